@@ -1,0 +1,1 @@
+//! Recorded and simulated episodes on disk and in memory.

@@ -1,0 +1,112 @@
+//! A gray camera image of checked size, and what is done with one: [`codec`] to and from files, [`preprocess`] to and
+//! from the model's space, [`quality`] to compare two.
+
+pub mod codec;
+pub mod preprocess;
+pub mod quality;
+
+/// The largest side of a frame that is accepted anywhere, in pixels.
+pub const MAX_SIDE_PX: u32 = 4096;
+
+/// Why a frame was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum FrameError {
+    /// A side is zero or over [`MAX_SIDE_PX`].
+    #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]
+    Size {
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+    },
+    /// The pixels don't fill the stated size.
+    #[error("{found} pixels given for a frame of {width}×{height} px, which takes {expected}")]
+    PixelCount {
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+        /// Pixels given.
+        found: usize,
+        /// Pixels needed.
+        expected: usize,
+    },
+    /// The bytes are no image that is understood.
+    #[error("not a readable PNG or JPEG image")]
+    Decode(#[source] image::ImageError),
+    /// An image could not be written.
+    #[error("could not encode the image")]
+    Encode(#[source] image::ImageError),
+    /// A pixel was NaN or infinite.
+    #[error("pixel {index} is {value}; every pixel must be a finite number")]
+    NotFinite {
+        /// Position, row by row.
+        index: usize,
+        /// The value found.
+        value: f32,
+    },
+}
+
+/// A gray image, 8 bits a pixel, row by row from the top left.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Frame {
+    width: u32,
+    height: u32,
+    pixels: Vec<u8>,
+}
+
+impl Frame {
+    /// A frame of that size. Errors: `Size` if a side is out of range, `PixelCount` if the pixels don't fill it.
+    pub fn new(width: u32, height: u32, pixels: Vec<u8>) -> Result<Self, FrameError> {
+        if !(1..=MAX_SIDE_PX).contains(&width) || !(1..=MAX_SIDE_PX).contains(&height) {
+            return Err(FrameError::Size { width, height });
+        }
+        let expected = width as usize * height as usize;
+        if pixels.len() != expected {
+            return Err(FrameError::PixelCount {
+                width,
+                height,
+                found: pixels.len(),
+                expected,
+            });
+        }
+        Ok(Self { width, height, pixels })
+    }
+
+    /// Width in pixels.
+    #[must_use]
+    pub fn width(&self) -> u32 {
+        self.width
+    }
+
+    /// Height in pixels.
+    #[must_use]
+    pub fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// Intensities 0 (black) to 255 (white), row by row.
+    #[must_use]
+    pub fn pixels(&self) -> &[u8] {
+        &self.pixels
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_that_its_pixels_do_not_fill_is_refused() {
+        let error = Frame::new(4, 4, vec![0; 15]).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "15 pixels given for a frame of 4×4 px, which takes 16"
+        );
+    }
+
+    #[test]
+    fn a_frame_without_width_is_refused() {
+        assert!(Frame::new(0, 4, vec![]).is_err());
+    }
+}

@@ -1,0 +1,115 @@
+//! Frames to and from PNG, JPEG and animated GIF. Sizes are checked before pixels are allocated.
+
+use std::io::Cursor;
+
+use image::codecs::gif::{GifEncoder, Repeat};
+use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageReader, Limits, RgbaImage};
+
+use super::{Frame, FrameError, MAX_SIDE_PX};
+
+/// Weights of red, green and blue in gray, ITU-R BT.601, in thousandths.
+const GRAY_FROM_RGB: [u32; 3] = [299, 587, 114];
+
+/// Reads a PNG or JPEG image as gray. Errors: `Decode` if the bytes are neither or a side is over [`MAX_SIDE_PX`].
+pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
+    let mut reader = ImageReader::new(Cursor::new(bytes))
+        .with_guessed_format()
+        .map_err(|error| FrameError::Decode(error.into()))?;
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_SIDE_PX);
+    limits.max_image_height = Some(MAX_SIDE_PX);
+    reader.limits(limits);
+    gray_from_image(&reader.decode().map_err(FrameError::Decode)?)
+}
+
+fn gray_from_image(image: &DynamicImage) -> Result<Frame, FrameError> {
+    let (width, height) = (image.width(), image.height());
+    let pixels = match image {
+        DynamicImage::ImageLuma8(gray) => gray.as_raw().clone(),
+        other => gray_from_rgb(other.to_rgb8().as_raw()),
+    };
+    Frame::new(width, height, pixels)
+}
+
+/// Gray intensities of interleaved red, green and blue bytes (ITU-R BT.601).
+#[must_use]
+pub fn gray_from_rgb(rgb: &[u8]) -> Vec<u8> {
+    rgb.as_chunks::<3>()
+        .0
+        .iter()
+        .map(|pixel| {
+            let sum: u32 = pixel
+                .iter()
+                .zip(GRAY_FROM_RGB)
+                .map(|(&value, weight)| u32::from(value) * weight)
+                .sum();
+            u8::try_from((sum + 500) / 1000).unwrap_or(u8::MAX)
+        })
+        .collect()
+}
+
+/// The frame as a gray PNG.
+pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
+    let mut bytes = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut bytes)
+        .write_image(frame.pixels(), frame.width(), frame.height(), ExtendedColorType::L8)
+        .map_err(FrameError::Encode)?;
+    Ok(bytes)
+}
+
+/// The frames as an endless GIF, `delay_ms` apart.
+pub fn encode_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
+    let mut bytes = Vec::new();
+    let mut encoder = GifEncoder::new(&mut bytes);
+    encoder.set_repeat(Repeat::Infinite).map_err(FrameError::Encode)?;
+    for frame in frames {
+        let rgba = frame
+            .pixels()
+            .iter()
+            .flat_map(|&value| [value, value, value, u8::MAX])
+            .collect();
+        let image = RgbaImage::from_raw(frame.width(), frame.height(), rgba).ok_or(FrameError::Size {
+            width: frame.width(),
+            height: frame.height(),
+        })?;
+        let delay = image::Delay::from_numer_denom_ms(delay_ms, 1);
+        encoder
+            .encode_frame(image::Frame::from_parts(image, 0, 0, delay))
+            .map_err(FrameError::Encode)?;
+    }
+    drop(encoder);
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_png_gives_back_every_pixel(width in 1u32..40, height in 1u32..40, seed in any::<u8>()) {
+            let pixels = (0..width * height).map(|i| (i * 31 + u32::from(seed)) as u8).collect();
+            let frame = Frame::new(width, height, pixels).unwrap();
+            prop_assert_eq!(decode(&encode_png(&frame).unwrap()).unwrap(), frame);
+        }
+
+        #[test]
+        fn no_bytes_make_the_decoder_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+            let _ = decode(&bytes);
+        }
+    }
+
+    #[test]
+    fn gray_of_pure_green_is_587_thousandths() {
+        assert_eq!(gray_from_rgb(&[0, 255, 0, 255, 255, 255]), [150, 255]);
+    }
+
+    #[test]
+    fn a_gif_of_two_frames_is_written() {
+        let frame = Frame::new(2, 2, vec![0, 80, 160, 255]).unwrap();
+        let bytes = encode_gif(&[frame.clone(), frame], 200).unwrap();
+        assert!(bytes.starts_with(b"GIF89a"));
+    }
+}

@@ -1,0 +1,176 @@
+//! From a frame to the model's space and back: Gaussian smoothing, inversion I = 255 − I, scaling to 0…1 (paper,
+//! Experimental Setup). Smoothing is not undone; the other two are.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Frame, FrameError};
+
+/// How frames enter the model's space.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Preprocess {
+    /// Standard deviation of the Gaussian, in pixels; 0 leaves the image sharp.
+    pub blur_sigma_px: f32,
+    /// Whether intensities are inverted, I = 255 − I.
+    pub invert: bool,
+}
+
+impl Default for Preprocess {
+    fn default() -> Self {
+        Self {
+            blur_sigma_px: 0.7,
+            invert: true,
+        }
+    }
+}
+
+impl Preprocess {
+    /// The frame's values in the model's space, 0…1, row by row.
+    #[must_use]
+    pub fn forward(&self, frame: &Frame) -> Vec<f32> {
+        let scaled = scale(frame.pixels());
+        let mut values = if self.blur_sigma_px > 0.0 {
+            let kernel = gaussian_kernel(self.blur_sigma_px, (3.0 * self.blur_sigma_px).ceil() as usize);
+            convolve_separable(&scaled, frame.width() as usize, &kernel)
+        } else {
+            scaled
+        };
+        if self.invert {
+            invert_intensity(&mut values);
+        }
+        values
+    }
+
+    /// Values in the model's space back to intensities 0…1 of the camera's space, clamped.
+    #[must_use]
+    pub fn inverse(&self, values: &[f32]) -> Vec<f32> {
+        let mut restored: Vec<f32> = values.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+        if self.invert {
+            invert_intensity(&mut restored);
+        }
+        restored
+    }
+
+    /// Values in the model's space back to a frame. Errors: `NotFinite` at a NaN or infinity, `PixelCount`.
+    pub fn frame_from(&self, values: &[f32], width: u32, height: u32) -> Result<Frame, FrameError> {
+        if let Some(index) = values.iter().position(|value| !value.is_finite()) {
+            return Err(FrameError::NotFinite {
+                index,
+                value: values[index],
+            });
+        }
+        let pixels = self
+            .inverse(values)
+            .into_iter()
+            .map(|value| (value * 255.0).round() as u8)
+            .collect();
+        Frame::new(width, height, pixels)
+    }
+}
+
+/// 8-bit intensities to 0…1.
+#[must_use]
+pub fn scale(pixels: &[u8]) -> Vec<f32> {
+    pixels.iter().map(|&value| f32::from(value) / 255.0).collect()
+}
+
+/// I = 255 − I on intensities scaled to 0…1.
+pub fn invert_intensity(values: &mut [f32]) {
+    for value in values {
+        *value = 1.0 - *value;
+    }
+}
+
+/// A normalized Gaussian of `2 · radius + 1` taps.
+pub(super) fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
+    let mut kernel: Vec<f32> = (0..=2 * radius)
+        .map(|i| {
+            let distance = (i as f32 - radius as f32) / sigma;
+            (-0.5 * distance * distance).exp()
+        })
+        .collect();
+    let sum: f32 = kernel.iter().sum();
+    for tap in &mut kernel {
+        *tap /= sum;
+    }
+    kernel
+}
+
+/// Convolves rows, then columns, with one odd kernel; the border repeats the edge pixel.
+pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
+    let height = values.len() / width;
+    let radius = kernel.len() / 2;
+    let clamped = |position: usize, tap: usize, len: usize| (position + tap).saturating_sub(radius).min(len - 1);
+    let mut rows = vec![0.0; values.len()];
+    for (row, out) in values.chunks_exact(width).zip(rows.chunks_exact_mut(width)) {
+        for (x, out) in out.iter_mut().enumerate() {
+            *out = kernel
+                .iter()
+                .enumerate()
+                .map(|(tap, weight)| weight * row[clamped(x, tap, width)])
+                .sum();
+        }
+    }
+    let mut result = vec![0.0; values.len()];
+    for (y, out) in result.chunks_exact_mut(width).enumerate() {
+        for (tap, weight) in kernel.iter().enumerate() {
+            let from = clamped(y, tap, height) * width;
+            for (out, value) in out.iter_mut().zip(&rows[from..from + width]) {
+                *out += weight * value;
+            }
+        }
+    }
+    result
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn inverting_twice_restores_every_intensity(pixels in proptest::collection::vec(any::<u8>(), 16)) {
+            let frame = Frame::new(4, 4, pixels).unwrap();
+            let preprocess = Preprocess { blur_sigma_px: 0.0, invert: true };
+            let values = preprocess.forward(&frame);
+            prop_assert_eq!(preprocess.frame_from(&values, 4, 4).unwrap(), frame);
+        }
+
+        #[test]
+        fn smoothing_keeps_a_flat_image(value in any::<u8>(), sigma in 0.1f32..3.0) {
+            let frame = Frame::new(9, 7, vec![value; 63]).unwrap();
+            let preprocess = Preprocess { blur_sigma_px: sigma, invert: false };
+            for out in preprocess.forward(&frame) {
+                prop_assert!((out - f32::from(value) / 255.0).abs() < 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn black_becomes_white_in_the_models_space() {
+        let frame = Frame::new(1, 1, vec![0]).unwrap();
+        assert_eq!(Preprocess::default().forward(&frame), [1.0]);
+    }
+
+    #[test]
+    fn a_point_spreads_as_the_gaussian_says() {
+        let mut pixels = vec![0; 49];
+        pixels[24] = 255;
+        let frame = Frame::new(7, 7, pixels).unwrap();
+        let preprocess = Preprocess {
+            blur_sigma_px: 0.7,
+            invert: false,
+        };
+        let values = preprocess.forward(&frame);
+        let expected = (-0.5f32 / 0.49).exp();
+        assert!((values[25] / values[24] - expected).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_nan_is_refused_with_its_place() {
+        let error = Preprocess::default().frame_from(&[0.5, f32::NAN], 2, 1).unwrap_err();
+        assert!(error.to_string().starts_with("pixel 1 is NaN"));
+    }
+}

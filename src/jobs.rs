@@ -1,0 +1,1 @@
+//! Background work: its table, its legal state transitions, its runner.

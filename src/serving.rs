@@ -1,0 +1,1 @@
+//! The thread that owns the models, and the handle that async code asks.

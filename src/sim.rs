@@ -1,0 +1,1 @@
+//! The simulated two-robot world: seeded, fixed step, no I/O.
