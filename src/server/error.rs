@@ -10,6 +10,7 @@ use tracing::error;
 
 use super::images::ImageError;
 use super::predict::PredictError;
+use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
 
@@ -167,6 +168,9 @@ impl From<PredictError> for ApiError {
             PredictError::Value { .. } | PredictError::BothStates | PredictError::StateCount { .. } => {
                 Self::Unprocessable(error.to_string())
             }
+            PredictError::Picture(FrameError::Size { .. }) => {
+                Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
+            }
             PredictError::Picture(_) => Self::Internal(with_cause(&error)),
         }
     }
@@ -237,3 +241,9 @@ pub(super) fn accepted<T: Serialize>(location: &str, body: T) -> Response {
     }
     response
 }
+
+/// What a connection over the limit is told before it is closed, as it goes over the wire: no request is read for it.
+pub(super) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavailable\r\n\
+    Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\r\n\
+    {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
+    \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";

@@ -2,7 +2,7 @@
 
 use font8x8::UnicodeFonts as _;
 
-use crate::frame::{Frame, FrameError, codec};
+use crate::frame::{Frame, FrameError, MAX_SIDE_PX, codec};
 
 /// Frames are enlarged until their longer side has about this many pixels.
 const SIDE_PX: u32 = 128;
@@ -10,26 +10,31 @@ const GLYPH_PX: usize = 8;
 /// Between frames, and around labels.
 const GAP_PX: usize = 4;
 const LABEL_HEIGHT_PX: usize = GLYPH_PX + 2 * GAP_PX;
+/// Longer sequences go on in the next row.
+const MOST_COLUMNS: usize = 12;
 const BACKGROUND: u8 = 32;
 const INK: u8 = 255;
 /// How long an animation rests on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;
 
-/// Rows of labelled frames: those seen above, those predicted below.
-pub(super) fn contact_sheet(seen: &[Frame], predicted: &[Frame]) -> Result<Frame, FrameError> {
+/// Rows of labelled frames: those seen, those predicted and, where known, those that came. Errors: `Size` if the sheet
+/// grows too large.
+pub(super) fn contact_sheet(seen: &[Frame], predicted: &[Frame], came: &[Frame]) -> Result<Frame, FrameError> {
     let past = seen.len().saturating_sub(1);
     let seen_labels = (0..seen.len()).map(|i| if i == past { "t".to_owned() } else { format!("t-{}", past - i) });
     let predicted_labels = (1..=predicted.len()).map(|i| format!("t+{i}"));
-    let rows = [
-        seen.iter().zip(seen_labels).collect::<Vec<_>>(),
-        predicted.iter().zip(predicted_labels).collect(),
-    ];
     let Some(first) = seen.first().or(predicted.first()) else {
         return Frame::new(0, 0, Vec::new());
     };
     let cell = enlarged(first);
     let (cell_width, cell_height) = (cell.width() as usize + GAP_PX, cell.height() as usize + LABEL_HEIGHT_PX);
-    let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
+    let most_columns = ((MAX_SIDE_PX as usize - GAP_PX) / cell_width).clamp(1, MOST_COLUMNS);
+    let seen: Vec<_> = seen.iter().zip(seen_labels).collect();
+    let predicted: Vec<_> = predicted.iter().zip(predicted_labels).collect();
+    let came: Vec<_> = came.iter().zip((1..=came.len()).map(|i| format!("true t+{i}"))).collect();
+    let parts = [seen, predicted, came];
+    let rows: Vec<_> = parts.iter().flat_map(|part| part.chunks(most_columns)).collect();
+    let columns = rows.iter().map(|row| row.len()).max().unwrap_or_default();
     let mut sheet = Canvas::new(columns * cell_width + GAP_PX, rows.len() * cell_height + GAP_PX);
     for (y, row) in rows.iter().enumerate() {
         for (x, (frame, label)) in row.iter().enumerate() {
@@ -128,7 +133,7 @@ mod tests {
 
     #[test]
     fn a_sheet_has_a_row_of_frames_seen_above_a_row_of_frames_predicted() {
-        let sheet = contact_sheet(&[flat(10), flat(20), flat(30)], &[flat(200)]).unwrap();
+        let sheet = contact_sheet(&[flat(10), flat(20), flat(30)], &[flat(200)], &[]).unwrap();
         let (cell_width, cell_height) = (128 + GAP_PX, 128 + LABEL_HEIGHT_PX);
         let pixel = |x: usize, y: usize| sheet.pixels()[y * sheet.width() as usize + x];
         assert_eq!(sheet.width() as usize, 3 * cell_width + GAP_PX);

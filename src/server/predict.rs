@@ -169,7 +169,7 @@ fn answer(
     let predicted = &prediction.frames;
     match wanted {
         Wanted::Png => picture(
-            picture::contact_sheet(seen, predicted).and_then(|sheet| codec::encode_png(&sheet)),
+            picture::contact_sheet(seen, predicted, &[]).and_then(|sheet| codec::encode_png(&sheet)),
             "image/png",
         ),
         Wanted::Gif => picture(picture::animation(seen, predicted, period_s), "image/gif"),
