@@ -41,7 +41,7 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
         .map_err(|source| RegistryError::Safetensors { path: path.clone(), source })?;
     let misfit = |source| RegistryError::Weights { path: path.clone(), source };
     let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(misfit)?;
-    let model = Model::new(manifest.spec.clone(), &parameters).map_err(misfit)?;
+    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(misfit)?;
     Ok(LoadedModel { manifest, model })
 }
 
