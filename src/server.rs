@@ -20,6 +20,7 @@ mod streams;
 
 pub mod openapi;
 pub mod protocol;
+pub mod shutdown;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -174,7 +175,7 @@ pub async fn serve(
     app: App,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), ServerError> {
-    let (stopping, mut stop) = tokio::sync::watch::channel(false);
+    let mut stopping = app.streams().stopping();
     let listener = BoundedListener::new(listener, app.config().max_connections);
     let of_signal = app.clone();
     let signal = async move {
@@ -182,13 +183,11 @@ pub async fn serve(
         info!("stopping");
         of_signal.streams().stop();
         of_signal.jobs().begin_stop();
-        stopping.send_replace(true);
     };
     let server = axum::serve(listener, router(app.clone())).with_graceful_shutdown(signal);
     let limit = Duration::from_millis(app.config().shutdown_deadline_ms);
     let over = async {
-        // The sender lives until it has sent.
-        let _ = stop.wait_for(|stop| *stop).await;
+        streams::told(&mut stopping).await;
         tokio::time::sleep(limit).await;
     };
     tokio::select! {

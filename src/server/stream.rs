@@ -15,6 +15,7 @@ use super::error::ApiError;
 use super::extract::Path;
 use super::protocol::{self, ClientMessage, ClosingReason, ErrorCode, FrameMessage, SUBPROTOCOL, ServerMessage};
 use super::session::{Session, Step, StreamError};
+use super::streams;
 use crate::registry::Manifest;
 
 /// Opens a stream: a WebSocket that takes frames with action and state and answers each with the frames to come.
@@ -90,7 +91,7 @@ impl Stream {
         loop {
             let message = tokio::select! {
                 biased;
-                _ = stopping.wait_for(|stopping| *stopping) => {
+                () = streams::told(&mut stopping) => {
                     return self.close(ClosingReason::Shutdown, close_code::AWAY).await;
                 }
                 message = timeout(Duration::from_millis(idle_ms), self.socket.recv()) => message,

@@ -51,3 +51,9 @@ impl Streams {
         let _ = self.places.acquire_many(self.limit).await;
     }
 }
+
+/// Waits until streams shall end.
+pub(super) async fn told(stopping: &mut watch::Receiver<bool>) {
+    // The sender lives as long as the streams' places do.
+    let _ = stopping.wait_for(|stopping| *stopping).await;
+}
