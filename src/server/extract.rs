@@ -1,7 +1,5 @@
 //! What handlers take from a request, refused in the one shape that errors have.
 
-use std::convert::Infallible;
-
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::header;
 use axum::http::request::Parts;
@@ -69,22 +67,6 @@ impl<S: Send + Sync> FromRequestParts<S> for Wanted {
                 .map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))
         })?;
         Self::from_accept(accept)
-    }
-}
-
-/// The request's id, as the middleware gave it.
-#[derive(Clone, Debug)]
-pub(super) struct RequestId(pub(super) String);
-
-impl<S: Send + Sync> FromRequestParts<S> for RequestId {
-    type Rejection = Infallible;
-
-    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
-        Ok(parts
-            .extensions
-            .get::<Self>()
-            .cloned()
-            .unwrap_or(Self(String::new())))
     }
 }
 

@@ -24,8 +24,7 @@ pub enum ImageFormat {
 
 impl ImageFormat {
     /// The format of the answer to images of this one.
-    #[must_use]
-    pub fn answer(self) -> Self {
+    pub(super) fn answer(self) -> Self {
         match self {
             Self::Raw => Self::Raw,
             Self::Png | Self::Jpeg => Self::Png,
@@ -35,43 +34,28 @@ impl ImageFormat {
 
 /// Why an image was refused.
 #[derive(Debug, thiserror::Error)]
-pub enum ImageError {
-    /// Not base64.
+pub(super) enum ImageError {
     #[error("{field} is not base64: {source}")]
     Base64 {
-        /// The field, with its index.
         field: String,
-        /// Where it went wrong.
         source: base64::DecodeError,
     },
-    /// Not an image.
     #[error("{field} is {source}")]
     Decode {
-        /// The field, with its index.
         field: String,
-        /// What it is instead.
         source: FrameError,
     },
-    /// Raw bytes of another count.
     #[error("{field} holds {found} raw bytes; model \"{model}\" takes {width}×{height} px, {expected} bytes")]
     RawLength {
-        /// The field, with its index.
         field: String,
-        /// The model's name.
         model: String,
-        /// Bytes given.
         found: usize,
-        /// Bytes needed.
         expected: usize,
-        /// The model's width in pixels.
         width: u32,
-        /// The model's height in pixels.
         height: u32,
     },
-    /// An image of another size.
     #[error(transparent)]
     Size(#[from] InputError),
-    /// The answer could not be encoded.
     #[error("an image of the answer could not be encoded")]
     Encode(#[source] FrameError),
 }
