@@ -1,7 +1,10 @@
 //! Behaviour of the whole library, one test binary.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
+mod architecture;
 mod jobs;
 mod server;
 mod service;
+mod sim;
 mod stream;
+mod training;
