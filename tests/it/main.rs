@@ -3,3 +3,4 @@
 
 mod dataset_collect;
 mod dataset_sampler;
+mod sim;
