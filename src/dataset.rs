@@ -1,38 +1,32 @@
 //! Recorded and simulated episodes, on disk and in memory.
 //!
 //! A [`Dataset`] lies in memory as a whole, its frames as bytes in one buffer. [`sampler`] says which [`Window`]s of it
-//! train, validate and test.
+//! train, validate and test; [`collect()`] simulates one into a directory in LeRobot's v3.0 layout.
 
+pub mod collect;
+mod collection;
 mod error;
+mod files;
+mod layout;
 pub mod sampler;
+mod shard;
+mod shard_reader;
+mod stats;
+mod store;
+mod tables;
 
 use std::ops::Range;
 
-use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+pub use collect::{CollectConfig, Progress, collect};
+pub use collection::Standing;
 pub use error::DatasetError;
 pub use sampler::{Split, Splits, WindowShape};
 
 use crate::frame::MAX_SIDE_PX;
+pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
-
-/// Everything that was drawn for one simulated trial.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct TrialParameters {
-    /// The trial's number.
-    pub trial: u64,
-    /// Whether it is one of the start/goal pairs or gains kept for `TestUnseen`.
-    pub held_out: bool,
-}
-
-impl TrialParameters {
-    /// Whether the trial belongs to [`Split::TestUnseen`].
-    #[must_use]
-    pub fn is_held_out(&self) -> bool {
-        self.held_out
-    }
-}
 
 /// What a data set is: sizes, rates, meanings and the hash of its content.
 #[derive(Clone, Debug, PartialEq)]
@@ -333,9 +327,26 @@ fn check_episode(info: &DatasetInfo, episode: usize, data: &EpisodeData) -> Resu
             });
         }
     }
-    check_finite(episode, "action", &data.actions, info.action_channels.len())?;
-    check_finite(episode, "state", &data.states, info.state_channels.len())?;
-    check_time(episode, &data.timestamps_s)
+    let numbers = Numbers {
+        actions: &data.actions,
+        states: &data.states,
+        timestamps_s: &data.timestamps_s,
+    };
+    check_numbers(info, episode, &numbers)
+}
+
+/// The numbers of one episode's frames.
+struct Numbers<'a> {
+    actions: &'a [f32],
+    states: &'a [f32],
+    timestamps_s: &'a [f64],
+}
+
+/// Errors: `NotFinite`, `TimeOrder`.
+fn check_numbers(info: &DatasetInfo, episode: usize, numbers: &Numbers<'_>) -> Result<(), DatasetError> {
+    check_finite(episode, "action", numbers.actions, info.action_channels.len())?;
+    check_finite(episode, "state", numbers.states, info.state_channels.len())?;
+    check_time(episode, numbers.timestamps_s)
 }
 
 fn check_finite(episode: usize, part: &'static str, values: &[f32], size: usize) -> Result<(), DatasetError> {

@@ -49,11 +49,8 @@ impl Execute for Pipeline {
 impl Pipeline {
     fn collect(&self, spec: &CollectSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
         let out = self.make_dir("datasets")?.join(&spec.name);
-        let config = CollectConfig {
-            trials: spec.trials,
-            seed: Seed(spec.seed),
-            ..CollectConfig::new(spec.scenario().map_err(|error| failed(&error))?, out)
-        };
+        let scenario = spec.scenario().map_err(|error| failed(&error))?;
+        let config = CollectConfig::new(scenario, spec.trials, Seed(spec.seed), &out);
         let on_progress = |progress: collect::Progress| report.progress(progress.done, progress.total, "simulating");
         collect::collect(&config, &on_progress, cancelled).map_err(|error| failed(&error))?;
         Ok(())

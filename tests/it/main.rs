@@ -2,6 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod architecture;
+mod dataset_collect;
+mod dataset_sampler;
 mod jobs;
 mod server;
 mod service;
