@@ -68,6 +68,12 @@ pub enum JobError {
         /// Who has it.
         why: &'static str,
     },
+    /// The directory holds what an earlier job left, which this one cannot go on with.
+    #[error("name: {reason}")]
+    Occupied {
+        /// What is there.
+        reason: String,
+    },
     /// The server is stopping.
     #[error("the server is stopping and takes no more jobs")]
     Stopping,

@@ -32,8 +32,8 @@ use tokio::net::TcpListener;
 use tracing::{info, warn};
 
 pub use config::ServerConfig;
-pub use error::Problem;
 use error::ApiError;
+pub use error::Problem;
 pub use images::ImageFormat;
 use listener::BoundedListener;
 use middleware::RequestIds;

@@ -7,13 +7,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::runner::{Execute, Failure, Report};
 use super::{CollectSpec, JobError, JobSpec, Losses, TrainSpec};
-use crate::dataset::Dataset;
-use crate::dataset::collect::{self, CollectConfig};
+use crate::dataset::{self, Dataset};
 use crate::files::write_atomically;
 use crate::registry;
 use crate::serving::Predictor;
 use crate::training::{self, Event, Outcome, Stage, Training};
-use crate::types::Seed;
 
 /// Collects and trains below `data_dir`: `datasets/NAME`, `runs/NAME`, `models/NAME`.
 pub struct Pipeline {
@@ -48,11 +46,11 @@ impl Execute for Pipeline {
 
 impl Pipeline {
     fn collect(&self, spec: &CollectSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
-        let out = self.make_dir("datasets")?.join(&spec.name);
-        let scenario = spec.scenario().map_err(|error| failed(&error))?;
-        let config = CollectConfig::new(scenario, spec.trials, Seed(spec.seed), &out);
-        let on_progress = |progress: collect::Progress| report.progress(progress.done, progress.total, "simulating");
-        collect::collect(&config, &on_progress, cancelled).map_err(|error| failed(&error))?;
+        let config = spec
+            .config(&self.make_dir("datasets")?)
+            .map_err(|error| failed(&error))?;
+        let on_progress = |progress: dataset::Progress| report.progress(progress.done, progress.total, "simulating");
+        dataset::collect(&config, &on_progress, cancelled).map_err(|error| failed(&error))?;
         Ok(())
     }
 

@@ -5,9 +5,11 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
+use crate::dataset::{CollectConfig, Standing};
 use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
+use crate::types::Seed;
 
 /// Trials of one collection at most.
 pub const MAX_TRIALS: u64 = 1_000_000;
@@ -81,29 +83,42 @@ impl JobSpec {
 impl CollectSpec {
     fn check(&self, data_dir: &Path) -> Result<(), JobError> {
         check_name("name", &self.name)?;
-        self.scenario()?;
         if !(1..=MAX_TRIALS).contains(&self.trials) {
             return Err(JobError::Invalid {
                 field: "trials",
-                reason: format!("{} is out of range; 1 to {MAX_TRIALS} trials can be collected", self.trials),
+                reason: format!(
+                    "{} is out of range; 1 to {MAX_TRIALS} trials can be collected",
+                    self.trials
+                ),
             });
         }
-        if is_dataset(&data_dir.join("datasets").join(&self.name)) {
-            return Err(JobError::Taken {
+        match Standing::of(&self.config(&data_dir.join("datasets"))?) {
+            Ok(Standing::New | Standing::Begun { .. }) => Ok(()),
+            Ok(Standing::Finished(_)) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),
                 why: "exists",
-            });
+            }),
+            Err(error) => Err(JobError::Occupied {
+                reason: error.to_string(),
+            }),
         }
-        Ok(())
+    }
+
+    /// What to collect into a directory of that name below `datasets`. Errors: `Invalid`, which names the scenarios.
+    pub(super) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
+        let out = datasets.join(&self.name);
+        Ok(CollectConfig::new(self.scenario()?, self.trials, Seed(self.seed), &out))
     }
 
     /// The scenario by its name. Errors: `Invalid`, which names those there are.
-    pub(super) fn scenario(&self) -> Result<Scenario, JobError> {
-        self.scenario.parse().map_err(|error: <Scenario as std::str::FromStr>::Err| JobError::Invalid {
-            field: "scenario",
-            reason: error.to_string(),
-        })
+    fn scenario(&self) -> Result<Scenario, JobError> {
+        self.scenario
+            .parse()
+            .map_err(|error: <Scenario as std::str::FromStr>::Err| JobError::Invalid {
+                field: "scenario",
+                reason: error.to_string(),
+            })
     }
 }
 

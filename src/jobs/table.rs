@@ -93,7 +93,10 @@ impl JobTable {
 
     /// Adds a job that waits. Errors: `QueueFull`; `Taken` if a job that has not ended makes the same thing.
     pub fn add(&mut self, spec: JobSpec, now_s: f64) -> Result<Job, JobError> {
-        let queued = self.entries.values().filter(|entry| entry.job.state == JobState::Queued);
+        let queued = self
+            .entries
+            .values()
+            .filter(|entry| entry.job.state == JobState::Queued);
         if queued.count() >= self.limits.queued {
             return Err(JobError::QueueFull {
                 limit: self.limits.queued,

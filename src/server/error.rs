@@ -190,7 +190,9 @@ impl From<JobError> for ApiError {
         match error {
             JobError::Unknown { .. } => Self::NotFound(error.to_string()),
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
-            JobError::IllegalTransition { .. } | JobError::Taken { .. } => Self::Conflict(error.to_string()),
+            JobError::IllegalTransition { .. } | JobError::Taken { .. } | JobError::Occupied { .. } => {
+                Self::Conflict(error.to_string())
+            }
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
             JobError::Thread(_) => Self::Internal(with_cause(&error)),
         }

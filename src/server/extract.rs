@@ -42,7 +42,9 @@ pub(super) enum Wanted {
 impl Wanted {
     /// The first form named in an `Accept` header that can be had; JSON where there is none.
     fn from_accept(accept: &str) -> Result<Self, ApiError> {
-        let named = accept.split(',').map(|part| part.split(';').next().unwrap_or("").trim());
+        let named = accept
+            .split(',')
+            .map(|part| part.split(';').next().unwrap_or("").trim());
         for media_type in named {
             match media_type {
                 "application/json" | "application/*" | "*/*" | "" => return Ok(Self::Json),

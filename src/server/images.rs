@@ -36,15 +36,9 @@ impl ImageFormat {
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ImageError {
     #[error("{field} is not base64: {source}")]
-    Base64 {
-        field: String,
-        source: base64::DecodeError,
-    },
+    Base64 { field: String, source: base64::DecodeError },
     #[error("{field} is {source}")]
-    Decode {
-        field: String,
-        source: FrameError,
-    },
+    Decode { field: String, source: FrameError },
     #[error("{field} holds {found} raw bytes; model \"{model}\" takes {width}×{height} px, {expected} bytes")]
     RawLength {
         field: String,

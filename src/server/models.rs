@@ -88,7 +88,10 @@ impl From<&Manifest> for ModelDescription {
 pub(super) async fn list(State(app): State<App>) -> axum::Json<ModelList> {
     let manifests = app.predictor().models();
     axum::Json(ModelList {
-        models: manifests.iter().map(|manifest| ModelDescription::from(&**manifest)).collect(),
+        models: manifests
+            .iter()
+            .map(|manifest| ModelDescription::from(&**manifest))
+            .collect(),
     })
 }
 

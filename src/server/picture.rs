@@ -21,7 +21,13 @@ const REST_PERIODS: usize = 4;
 /// grows too large.
 pub(super) fn contact_sheet(seen: &[Frame], predicted: &[Frame], came: &[Frame]) -> Result<Frame, FrameError> {
     let past = seen.len().saturating_sub(1);
-    let seen_labels = (0..seen.len()).map(|i| if i == past { "t".to_owned() } else { format!("t-{}", past - i) });
+    let seen_labels = (0..seen.len()).map(|i| {
+        if i == past {
+            "t".to_owned()
+        } else {
+            format!("t-{}", past - i)
+        }
+    });
     let predicted_labels = (1..=predicted.len()).map(|i| format!("t+{i}"));
     let Some(first) = seen.first().or(predicted.first()) else {
         return Frame::new(0, 0, Vec::new());
@@ -31,7 +37,10 @@ pub(super) fn contact_sheet(seen: &[Frame], predicted: &[Frame], came: &[Frame])
     let most_columns = ((MAX_SIDE_PX as usize - GAP_PX) / cell_width).clamp(1, MOST_COLUMNS);
     let seen: Vec<_> = seen.iter().zip(seen_labels).collect();
     let predicted: Vec<_> = predicted.iter().zip(predicted_labels).collect();
-    let came: Vec<_> = came.iter().zip((1..=came.len()).map(|i| format!("true t+{i}"))).collect();
+    let came: Vec<_> = came
+        .iter()
+        .zip((1..=came.len()).map(|i| format!("true t+{i}")))
+        .collect();
     let parts = [seen, predicted, came];
     let rows: Vec<_> = parts.iter().flat_map(|part| part.chunks(most_columns)).collect();
     let columns = rows.iter().map(|row| row.len()).max().unwrap_or_default();
@@ -54,10 +63,7 @@ pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> R
     let mut frames = Vec::new();
     for (frame, label) in seen.iter().chain(predicted).zip(labels) {
         let picture = enlarged(frame);
-        let mut canvas = Canvas::new(
-            picture.width() as usize,
-            picture.height() as usize + LABEL_HEIGHT_PX,
-        );
+        let mut canvas = Canvas::new(picture.width() as usize, picture.height() as usize + LABEL_HEIGHT_PX);
         canvas.write(&label, GAP_PX, GAP_PX);
         canvas.paste(&picture, 0, LABEL_HEIGHT_PX);
         frames.push(canvas.into_frame()?);
@@ -70,7 +76,11 @@ pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> R
 /// The frame with every pixel repeated.
 fn enlarged(frame: &Frame) -> Frame {
     let factor = (SIDE_PX / frame.width().max(frame.height())).max(1) as usize;
-    let row = |row: &[u8]| row.iter().flat_map(|&pixel| std::iter::repeat_n(pixel, factor)).collect::<Vec<u8>>();
+    let row = |row: &[u8]| {
+        row.iter()
+            .flat_map(|&pixel| std::iter::repeat_n(pixel, factor))
+            .collect::<Vec<u8>>()
+    };
     let rows = frame.pixels().chunks_exact(frame.width() as usize);
     let pixels = rows.flat_map(|pixels| row(pixels).repeat(factor)).collect();
     let side = |length: u32| length * factor as u32;

@@ -32,10 +32,7 @@ const TRIAL: u64 = 1;
         (status = 503, description = "Too many predictions wait", body = Problem),
     )
 )]
-pub(super) async fn preview(
-    State(app): State<App>,
-    Path(model): Path<String>,
-) -> Result<impl IntoResponse, ApiError> {
+pub(super) async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<impl IntoResponse, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let (input, came) = blocking(move || simulate(&manifest))
         .await?

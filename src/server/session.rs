@@ -153,7 +153,10 @@ impl Session {
             }
         };
         let state = message.state.clone().map(RobotState::try_from).transpose();
-        let plan = message.plan.as_ref().map(|plan| plan.iter().map(action("plan")).collect());
+        let plan = message
+            .plan
+            .as_ref()
+            .map(|plan| plan.iter().map(action("plan")).collect());
         let input = PredictionInput {
             frames: Vec::new(),
             actions: message.action.iter().map(action("action")).collect::<Result<_, _>>()?,

@@ -40,7 +40,9 @@ pub(super) async fn stream(
     let manifest = app.predictor().model(&model)?;
     let upgrade = upgrade.map_err(|_| ApiError::UpgradeRequired)?.protocols([SUBPROTOCOL]);
     if upgrade.selected_protocol().is_none() && upgrade.requested_protocols().next().is_some() {
-        return Err(ApiError::Malformed(format!("the sub-protocol spoken here is {SUBPROTOCOL}")));
+        return Err(ApiError::Malformed(format!(
+            "the sub-protocol spoken here is {SUBPROTOCOL}"
+        )));
     }
     let place = app.streams().enter()?;
     let limit = app.config().max_body_bytes;

@@ -102,7 +102,12 @@ impl PredictionInput {
             });
         }
         for (index, frame) in self.frames.iter().enumerate() {
-            check_size(&format!("frames[{index}]"), model, spec, (frame.width(), frame.height()))?;
+            check_size(
+                &format!("frames[{index}]"),
+                model,
+                spec,
+                (frame.width(), frame.height()),
+            )?;
         }
         if self.actions.len() > self.frames.len() {
             return Err(InputError::ActionCount {

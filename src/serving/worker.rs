@@ -78,10 +78,11 @@ fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
 
 fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
     let pixels = vec![0; spec.frame_width_px as usize * spec.frame_height_px as usize];
-    let frame = Frame::new(spec.frame_width_px, spec.frame_height_px, pixels).map_err(|source| ServingError::Frame {
-        model: String::new(),
-        source,
-    })?;
+    let frame =
+        Frame::new(spec.frame_width_px, spec.frame_height_px, pixels).map_err(|source| ServingError::Frame {
+            model: String::new(),
+            source,
+        })?;
     Ok(PredictionInput {
         frames: vec![frame; spec.context],
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),

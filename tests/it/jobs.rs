@@ -1,8 +1,8 @@
 //! Jobs over HTTP: with work that the test holds in its hand, and with the real collection and training.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use foreframe::jobs::{Execute, Failure, JobError, JobSpec, Jobs, Report, TableLimits};
@@ -78,7 +78,10 @@ async fn a_job_goes_its_way_and_can_be_watched() {
     let dir = tempfile::tempdir().unwrap();
     let (app, order) = puppet_app(dir.path(), true);
     let taken = post(&app, JOBS, &collect("a")).await;
-    assert_eq!((taken.status.as_u16(), &taken.headers["location"]), (202, &"/v1/jobs/job-1".parse().unwrap()));
+    assert_eq!(
+        (taken.status.as_u16(), &taken.headers["location"]),
+        (202, &"/v1/jobs/job-1".parse().unwrap())
+    );
     let job = state_becomes(&app, "job-1", "running").await;
     assert_eq!(job["spec"]["scenario"], "static-observer");
     let progress = until(async || {
@@ -91,7 +94,10 @@ async fn a_job_goes_its_way_and_can_be_watched() {
 
     post(&app, JOBS, &collect("b")).await;
     order.send(Err(Failure::Failed("the disk is full".to_owned()))).unwrap();
-    assert_eq!(state_becomes(&app, "job-2", "failed").await["error"], "the disk is full");
+    assert_eq!(
+        state_becomes(&app, "job-2", "failed").await["error"],
+        "the disk is full"
+    );
     let all = get(&app, JOBS).await.json();
     let ids: Vec<&Value> = all["jobs"].as_array().unwrap().iter().map(|job| &job["id"]).collect();
     assert_eq!(ids, ["job-2", "job-1"]);
@@ -107,17 +113,29 @@ async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
         assert_eq!(post(&app, JOBS, &collect(name)).await.status, 202);
     }
     let refused = post(&app, JOBS, &collect("d")).await;
-    assert_eq!(refused.detail(503), "2 jobs wait already; cancel one or try again later");
+    assert_eq!(
+        refused.detail(503),
+        "2 jobs wait already; cancel one or try again later"
+    );
     assert_eq!(refused.headers["retry-after"], "1");
     let same = post(&app, "/v1/jobs/job-3/cancel", &Value::Null).await;
     assert_eq!(same.json()["state"], "cancelled");
     let taken = post(&app, JOBS, &collect("a")).await.detail(409);
-    assert_eq!(taken, "name: data set \"a\" is being made by another job; choose another name");
-    assert_eq!(post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.json()["cancelling"], true);
+    assert_eq!(
+        taken,
+        "name: data set \"a\" is being made by another job; choose another name"
+    );
+    assert_eq!(
+        post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.json()["cancelling"],
+        true
+    );
     state_becomes(&app, "job-1", "cancelled").await;
     let again = post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.detail(409);
     assert_eq!(again, "job job-1 has been cancelled; it cannot be cancelled any more");
-    assert_eq!(get(&app, "/v1/jobs/job-77").await.detail(404), "there is no job \"job-77\"");
+    assert_eq!(
+        get(&app, "/v1/jobs/job-77").await.detail(404),
+        "there is no job \"job-77\""
+    );
 }
 
 #[tokio::test]
@@ -155,13 +173,33 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
     zero["trials"] = json!(0);
     for (body, status, detail) in [
         (wild, 422, "moving-observer"),
-        (zero, 422, "trials: 0 is out of range; 1 to 1000000 trials can be collected"),
+        (
+            zero,
+            422,
+            "trials: 0 is out of range; 1 to 1000000 trials can be collected",
+        ),
         (collect("../up"), 422, "name: \"../up\" is no name"),
-        (train(json!({})), 422, "dataset: there is no data set \"none\"; there are: none yet"),
-        (train(json!({"preset": "papr"})), 422, "preset: there is no preset \"papr\"; there are: paper, static, moving"),
-        (train(json!({"settings": {"fit": {"stepz": 1}}})), 422, "unknown field `stepz`"),
+        (
+            train(json!({})),
+            422,
+            "dataset: there is no data set \"none\"; there are: none yet",
+        ),
+        (
+            train(json!({"preset": "papr"})),
+            422,
+            "preset: there is no preset \"papr\"; there are: paper, static, moving",
+        ),
+        (
+            train(json!({"settings": {"fit": {"stepz": 1}}})),
+            422,
+            "unknown field `stepz`",
+        ),
         (train(json!({"colour": 1})), 422, "unknown field `colour`"),
-        (json!({"kind": "dream"}), 422, "unknown variant `dream`, expected `collect` or `train`"),
+        (
+            json!({"kind": "dream"}),
+            422,
+            "unknown variant `dream`, expected `collect` or `train`",
+        ),
     ] {
         let answer = post(&app, JOBS, &body).await.detail(status);
         assert!(answer.contains(detail), "{answer}");
@@ -173,9 +211,15 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
 async fn a_collected_data_set_trains_a_model_that_serves_at_once() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let id = post(&app, JOBS, &collect("seen")).await.json()["id"].as_str().unwrap().to_owned();
+    let id = post(&app, JOBS, &collect("seen")).await.json()["id"]
+        .as_str()
+        .unwrap()
+        .to_owned();
     let done = state_becomes(&app, &id, "succeeded").await;
-    assert_eq!((&done["progress"]["done"], &done["progress"]["total"]), (&json!(12), &json!(12)));
+    assert_eq!(
+        (&done["progress"]["done"], &done["progress"]["total"]),
+        (&json!(12), &json!(12))
+    );
     let exists = post(&app, JOBS, &collect("seen")).await.detail(409);
     assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
 
@@ -190,12 +234,20 @@ async fn a_collected_data_set_trains_a_model_that_serves_at_once() {
     let taken = post(&app, JOBS, &train).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let done = state_becomes(&app, taken.json()["id"].as_str().unwrap(), "succeeded").await;
-    assert!(done["losses"]["train"].is_number() && done["losses"]["validation"].is_number(), "{done}");
+    assert!(
+        done["losses"]["train"].is_number() && done["losses"]["validation"].is_number(),
+        "{done}"
+    );
 
     let description = get(&app, "/v1/models/fresh").await.json();
     assert_eq!(description["lineage"]["dataset"], "seen");
-    let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()})).await.detail(422);
-    assert!(misfit.contains("frames[0] is 16×12 px; model \"fresh\" takes 64×64"), "{misfit}");
+    let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
+        .await
+        .detail(422);
+    assert!(
+        misfit.contains("frames[0] is 16×12 px; model \"fresh\" takes 64×64"),
+        "{misfit}"
+    );
     let preview = get(&app, "/v1/models/fresh/preview.png").await;
     assert_eq!(preview.status, 200);
     let again = post(&app, JOBS, &train).await.detail(409);

@@ -47,7 +47,9 @@ async fn a_prediction_over_http_is_the_librarys() {
 async fn raw_images_are_answered_by_raw_images() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let raw: Vec<String> = (0..CONTEXT as u8).map(|i| STANDARD.encode(frame(i * 10).pixels())).collect();
+    let raw: Vec<String> = (0..CONTEXT as u8)
+        .map(|i| STANDARD.encode(frame(i * 10).pixels()))
+        .collect();
     let as_raw = post(&app, PLAIN, &json!({"frames": raw, "format": "raw"})).await.json();
     let as_png = post(&app, PLAIN, &json!({"frames": context()})).await.json();
     let decoded = codec::decode(&STANDARD.decode(as_png["frames"][0].as_str().unwrap()).unwrap()).unwrap();
@@ -95,7 +97,10 @@ async fn pictures_are_given_where_asked_for() {
     assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
     assert!(film.body.starts_with(b"GIF89a"));
     let refused = post_text(&app, PLAIN, body, "text/csv").await.detail(406);
-    assert!(refused.contains("application/json, image/png and image/gif"), "{refused}");
+    assert!(
+        refused.contains("application/json, image/png and image/gif"),
+        "{refused}"
+    );
 }
 
 #[tokio::test]
@@ -120,7 +125,11 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
             json!({"frames": &context()[1..]}),
             "frames holds 2 images; model \"plain\" takes 3",
         ),
-        (PLAIN, json!({"frames": ["%"]}), "frames[0] is not base64: Invalid symbol 37, offset 0."),
+        (
+            PLAIN,
+            json!({"frames": ["%"]}),
+            "frames[0] is not base64: Invalid symbol 37, offset 0.",
+        ),
         (
             PLAIN,
             json!({"frames": ["AAAA"]}),
@@ -181,7 +190,12 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let json = "*/*";
-    assert!(post_text(&app, PLAIN, "{\"frames\":".to_owned(), json).await.detail(400).contains("JSON"));
+    assert!(
+        post_text(&app, PLAIN, "{\"frames\":".to_owned(), json)
+            .await
+            .detail(400)
+            .contains("JSON")
+    );
     let unknown = post(&app, PLAIN, &json!({"frames": [], "colour": 1})).await.detail(422);
     assert!(unknown.contains("unknown field `colour`"), "{unknown}");
     let untyped = Request::post(PLAIN).body(Body::from("{}")).unwrap();
@@ -190,19 +204,35 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
     assert!(get(&app, "/nothing").await.detail(404).contains("openapi.json"));
     let none = get(&app, "/v1/models/movin").await.detail(404);
     assert_eq!(none, "no model is named \"movin\"; there are: moving, plain");
-    assert!(get(&app, "/v1/models/plain/stream").await.detail(426).contains("WebSocket"));
+    assert!(
+        get(&app, "/v1/models/plain/stream")
+            .await
+            .detail(426)
+            .contains("WebSocket")
+    );
 }
 
 #[tokio::test]
 async fn every_answer_carries_the_requests_id() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let request = |id: &str| Request::get("/nothing").header("x-request-id", id).body(Body::empty()).unwrap();
+    let request = |id: &str| {
+        Request::get("/nothing")
+            .header("x-request-id", id)
+            .body(Body::empty())
+            .unwrap()
+    };
     let own = send(&app, request("robot-7")).await;
-    assert_eq!((own.detail(404), own.headers["x-request-id"].to_str().unwrap()), (own.detail(404), "robot-7"));
+    assert_eq!(
+        (own.detail(404), own.headers["x-request-id"].to_str().unwrap()),
+        (own.detail(404), "robot-7")
+    );
     let odd = send(&app, request("a b\"c")).await;
     assert_ne!(odd.headers["x-request-id"], "a b\"c");
-    assert_ne!(get(&app, "/livez").await.headers["x-request-id"], odd.headers["x-request-id"]);
+    assert_ne!(
+        get(&app, "/livez").await.headers["x-request-id"],
+        odd.headers["x-request-id"]
+    );
 }
 
 #[tokio::test]
@@ -212,13 +242,22 @@ async fn the_server_is_ready_once_its_models_are_warm() {
     assert_eq!(get(&app, "/livez").await.status, 200);
     until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
     let models = get(&app, "/v1/models").await.json();
-    let names: Vec<&Value> = models["models"].as_array().unwrap().iter().map(|model| &model["name"]).collect();
+    let names: Vec<&Value> = models["models"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|model| &model["name"])
+        .collect();
     assert_eq!(names, ["moving", "plain"]);
     let moving = get(&app, "/v1/models/moving").await.json();
     assert_eq!(moving["spec"]["conditioning"], "state-action");
     assert_eq!(moving["spec"]["actions"][1]["unit"], "rad/s");
     let page = get(&app, "/").await;
-    assert!(String::from_utf8(page.body).unwrap().contains("/v1/models/{model}/predict"));
+    assert!(
+        String::from_utf8(page.body)
+            .unwrap()
+            .contains("/v1/models/{model}/predict")
+    );
 }
 
 #[tokio::test]
@@ -230,7 +269,9 @@ async fn a_body_or_a_list_over_its_limit_is_refused() {
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);
-    let long = post(&app, PLAIN, &json!({"frames": ["A".repeat(5000)]})).await.detail(413);
+    let long = post(&app, PLAIN, &json!({"frames": ["A".repeat(5000)]}))
+        .await
+        .detail(413);
     assert_eq!(long, "the body is longer than this server takes");
     let many = post(&app, PLAIN, &json!({"frames": vec!["AAAA"; 5]})).await.detail(413);
     assert_eq!(many, "frames holds 5 images; this server takes at most 4 in a request");
@@ -290,7 +331,10 @@ async fn a_connection_over_the_limit_is_told_so_and_closed() {
     second.write_all(ask).await.unwrap();
     let mut answer = String::new();
     second.read_to_string(&mut answer).await.unwrap();
-    assert!(answer.starts_with("HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1"), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1"),
+        "{answer}"
+    );
     let (_, problem) = answer.split_once("\r\n\r\n").unwrap();
     assert_eq!(serde_json::from_str::<Value>(problem).unwrap()["status"], 503);
     drop((first, second));
@@ -306,7 +350,8 @@ async fn half_a_body_is_not_waited_for_for_ever() {
     };
     let server = run(app(dir.path(), config)).await;
     let mut client = TcpStream::connect(server.address).await.unwrap();
-    let head = format!("POST {PLAIN} HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\ncontent-length: 99\r\n\r\n{{");
+    let head =
+        format!("POST {PLAIN} HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\ncontent-length: 99\r\n\r\n{{");
     client.write_all(head.as_bytes()).await.unwrap();
     let mut beginning = [0; 12];
     client.read_exact(&mut beginning).await.unwrap();
@@ -335,7 +380,11 @@ async fn an_accepted_request_is_answered_while_the_server_stops() {
     let mut answer = String::new();
     client.read_to_string(&mut answer).await.unwrap();
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    tokio::time::timeout(crate::service::PATIENCE, server.task).await.unwrap().unwrap().unwrap();
+    tokio::time::timeout(crate::service::PATIENCE, server.task)
+        .await
+        .unwrap()
+        .unwrap()
+        .unwrap();
     assert!(TcpStream::connect(server.address).await.is_err());
 }
 
@@ -376,10 +425,17 @@ async fn every_path_of_the_contract_is_answered() {
         for method in methods.as_object().unwrap().keys() {
             let path = path.replace("{model}", "plain").replace("{id}", "job-9");
             let method = method.to_uppercase();
-            let request = Request::builder().method(method.as_str()).uri(&path).body(Body::empty()).unwrap();
+            let request = Request::builder()
+                .method(method.as_str())
+                .uri(&path)
+                .body(Body::empty())
+                .unwrap();
             let answer = send(&app, request).await;
             let text = String::from_utf8_lossy(&answer.body).into_owned();
-            assert!(answer.status != 405 && !text.contains("nothing at this path"), "{method} {path}: {text}");
+            assert!(
+                answer.status != 405 && !text.contains("nothing at this path"),
+                "{method} {path}: {text}"
+            );
         }
     }
 }

@@ -139,7 +139,10 @@ impl Answer {
 pub async fn send(app: &App, request: Request<Body>) -> Answer {
     let response = server::router(app.clone()).oneshot(request).await.unwrap();
     let (status, headers) = (response.status(), response.headers().clone());
-    let body = axum::body::to_bytes(response.into_body(), 1 << 24).await.unwrap().to_vec();
+    let body = axum::body::to_bytes(response.into_body(), 1 << 24)
+        .await
+        .unwrap()
+        .to_vec();
     Answer { status, headers, body }
 }
 
@@ -186,7 +189,11 @@ pub async fn run(app: App) -> Running {
 impl Running {
     pub async fn stop(self) {
         let _ = self.shutdown.send(());
-        tokio::time::timeout(PATIENCE, self.task).await.unwrap().unwrap().unwrap();
+        tokio::time::timeout(PATIENCE, self.task)
+            .await
+            .unwrap()
+            .unwrap()
+            .unwrap();
     }
 }
 
