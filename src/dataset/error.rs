@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use crate::frame::FrameError;
+use crate::sim::SimError;
 
 /// Why a data set could not be made, read or sampled: what was wrong and what would be right.
 #[derive(Debug, thiserror::Error)]
@@ -136,15 +137,23 @@ pub enum DatasetError {
         reason: String,
     },
     /// A frame in a file is no image of the right size.
-    #[error("{path}, row {row}: frame is damaged", path = path.display())]
+    #[error("{path}, row {row}: {column} is damaged", path = path.display())]
     CorruptFrame {
         /// The file.
         path: PathBuf,
+        /// The column of images.
+        column: &'static str,
         /// Row in it.
         row: usize,
         /// What is wrong with the image.
         source: FrameError,
     },
+    /// A frame could not be compressed.
+    #[error("a frame could not be stored")]
+    Encode(#[source] FrameError),
+    /// A table could not be built.
+    #[error("a table of the data set could not be built")]
+    Build(#[source] parquet::errors::ParquetError),
     /// A file is not the one that was collected.
     #[error(
         "{path} has the sha256 {found}, but {expected} was recorded when it was made; restore the file or collect the \
@@ -164,6 +173,51 @@ pub enum DatasetError {
     NotADataset {
         /// The directory.
         path: PathBuf,
+    },
+    /// The directory is in use for something else.
+    #[error(
+        "{path} exists and is not a collection; name a directory that doesn't exist or is empty",
+        path = path.display()
+    )]
+    OutExists {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The collection there was begun with other arguments.
+    #[error(
+        "{path} was begun with other arguments ({differences}); use those to go on, or name another directory",
+        path = path.display()
+    )]
+    OtherArguments {
+        /// The directory.
+        path: PathBuf,
+        /// Each argument that differs, with both values.
+        differences: String,
+    },
+    /// Another collection is writing there.
+    #[error("another collection is running in {path}; wait for it or name another directory", path = path.display())]
+    Busy {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The collection was stopped before its end.
+    #[error("stopped with {done} of {total} trials kept; run the same command again to go on")]
+    Cancelled {
+        /// Trials in finished shards.
+        done: u64,
+        /// Trials asked for.
+        total: u64,
+    },
+    /// The world's settings are out of range.
+    #[error(transparent)]
+    World(SimError),
+    /// The world refused.
+    #[error("trial {trial} could not be simulated")]
+    Simulation {
+        /// The trial.
+        trial: u64,
+        /// What the world said.
+        source: SimError,
     },
     /// The collection was interrupted.
     #[error(

@@ -22,9 +22,9 @@ pub const OBSERVER: PlanarPose = PlanarPose {
 };
 
 /// Tb2's 3 starts, [x, y] in metres.
-pub const STARTS_M: [[f32; 2]; 3] = [[2.55, 1.1], [3.7, -0.3], [1.75, -0.55]];
+pub const STARTS_M: [[f32; 2]; 3] = [[2.5, 0.95], [3.5, -0.3], [1.75, -0.5]];
 /// Tb2's 4 goals, [x, y] in metres.
-pub const GOALS_M: [[f32; 2]; 4] = [[1.7, 0.5], [3.6, 1.35], [3.0, -1.3], [2.85, 0.2]];
+pub const GOALS_M: [[f32; 2]; 4] = [[1.65, 0.4], [3.4, 1.25], [2.9, -1.15], [2.7, 0.05]];
 
 /// A round column from floor to ceiling.
 #[derive(Clone, Copy, Debug)]
@@ -135,6 +135,6 @@ fn wall_albedo(base: f32, along_m: f32, z: f32, door_m: f32) -> f32 {
     let skirting = 1.0 - 0.35 * (1.0 - z / 0.18).clamp(0.0, 1.0);
     let beside = ((along_m - door_m).abs() - 0.32) / 0.16;
     let door = (1.0 - beside.clamp(0.0, 1.0)) * (1.0 - ((z - 1.3) / 0.2).clamp(0.0, 1.0));
-    let light = if base > 0.6 { 0.62 } else { 1.45 };
+    let light = if base > 0.6 { 0.7 } else { 1.45 };
     base * waves * skirting * (1.0 + (light - 1.0) * door)
 }

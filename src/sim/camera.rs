@@ -19,7 +19,7 @@ const EDGE_RAYS: usize = 3;
 /// Neighbours that differ by more than this are an edge though they hit the same thing.
 const EDGE_STEP: f32 = 0.06;
 /// Share of the light that comes from everywhere.
-const AMBIENT: f32 = 0.5;
+const AMBIENT: f32 = 0.6;
 /// Towards the lamp.
 static LIGHT: LazyLock<Vector> = LazyLock::new(|| Vector::new(-0.45, 0.35, 0.82).normalize());
 

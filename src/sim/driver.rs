@@ -16,13 +16,13 @@ pub(super) const TURN_RAD_S: f32 = 0.8;
 /// Memory of the random commands, in seconds.
 const MEMORY_S: f32 = 0.8;
 const LINEAR_STD_M_S: f32 = 0.17;
-const ANGULAR_STD_RAD_S: f32 = 0.5;
+const ANGULAR_STD_RAD_S: f32 = 0.45;
 /// Mean time until another place is sought, in seconds.
 const PATIENCE_S: f32 = 3.0;
 /// The driver turns away from what is nearer than this, in metres.
-const CAUTION_M: f32 = 0.7;
+const CAUTION_M: f32 = 0.8;
 /// And stops before what is nearer than this.
-const STOP_M: f32 = 0.12;
+const STOP_M: f32 = 0.2;
 
 /// The driver's mood and aim.
 pub(super) struct Driver {
@@ -51,7 +51,7 @@ impl Driver {
         let aim = self.aim(pose, others, period);
         let bearing = arena::bearing(pose, aim);
         let linear = (CRUISE_M_S / 2.0 + self.linear) * (0.4 + 0.6 * bearing.cos().max(0.0));
-        let angular = (0.8 * bearing).clamp(-0.5, 0.5) + self.angular;
+        let angular = (1.2 * bearing).clamp(-0.6, 0.6) + self.angular;
         keep_off(pose, others, [linear, angular])
     }
 
@@ -72,7 +72,7 @@ impl Driver {
             let y = self
                 .random
                 .random_range(0.5 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.5);
-            self.place_m = self.random.random_bool(0.4).then_some([x, y]);
+            self.place_m = self.random.random_bool(0.25).then_some([x, y]);
         }
         self.place_m
             .or(others.first().copied())

@@ -95,11 +95,11 @@ impl PidGains {
                 derivative: random.random_range(0.0..0.2),
             },
             distance: Gains {
-                proportional: random.random_range(0.6..1.2),
+                proportional: random.random_range(0.5..1.1),
                 integral: random.random_range(0.0..0.1),
                 derivative: random.random_range(0.0..0.1),
             },
-            max_linear_m_s: random.random_range(0.3..0.65),
+            max_linear_m_s: random.random_range(0.3..0.6),
         }
     }
 }
@@ -151,7 +151,7 @@ impl TrialParameters {
         let gains = PidGains::draw(&mut random);
         let start_m = arena::STARTS_M[start];
         let ahead = facing(start_m, arena::GOALS_M[goal]);
-        let start_heading_rad = robot::wrap(ahead + random.random_range(-1.3..1.3));
+        let start_heading_rad = robot::wrap(ahead + random.random_range(-1.5..1.5));
         let mut taken = vec![start_m];
         let observer = if scenario.observer_drives() {
             let place = free_place(&mut random, &taken, 1.0);

@@ -3,4 +3,6 @@
 mod architecture;
 mod training;
 
+mod dataset_collect;
+mod dataset_sampler;
 mod sim;

@@ -1,0 +1,253 @@
+//! The directory of a collection: begun, left, taken up again, completed.
+
+use std::fs::{self, File, TryLockError};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use super::collect::CollectConfig;
+use super::files::{sha256, sha256_of_file, write_atomically};
+use super::layout::{ARGUMENTS, INFO, Stamp, shard_path};
+use super::shard::{EncodedEpisode, ShardStart, build};
+use super::shard_reader::records;
+use super::store::{FinishedShard, complete};
+use super::{DatasetError, DatasetInfo};
+use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
+use crate::types::Seed;
+
+/// What decides a collection's bytes; kept in the directory from the start.
+#[derive(Serialize)]
+struct Arguments<'a> {
+    program_version: &'static str,
+    scenario: Scenario,
+    trials: u64,
+    seed: Seed,
+    trials_per_shard: u64,
+    world: &'a WorldConfig,
+}
+
+impl Arguments<'_> {
+    fn text(config: &CollectConfig) -> Result<String, DatasetError> {
+        let arguments = Arguments {
+            program_version: env!("CARGO_PKG_VERSION"),
+            scenario: config.scenario,
+            trials: config.trials,
+            seed: config.seed,
+            trials_per_shard: config.trials_per_shard,
+            world: &config.world,
+        };
+        let text = serde_json::to_string_pretty(&arguments);
+        text.map(|text| text + "\n")
+            .map_err(|error| DatasetError::Description(error.to_string()))
+    }
+}
+
+/// How far the collection in a directory is.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Standing {
+    /// Nothing is there yet.
+    New,
+    /// So many trials are there already.
+    Begun {
+        /// Trials in finished shards.
+        trials: u64,
+    },
+    /// Everything is there.
+    Finished(Box<DatasetInfo>),
+}
+
+impl Standing {
+    /// How far the collection of that configuration is; changes nothing.
+    /// Errors: `OutExists`, `OtherArguments`, as [`super::collect()`].
+    pub fn of(config: &CollectConfig) -> Result<Self, DatasetError> {
+        let out = &config.out;
+        let Some(found) = read_arguments(out)? else {
+            return if is_unused(out)? {
+                Ok(Self::New)
+            } else {
+                Err(DatasetError::OutExists { path: out.clone() })
+            };
+        };
+        let wanted = Arguments::text(config)?;
+        if found != wanted {
+            return Err(DatasetError::OtherArguments {
+                path: out.clone(),
+                differences: differences(&found, &wanted),
+            });
+        }
+        if out.join(INFO).exists() {
+            return Ok(Self::Finished(Box::new(Stamp::read(out)?.info())));
+        }
+        let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
+        let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
+        Ok(Self::Begun { trials })
+    }
+}
+
+fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
+    let path = out.join(ARGUMENTS);
+    match fs::read_to_string(&path) {
+        Ok(text) => Ok(Some(text)),
+        // Where `out` is a file, that says so itself.
+        Err(error)
+            if matches!(
+                error.kind(),
+                std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory
+            ) =>
+        {
+            Ok(None)
+        }
+        Err(error) => Err(DatasetError::io("read", &path)(error)),
+    }
+}
+
+/// Whether a directory is missing, empty, or holds no more than a collection that was killed before its first write
+/// was done.
+fn is_unused(out: &Path) -> Result<bool, DatasetError> {
+    if !out.exists() {
+        return Ok(true);
+    }
+    if !out.is_dir() {
+        return Ok(false);
+    }
+    let names = |path: &Path| -> Result<Vec<PathBuf>, DatasetError> {
+        fs::read_dir(path)
+            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+            .map(|entries| entries.iter().map(fs::DirEntry::path).collect())
+            .map_err(DatasetError::io("read", path))
+    };
+    for path in names(out)? {
+        let is_meta = path == out.join("meta") && path.is_dir();
+        let only_half = is_meta
+            && names(&path)?
+                .iter()
+                .all(|inner| *inner == out.join(ARGUMENTS.to_owned() + ".tmp"));
+        if !only_half {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// Every argument that differs, as `trials: 5 there, 6 asked`.
+fn differences(found: &str, wanted: &str) -> String {
+    let object = |text: &str| serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();
+    let (found, wanted) = (object(found), object(wanted));
+    let shown = |value: Option<&Value>| value.map_or_else(|| "none".to_owned(), Value::to_string);
+    let differing: Vec<_> = wanted
+        .iter()
+        .filter(|(key, value)| found.get(*key) != Some(value))
+        .map(|(key, value)| format!("{key}: {} there, {} asked", shown(found.get(key)), shown(Some(value))))
+        .collect();
+    differing.join("; ")
+}
+
+/// A collection that is being written: its finished shards, from the first without a hole.
+pub(super) struct Collection<'a> {
+    config: &'a CollectConfig,
+    info: DatasetInfo,
+    shards: Vec<FinishedShard>,
+    start: ShardStart,
+    /// Held as long as this process writes.
+    _lock: File,
+}
+
+impl<'a> Collection<'a> {
+    /// Takes a directory whose standing was found to be new or begun, and looks what is there.
+    pub(super) fn begin(config: &'a CollectConfig) -> Result<Self, DatasetError> {
+        let path = config.out.join(ARGUMENTS);
+        if !path.exists() {
+            write_atomically(&path, Arguments::text(config)?.as_bytes())?;
+        }
+        let lock = File::open(&path).map_err(DatasetError::io("read", &path))?;
+        lock.try_lock().map_err(|error| match error {
+            TryLockError::WouldBlock => DatasetError::Busy {
+                path: config.out.clone(),
+            },
+            TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
+        })?;
+        let mut collection = Self {
+            info: description(config),
+            config,
+            shards: Vec::new(),
+            start: ShardStart { episode: 0, frame: 0 },
+            _lock: lock,
+        };
+        while let Some(shard) = collection.finished_on_disk() {
+            collection.push(shard);
+        }
+        Ok(collection)
+    }
+
+    /// What is being collected; counts and hash are not filled in yet.
+    pub(super) fn info(&self) -> &DatasetInfo {
+        &self.info
+    }
+
+    /// Shards that are there.
+    pub(super) fn shard_count(&self) -> usize {
+        self.shards.len()
+    }
+
+    /// Trials that are there.
+    pub(super) fn trial_count(&self) -> u64 {
+        self.start.episode as u64
+    }
+
+    /// The next shard, if it is on the disk and whole; a damaged one is made anew.
+    fn finished_on_disk(&self) -> Option<FinishedShard> {
+        let shard = self.shards.len();
+        if shard >= self.config.shard_count() {
+            return None;
+        }
+        let path = self.config.out.join(shard_path(shard));
+        let records = records(&path).ok()?;
+        let sha256 = sha256_of_file(&path).ok()?;
+        (records.len() == self.config.shard_trials(shard).count()).then_some(FinishedShard { sha256, records })
+    }
+
+    fn push(&mut self, shard: FinishedShard) {
+        self.start = ShardStart {
+            episode: self.start.episode + shard.records.len(),
+            frame: self.start.frame + shard.frames(),
+        };
+        self.shards.push(shard);
+    }
+
+    /// Writes the next shard.
+    pub(super) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
+        let built = build(&self.info, self.start, episodes)?;
+        write_atomically(&self.config.out.join(shard_path(self.shards.len())), &built.bytes)?;
+        // Read back from the text, as a later run would, so that going on changes no digit.
+        let records =
+            serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
+        self.push(FinishedShard {
+            sha256: sha256(&built.bytes),
+            records,
+        });
+        Ok(())
+    }
+
+    /// Writes the tables and descriptions, once every shard is there.
+    pub(super) fn complete(self) -> Result<DatasetInfo, DatasetError> {
+        complete(&self.config.out, self.info, &self.shards)
+    }
+}
+
+fn description(config: &CollectConfig) -> DatasetInfo {
+    DatasetInfo {
+        name: format!("{}-{}-seed-{}", config.scenario, config.trials, config.seed.0),
+        frame_width_px: config.world.frame_width_px,
+        frame_height_px: config.world.frame_height_px,
+        frame_period_s: config.world.frame_period_s,
+        action_channels: action_channels(),
+        state_channels: state_channels(),
+        content_hash: String::new(),
+        scenario: Some(config.scenario.to_string()),
+        seed: Some(config.seed),
+        frame_count: 0,
+        episode_count: 0,
+        has_masks: true,
+    }
+}

@@ -1,0 +1,219 @@
+//! Where things lie in a data set's directory (LeRobot's v3.0 layout) and what its descriptions say.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::files::sha256;
+use super::{DatasetError, DatasetInfo};
+use crate::types::{Channel, Seed};
+
+/// LeRobot's description; written last, so a directory without it is unfinished.
+pub(super) const INFO: &str = "meta/info.json";
+/// Ours: hashes and exact values.
+pub(super) const STAMP: &str = "meta/foreframe.json";
+/// The arguments of the collection; written first.
+pub(super) const ARGUMENTS: &str = "meta/collect.json";
+/// Figures of every column.
+pub(super) const STATS: &str = "meta/stats.json";
+/// The one task.
+pub(super) const TASKS: &str = "meta/tasks.parquet";
+/// The episodes.
+pub(super) const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
+
+/// Most files in one chunk directory.
+const CHUNK_FILES: usize = 1000;
+
+/// Names of the columns.
+pub(super) const IMAGE: &str = "observation.image";
+pub(super) const MASK: &str = "observation.mask";
+pub(super) const STATE: &str = "observation.state";
+pub(super) const ACTION: &str = "action";
+pub(super) const TIMESTAMP: &str = "timestamp";
+/// Counters that LeRobot keeps for every frame.
+pub(super) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", "index", "task_index"];
+
+/// Chunk directory and file within it of a shard.
+pub(super) fn shard_place(shard: usize) -> (usize, usize) {
+    (shard / CHUNK_FILES, shard % CHUNK_FILES)
+}
+
+/// Path of a shard within the data set.
+pub(super) fn shard_path(shard: usize) -> PathBuf {
+    let (chunk, file) = shard_place(shard);
+    PathBuf::from(format!("data/chunk-{chunk:03}/file-{file:03}.parquet"))
+}
+
+/// One data file, as the stamp records it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ShardEntry {
+    pub(super) path: PathBuf,
+    pub(super) sha256: String,
+    pub(super) episodes: usize,
+    pub(super) frames: usize,
+}
+
+/// What `meta/foreframe.json` holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Stamp {
+    pub(super) program_version: String,
+    pub(super) name: String,
+    pub(super) scenario: Option<String>,
+    pub(super) seed: Option<Seed>,
+    pub(super) frame_width_px: u32,
+    pub(super) frame_height_px: u32,
+    pub(super) frame_period_s: f64,
+    pub(super) action_channels: Vec<Channel>,
+    pub(super) state_channels: Vec<Channel>,
+    pub(super) has_masks: bool,
+    pub(super) content_hash: String,
+    pub(super) episodes_sha256: String,
+    pub(super) shards: Vec<ShardEntry>,
+}
+
+impl Stamp {
+    /// Reads and checks the stamp of a finished data set. Errors: `Unfinished`, `NotADataset`, `Corrupt`.
+    pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
+        let arguments = directory.join(ARGUMENTS);
+        if !directory.join(INFO).exists() {
+            return Err(match std::fs::read_to_string(arguments) {
+                Ok(text) => DatasetError::Unfinished {
+                    path: directory.to_owned(),
+                    arguments: one_line(&text),
+                },
+                Err(_) => DatasetError::NotADataset {
+                    path: directory.to_owned(),
+                },
+            });
+        }
+        let path = directory.join(STAMP);
+        let text = std::fs::read_to_string(&path).map_err(DatasetError::io("read", &path))?;
+        let corrupt = |reason| DatasetError::Corrupt {
+            path: path.clone(),
+            reason,
+        };
+        let stamp: Self = serde_json::from_str(&text).map_err(|error| corrupt(error.to_string()))?;
+        if stamp.content_hash != content_hash(&stamp.shards) {
+            return Err(corrupt(
+                "its content hash is not that of the shards it lists".to_owned(),
+            ));
+        }
+        Ok(stamp)
+    }
+
+    /// What the data set is.
+    pub(super) fn info(&self) -> DatasetInfo {
+        DatasetInfo {
+            name: self.name.clone(),
+            frame_width_px: self.frame_width_px,
+            frame_height_px: self.frame_height_px,
+            frame_period_s: self.frame_period_s,
+            action_channels: self.action_channels.clone(),
+            state_channels: self.state_channels.clone(),
+            content_hash: self.content_hash.clone(),
+            scenario: self.scenario.clone(),
+            seed: self.seed,
+            frame_count: self.shards.iter().map(|shard| shard.frames).sum(),
+            episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
+            has_masks: self.has_masks,
+        }
+    }
+}
+
+/// The hex sha256 over the shards' hex hashes, one after another.
+pub(super) fn content_hash(shards: &[ShardEntry]) -> String {
+    let hashes: String = shards.iter().map(|shard| shard.sha256.as_str()).collect();
+    sha256(hashes.as_bytes())
+}
+
+/// A JSON object without its line breaks, for a message.
+fn one_line(text: &str) -> String {
+    serde_json::from_str::<Value>(text).map_or_else(|_| text.trim().to_owned(), |value| value.to_string())
+}
+
+/// LeRobot's `info.json` of a data set.
+pub(super) fn lerobot_info(info: &DatasetInfo) -> Value {
+    json!({
+        "codebase_version": "v3.0",
+        "robot_type": "turtlebot",
+        "total_episodes": info.episode_count,
+        "total_frames": info.frame_count,
+        "total_tasks": 1,
+        "chunks_size": CHUNK_FILES,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": frame_rate(info.frame_period_s),
+        "splits": {"train": format!("0:{}", info.episode_count)},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": null,
+        "features": lerobot_features(info),
+    })
+}
+
+/// Frames a second: a whole number where the period allows, since LeRobot wants one.
+fn frame_rate(period_s: f64) -> Value {
+    let rate = 1.0 / period_s;
+    if (rate - rate.round()).abs() < 1e-6 * rate {
+        json!(rate.round() as u64)
+    } else {
+        json!(rate)
+    }
+}
+
+fn lerobot_features(info: &DatasetInfo) -> Value {
+    let image = json!({
+        "dtype": "image",
+        "shape": [info.frame_height_px, info.frame_width_px, 1],
+        "names": ["height", "width", "channels"],
+    });
+    let mut features = serde_json::Map::new();
+    features.insert(IMAGE.to_owned(), image.clone());
+    if info.has_masks {
+        features.insert(MASK.to_owned(), image);
+    }
+    for (key, channels) in [(STATE, &info.state_channels), (ACTION, &info.action_channels)] {
+        if !channels.is_empty() {
+            let names: Vec<_> = channels.iter().map(|channel| &channel.name).collect();
+            features.insert(
+                key.to_owned(),
+                json!({"dtype": "float32", "shape": [channels.len()], "names": names}),
+            );
+        }
+    }
+    let scalar = |dtype: &str| json!({"dtype": dtype, "shape": [1], "names": null});
+    features.insert(TIMESTAMP.to_owned(), scalar("float32"));
+    for key in COUNTERS {
+        features.insert(key.to_owned(), scalar("int64"));
+    }
+    Value::Object(features)
+}
+
+/// The columns as the `datasets` library describes them, for the Parquet schema's `huggingface` entry.
+pub(super) fn huggingface_features(info: &DatasetInfo) -> Value {
+    let value = |dtype: &str| json!({"dtype": dtype, "_type": "Value"});
+    let mut features = serde_json::Map::new();
+    features.insert(IMAGE.to_owned(), json!({"_type": "Image"}));
+    if info.has_masks {
+        features.insert(MASK.to_owned(), json!({"_type": "Image"}));
+    }
+    for (key, size) in [(STATE, info.state_channels.len()), (ACTION, info.action_channels.len())] {
+        match size {
+            0 => {}
+            1 => {
+                features.insert(key.to_owned(), value("float32"));
+            }
+            _ => {
+                let list = json!({"feature": value("float32"), "length": size, "_type": "Sequence"});
+                features.insert(key.to_owned(), list);
+            }
+        }
+    }
+    features.insert(TIMESTAMP.to_owned(), value("float32"));
+    for key in COUNTERS {
+        features.insert(key.to_owned(), value("int64"));
+    }
+    json!({"info": {"features": features}})
+}

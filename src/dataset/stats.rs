@@ -1,0 +1,120 @@
+//! Minimum, maximum, mean and standard deviation of every column, as LeRobot keeps them beside the data.
+
+use serde::{Deserialize, Serialize};
+
+/// One column's figures; one value for each of its components.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct FeatureStats {
+    pub(super) min: Vec<f64>,
+    pub(super) max: Vec<f64>,
+    pub(super) mean: Vec<f64>,
+    pub(super) std: Vec<f64>,
+    /// Frames the figures come from.
+    pub(super) count: u64,
+}
+
+impl FeatureStats {
+    /// Of rows of `size` numbers each, one row a frame.
+    pub(super) fn of_rows(rows: &[f64], size: usize) -> Self {
+        let count = rows.len() / size.max(1);
+        let mut stats = Self::with_components(size, count as u64);
+        for component in 0..size {
+            let values = || rows.iter().skip(component).step_by(size);
+            let mean = values().sum::<f64>() / count as f64;
+            let variance = values().map(|value| (value - mean).powi(2)).sum::<f64>() / count as f64;
+            stats.min.push(values().copied().fold(f64::INFINITY, f64::min));
+            stats.max.push(values().copied().fold(f64::NEG_INFINITY, f64::max));
+            stats.mean.push(mean);
+            stats.std.push(variance.sqrt());
+        }
+        stats
+    }
+
+    /// Of the pixels of `frames` frames, with 255 as 1.
+    pub(super) fn of_pixels(pixels: &[u8], frames: usize) -> Self {
+        let mut histogram = [0u64; 256];
+        for &pixel in pixels {
+            histogram[usize::from(pixel)] += 1;
+        }
+        let total = pixels.len() as f64;
+        let levels = || (0..256).map(|level| f64::from(level) / 255.0).zip(histogram);
+        let mean = levels().map(|(value, count)| value * count as f64).sum::<f64>() / total;
+        let variance = levels()
+            .map(|(value, count)| (value - mean).powi(2) * count as f64)
+            .sum::<f64>()
+            / total;
+        let seen = || levels().filter(|&(_, count)| count > 0).map(|(value, _)| value);
+        Self {
+            min: vec![seen().fold(f64::INFINITY, f64::min)],
+            max: vec![seen().fold(f64::NEG_INFINITY, f64::max)],
+            mean: vec![mean],
+            std: vec![variance.sqrt()],
+            count: frames as u64,
+        }
+    }
+
+    /// Of all parts together, each weighted by its frames.
+    pub(super) fn merged(parts: &[&Self]) -> Self {
+        let size = parts.first().map_or(0, |part| part.mean.len());
+        let count: u64 = parts.iter().map(|part| part.count).sum();
+        let mut stats = Self::with_components(size, count);
+        for component in 0..size {
+            let mean_of = |value: &dyn Fn(&Self) -> f64| {
+                parts.iter().map(|part| part.count as f64 * value(part)).sum::<f64>() / count as f64
+            };
+            let mean = mean_of(&|part| part.mean[component]);
+            let variance = mean_of(&|part| part.std[component].powi(2) + (part.mean[component] - mean).powi(2));
+            let all = |column: fn(&Self) -> &Vec<f64>| parts.iter().map(move |part| column(part)[component]);
+            stats.min.push(all(|part| &part.min).fold(f64::INFINITY, f64::min));
+            stats.max.push(all(|part| &part.max).fold(f64::NEG_INFINITY, f64::max));
+            stats.mean.push(mean);
+            stats.std.push(variance.sqrt());
+        }
+        stats
+    }
+
+    fn with_components(size: usize, count: u64) -> Self {
+        let empty = || Vec::with_capacity(size);
+        Self {
+            min: empty(),
+            max: empty(),
+            mean: empty(),
+            std: empty(),
+            count,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_of_two_components_are_those_of_their_columns() {
+        let stats = FeatureStats::of_rows(&[1.0, 10.0, 3.0, 10.0], 2);
+        assert_eq!(
+            (stats.min, stats.max, stats.mean, stats.std, stats.count),
+            (vec![1.0, 10.0], vec![3.0, 10.0], vec![2.0, 10.0], vec![1.0, 0.0], 2)
+        );
+    }
+
+    #[test]
+    fn merged_figures_are_those_of_all_frames() {
+        let all: Vec<f64> = (0..30).map(|i| f64::from(i * i % 17)).collect();
+        let parts = [FeatureStats::of_rows(&all[..9], 1), FeatureStats::of_rows(&all[9..], 1)];
+        let merged = FeatureStats::merged(&[&parts[0], &parts[1]]);
+        let whole = FeatureStats::of_rows(&all, 1);
+        assert_eq!(
+            (&merged.min, &merged.max, merged.count),
+            (&whole.min, &whole.max, whole.count)
+        );
+        assert!((merged.mean[0] - whole.mean[0]).abs() < 1e-12);
+        assert!((merged.std[0] - whole.std[0]).abs() < 1e-12);
+    }
+
+    #[test]
+    fn half_black_and_half_white_pixels_have_mean_and_deviation_one_half() {
+        let stats = FeatureStats::of_pixels(&[0, 255, 255, 0], 1);
+        assert_eq!((stats.mean[0], stats.std[0]), (0.5, 0.5));
+    }
+}

@@ -1,0 +1,335 @@
+//! A data set on disk: reading one whole, and completing one whose shards are there.
+
+use std::path::Path;
+
+use arrow_array::types::Int64Type;
+use rayon::prelude::*;
+
+use super::check::{Numbers, check_numbers};
+use super::files::{verify, write_atomically};
+use super::layout::{self, EPISODES, INFO, STAMP, STATS, ShardEntry, Stamp, TASKS};
+use super::shard::EpisodeRecord;
+use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
+use super::tables::{self, EpisodeRow};
+use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
+
+impl Dataset {
+    /// Reads a data set whole, after checking that every file is the one that was written.
+    /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, numbers that aren't finite.
+    pub fn open(directory: &Path) -> Result<Self, DatasetError> {
+        let stamp = Stamp::read(directory)?;
+        let info = stamp.info();
+        let path = directory.join(EPISODES);
+        verify(&path, &stamp.episodes_sha256)?;
+        let episodes = read_episodes(&path, &info)?;
+        let mut dataset = Self {
+            pixels: vec![0; info.frame_count * info.frame_pixels()],
+            masks: info.has_masks.then(|| vec![0; info.frame_count * info.frame_pixels()]),
+            actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
+            states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
+            timestamps_s: Vec::with_capacity(info.frame_count),
+            info,
+            episodes,
+        };
+        let slots = slots(&mut dataset, directory, &stamp.shards);
+        let info = stamp.info();
+        let numbers: Result<Vec<ShardNumbers>, DatasetError> = slots
+            .into_par_iter()
+            .zip(&stamp.shards)
+            .map(|(mut slot, entry)| {
+                verify(&slot.path, &entry.sha256)?;
+                read(&info, &mut slot)
+            })
+            .collect();
+        for part in numbers? {
+            dataset.actions.extend(part.actions);
+            dataset.states.extend(part.states);
+            dataset.timestamps_s.extend(part.timestamps_s);
+        }
+        for episode in &dataset.episodes {
+            let frames = episode.frames();
+            let actions = dataset.info.action_channels.len();
+            let states = dataset.info.state_channels.len();
+            check_numbers(
+                &dataset.info,
+                episode.index,
+                &Numbers {
+                    actions: &dataset.actions[frames.start * actions..frames.end * actions],
+                    states: &dataset.states[frames.start * states..frames.end * states],
+                    timestamps_s: &dataset.timestamps_s[frames],
+                },
+            )?;
+        }
+        Ok(dataset)
+    }
+}
+
+/// Hands every shard its part of the buffers.
+fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) -> Vec<ShardSlot<'a>> {
+    let size = dataset.info.frame_pixels();
+    let mut pixels = dataset.pixels.as_mut_slice();
+    let mut masks = dataset.masks.as_deref_mut();
+    let mut first_frame = 0;
+    let mut slots = Vec::with_capacity(shards.len());
+    for shard in shards {
+        let (mine, rest) = std::mem::take(&mut pixels).split_at_mut(shard.frames * size);
+        pixels = rest;
+        let mask = masks.take().map(|all| all.split_at_mut(shard.frames * size));
+        let (mask, rest) = mask.map_or((None, None), |(mine, rest)| (Some(mine), Some(rest)));
+        masks = rest;
+        slots.push(ShardSlot {
+            path: directory.join(&shard.path),
+            frames: shard.frames,
+            first_frame,
+            pixels: mine,
+            masks: mask,
+        });
+        first_frame += shard.frames;
+    }
+    slots
+}
+
+fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
+    let corrupt = |reason: String| DatasetError::Corrupt {
+        path: path.to_owned(),
+        reason,
+    };
+    let mut episodes = Vec::with_capacity(info.episode_count);
+    let mut first_frame = 0;
+    for batch in &batches(path)? {
+        let column = Column { batch, path };
+        let lengths = column.numbers::<Int64Type>("length")?;
+        for (&length, trial) in lengths.iter().zip(column.texts("trial")?) {
+            let frame_count = usize::try_from(length).map_err(|error| corrupt(error.to_string()))?;
+            let trial: Option<TrialParameters> = trial
+                .map(serde_json::from_str)
+                .transpose()
+                .map_err(|error| corrupt(format!("trial of episode {}: {error}", episodes.len())))?;
+            episodes.push(Episode {
+                index: episodes.len(),
+                first_frame,
+                frame_count,
+                trial,
+            });
+            first_frame += frame_count;
+        }
+    }
+    if (episodes.len(), first_frame) != (info.episode_count, info.frame_count) {
+        return Err(corrupt(format!(
+            "it has {} episodes of {first_frame} frames in all; {} of {} are recorded",
+            episodes.len(),
+            info.episode_count,
+            info.frame_count
+        )));
+    }
+    Ok(episodes)
+}
+
+/// A shard that is on the disk.
+pub(super) struct FinishedShard {
+    pub(super) sha256: String,
+    pub(super) records: Vec<EpisodeRecord>,
+}
+
+impl FinishedShard {
+    /// Frames in it.
+    pub(super) fn frames(&self) -> usize {
+        self.records.iter().map(|record| record.frames).sum()
+    }
+}
+
+/// Writes what completes a data set whose shards are all there; `meta/info.json` last. The counts and the hash of
+/// `info` are filled in.
+pub(super) fn complete(
+    directory: &Path,
+    info: DatasetInfo,
+    shards: &[FinishedShard],
+) -> Result<DatasetInfo, DatasetError> {
+    let mut rows = Vec::new();
+    let mut first_frame = 0;
+    for (shard, finished) in shards.iter().enumerate() {
+        for record in &finished.records {
+            rows.push(EpisodeRow {
+                record,
+                shard,
+                first_frame,
+            });
+            first_frame += record.frames;
+        }
+    }
+    let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
+    let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
+    let stamp = stamp(info, shards, super::files::sha256(&episodes));
+    let info = stamp.info();
+    write_atomically(&directory.join(EPISODES), &episodes)?;
+    let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
+    write_atomically(&directory.join(TASKS), &tasks)?;
+    write_json(&directory.join(STATS), &tables::stats_json(&rows))?;
+    write_json(&directory.join(STAMP), &stamp)?;
+    write_json(&directory.join(INFO), &layout::lerobot_info(&info))?;
+    Ok(info)
+}
+
+fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> Stamp {
+    let entries: Vec<_> = shards
+        .iter()
+        .enumerate()
+        .map(|(shard, finished)| ShardEntry {
+            path: layout::shard_path(shard),
+            sha256: finished.sha256.clone(),
+            episodes: finished.records.len(),
+            frames: finished.frames(),
+        })
+        .collect();
+    Stamp {
+        program_version: env!("CARGO_PKG_VERSION").to_owned(),
+        name: info.name,
+        scenario: info.scenario,
+        seed: info.seed,
+        frame_width_px: info.frame_width_px,
+        frame_height_px: info.frame_height_px,
+        frame_period_s: info.frame_period_s,
+        action_channels: info.action_channels,
+        state_channels: info.state_channels,
+        has_masks: info.has_masks,
+        content_hash: layout::content_hash(&entries),
+        episodes_sha256,
+        shards: entries,
+    }
+}
+
+fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetError> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|error| DatasetError::Description(error.to_string()))?;
+    text.push('\n');
+    write_atomically(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::files::sha256;
+    use super::super::shard::{EncodedEpisode, ShardStart, build};
+    use super::super::{EpisodeData, hex};
+    use super::*;
+    use crate::types::Channel;
+
+    fn info() -> DatasetInfo {
+        DatasetInfo {
+            name: "made-up".to_owned(),
+            frame_width_px: 4,
+            frame_height_px: 2,
+            frame_period_s: 0.2,
+            action_channels: vec![Channel::new("linear", "m/s")],
+            state_channels: vec![],
+            content_hash: String::new(),
+            scenario: None,
+            seed: None,
+            frame_count: 0,
+            episode_count: 0,
+            has_masks: false,
+        }
+    }
+
+    fn episode(frames: usize) -> EpisodeData {
+        EpisodeData {
+            timestamps_s: (0..frames).map(|frame| f64::from(frame as f32) * 0.25).collect(),
+            pixels: (0..frames * 8).map(|i| i as u8).collect(),
+            actions: (0..frames).map(|frame| frame as f32).collect(),
+            ..EpisodeData::default()
+        }
+    }
+
+    /// Writes a set of one shard, changed on the way, and opens it as one that `described` describes.
+    fn open_changed(
+        described: DatasetInfo,
+        change: impl Fn(&mut EncodedEpisode),
+        change_bytes: impl Fn(&mut Vec<u8>),
+    ) -> Result<Dataset, DatasetError> {
+        let directory = tempfile::tempdir().unwrap();
+        let mut encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
+        change(&mut encoded);
+        let start = ShardStart { episode: 0, frame: 0 };
+        let mut built = build(&info(), start, &[encoded]).unwrap();
+        change_bytes(&mut built.bytes);
+        let shard = FinishedShard {
+            sha256: sha256(&built.bytes),
+            records: serde_json::from_str(&built.records).unwrap(),
+        };
+        write_atomically(&directory.path().join(layout::shard_path(0)), &built.bytes).unwrap();
+        complete(directory.path(), described, &[shard]).unwrap();
+        Dataset::open(directory.path())
+    }
+
+    #[test]
+    fn one_component_actions_and_no_states_come_back_as_they_were() {
+        let read = open_changed(info(), |_| {}, |_| {}).unwrap();
+        let mut made = Dataset::from_episodes(info(), vec![episode(5)]).unwrap();
+        made.info.content_hash = read.info.content_hash.clone();
+        assert_eq!(read, made);
+    }
+
+    #[test]
+    fn actions_that_are_not_finite_are_refused() {
+        let error = open_changed(info(), |episode| episode.actions[2] = f32::INFINITY, |_| {}).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "episode 0, frame 2: action is inf; every number must be finite"
+        );
+    }
+
+    #[test]
+    fn frames_of_another_size_are_refused() {
+        let described = DatasetInfo {
+            frame_width_px: 2,
+            frame_height_px: 4,
+            ..info()
+        };
+        let message = open_changed(described, |_| {}, |_| {}).unwrap_err().to_string();
+        assert!(
+            message.contains("row 0 is 4×2 px; the data set has frames of 2×4 px"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn actions_of_another_dimension_are_refused() {
+        let two = vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")];
+        let described = DatasetInfo {
+            action_channels: two,
+            ..info()
+        };
+        let message = open_changed(described, |_| {}, |_| {}).unwrap_err().to_string();
+        assert!(message.contains("no column \"action\" of vectors"), "{message}");
+    }
+
+    #[test]
+    fn truncated_or_damaged_bytes_never_panic_and_name_the_file() {
+        for kept in [0, 3, 40, 400] {
+            let error = open_changed(info(), |_| {}, |bytes| bytes.truncate(kept)).unwrap_err();
+            assert!(error.to_string().contains("file-000.parquet is damaged"), "{error}");
+        }
+        let error = open_changed(info(), |_| {}, |bytes| bytes[40..120].fill(0xA5)).unwrap_err();
+        assert!(error.to_string().contains("file-000.parquet"), "{error}");
+    }
+
+    #[test]
+    fn a_frame_that_is_no_image_is_named() {
+        let error = open_changed(info(), |episode| episode.images[3] = vec![1, 2, 3], |_| {}).unwrap_err();
+        assert!(
+            error
+                .to_string()
+                .ends_with("file-000.parquet, row 3: observation.image is damaged")
+        );
+    }
+
+    #[test]
+    fn the_content_hash_is_that_of_the_shards_hashes_in_order() {
+        let read = open_changed(info(), |_| {}, |_| {}).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
+        let built = build(&info(), ShardStart { episode: 0, frame: 0 }, &[encoded]).unwrap();
+        let path = directory.path().join("shard");
+        std::fs::write(&path, &built.bytes).unwrap();
+        let digest = <sha2::Sha256 as sha2::Digest>::digest(super::super::files::sha256_of_file(&path).unwrap());
+        assert_eq!(read.info().content_hash, hex(&digest));
+    }
+}

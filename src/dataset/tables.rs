@@ -1,0 +1,194 @@
+//! The small tables beside the data: tasks, episodes and figures of every column.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use arrow_array::builder::{Float64Builder, ListBuilder, StringBuilder};
+use arrow_array::{ArrayRef, Int64Array, RecordBatch, StringArray};
+use arrow_schema::{DataType, Field, Schema};
+use parquet::arrow::ArrowWriter;
+use parquet::basic::Compression;
+use parquet::errors::ParquetError;
+use parquet::file::properties::WriterProperties;
+use serde_json::{Value, json};
+
+use super::layout::{COUNTERS, IMAGE, MASK, shard_place};
+use super::shard::EpisodeRecord;
+use super::stats::FeatureStats;
+
+/// An episode in its place: its record and where its frames lie.
+pub(super) struct EpisodeRow<'a> {
+    pub(super) record: &'a EpisodeRecord,
+    pub(super) shard: usize,
+    pub(super) first_frame: usize,
+}
+
+impl EpisodeRow<'_> {
+    /// The figures of every column; those of the counters follow from the place.
+    fn stats(&self, episode: usize) -> BTreeMap<String, FeatureStats> {
+        let mut stats = self.record.stats.clone();
+        let starts = [(0, 1), (episode, 0), (self.first_frame, 1), (0, 0)];
+        for (key, (first, step)) in COUNTERS.iter().zip(starts) {
+            let values: Vec<f64> = (0..self.record.frames).map(|i| (first + step * i) as f64).collect();
+            stats.insert((*key).to_owned(), FeatureStats::of_rows(&values, 1));
+        }
+        stats
+    }
+}
+
+/// A table of one task, laid out as pandas does an index named `task`, since LeRobot looks tasks up by it.
+pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
+    let column = |name: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
+    let pandas = json!({
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [column("task_index", "int64", "int64"), column("task", "unicode", "object")],
+        "creator": {"library": "foreframe", "version": env!("CARGO_PKG_VERSION")},
+        "pandas_version": "2.0.0",
+    });
+    let columns: Vec<(String, ArrayRef)> = vec![
+        ("task_index".to_owned(), Arc::new(Int64Array::from(vec![0]))),
+        ("task".to_owned(), Arc::new(StringArray::from(vec![task]))),
+    ];
+    write(columns, &[("pandas", pandas.to_string())])
+}
+
+/// The table of episodes, with where each lies, the trial's parameters and the figures of every column.
+pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
+    let counts = |value: &dyn Fn(usize, &EpisodeRow<'_>) -> usize| -> ArrayRef {
+        let values = rows.iter().enumerate().map(|(index, row)| value(index, row) as i64);
+        Arc::new(Int64Array::from_iter_values(values))
+    };
+    let mut tasks = ListBuilder::new(StringBuilder::new());
+    for _ in rows {
+        tasks.values().append_value(task);
+        tasks.append(true);
+    }
+    let trials: StringArray = rows.iter().map(|row| row.record.trial.as_deref()).collect();
+    let mut columns: Vec<(String, ArrayRef)> = vec![
+        ("episode_index".to_owned(), counts(&|index, _| index)),
+        ("tasks".to_owned(), Arc::new(tasks.finish())),
+        ("length".to_owned(), counts(&|_, row| row.record.frames)),
+        ("trial".to_owned(), Arc::new(trials)),
+        (
+            "data/chunk_index".to_owned(),
+            counts(&|_, row| shard_place(row.shard).0),
+        ),
+        ("data/file_index".to_owned(), counts(&|_, row| shard_place(row.shard).1)),
+        ("dataset_from_index".to_owned(), counts(&|_, row| row.first_frame)),
+        (
+            "dataset_to_index".to_owned(),
+            counts(&|_, row| row.first_frame + row.record.frames),
+        ),
+        ("meta/episodes/chunk_index".to_owned(), counts(&|_, _| 0)),
+        ("meta/episodes/file_index".to_owned(), counts(&|_, _| 0)),
+    ];
+    columns.extend(stats_columns(rows));
+    write(columns, &[])
+}
+
+fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {
+    let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
+    let Some(first) = all.first() else {
+        return Vec::new();
+    };
+    let mut columns = Vec::new();
+    for key in first.keys() {
+        let stats = || all.iter().filter_map(|stats| stats.get(key));
+        for (figure, values) in FIGURES {
+            let lists: Vec<&[f64]> = stats().map(|stats| values(stats).as_slice()).collect();
+            let array = if is_image(key) {
+                image_lists(&lists)
+            } else {
+                lists_of(&lists)
+            };
+            columns.push((format!("stats/{key}/{figure}"), array));
+        }
+        let mut counts = ListBuilder::new(Int64Array::builder(rows.len()));
+        for stats in stats() {
+            counts.values().append_value(stats.count as i64);
+            counts.append(true);
+        }
+        columns.push((format!("stats/{key}/count"), Arc::new(counts.finish())));
+    }
+    columns
+}
+
+/// A figure's name and where it is found.
+type Figure = (&'static str, fn(&FeatureStats) -> &Vec<f64>);
+
+const FIGURES: [Figure; 4] = [
+    ("min", |stats| &stats.min),
+    ("max", |stats| &stats.max),
+    ("mean", |stats| &stats.mean),
+    ("std", |stats| &stats.std),
+];
+
+fn is_image(key: &str) -> bool {
+    key == IMAGE || key == MASK
+}
+
+fn lists_of(lists: &[&[f64]]) -> ArrayRef {
+    let mut builder = ListBuilder::new(Float64Builder::new());
+    for list in lists {
+        builder.values().append_slice(list);
+        builder.append(true);
+    }
+    Arc::new(builder.finish())
+}
+
+/// Figures of an image as LeRobot wants them: channels × 1 × 1.
+fn image_lists(lists: &[&[f64]]) -> ArrayRef {
+    let mut builder = ListBuilder::new(ListBuilder::new(ListBuilder::new(Float64Builder::new())));
+    for list in lists {
+        for &value in *list {
+            builder.values().values().values().append_value(value);
+            builder.values().values().append(true);
+            builder.values().append(true);
+        }
+        builder.append(true);
+    }
+    Arc::new(builder.finish())
+}
+
+/// LeRobot's `stats.json`: the figures of every column over all episodes.
+pub(super) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
+    let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
+    let mut features = serde_json::Map::new();
+    for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
+        let parts: Vec<_> = all.iter().filter_map(|stats| stats.get(key)).collect();
+        let merged = FeatureStats::merged(&parts);
+        let mut figures = serde_json::Map::new();
+        for (figure, values) in FIGURES {
+            let values = values(&merged);
+            let value = if is_image(key) {
+                values.iter().map(|value| json!([[value]])).collect()
+            } else {
+                json!(values)
+            };
+            figures.insert(figure.to_owned(), value);
+        }
+        figures.insert("count".to_owned(), json!([merged.count]));
+        features.insert(key.clone(), Value::Object(figures));
+    }
+    Value::Object(features)
+}
+
+fn write(columns: Vec<(String, ArrayRef)>, metadata: &[(&str, String)]) -> Result<Vec<u8>, ParquetError> {
+    let nullable = |kind: &DataType, name: &String| Field::new(name, kind.clone(), true);
+    let fields: Vec<_> = columns
+        .iter()
+        .map(|(name, array)| nullable(array.data_type(), name))
+        .collect();
+    let metadata: HashMap<_, _> = metadata
+        .iter()
+        .map(|(key, value)| ((*key).to_owned(), value.clone()))
+        .collect();
+    let schema = Arc::new(Schema::new(fields).with_metadata(metadata));
+    let arrays = columns.into_iter().map(|(_, array)| array).collect();
+    let batch = RecordBatch::try_new(schema.clone(), arrays)?;
+    let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
+    let mut writer = ArrowWriter::try_new(Vec::new(), schema, Some(properties))?;
+    writer.write(&batch)?;
+    writer.into_inner()
+}

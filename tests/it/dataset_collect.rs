@@ -1,0 +1,290 @@
+//! Collecting into a directory: what is written, going on after interruptions, and what is refused.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use foreframe::dataset::{CollectConfig, Dataset, DatasetError, DatasetInfo, Progress, Standing, collect};
+use foreframe::sim::{Scenario, World, WorldConfig};
+use foreframe::types::Seed;
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+const TRIALS: u64 = 11;
+
+fn config(out: &Path) -> CollectConfig {
+    CollectConfig {
+        world: WorldConfig {
+            frame_width_px: 12,
+            frame_height_px: 8,
+            max_duration_s: 1.6,
+            ..WorldConfig::default()
+        },
+        threads: 2,
+        trials_per_shard: 3,
+        ..CollectConfig::new(Scenario::MovingObserver, TRIALS, Seed(4), out)
+    }
+}
+
+fn run(config: &CollectConfig) -> Result<DatasetInfo, DatasetError> {
+    collect(config, &|_| {}, &AtomicBool::new(false))
+}
+
+/// Collects, and cancels once that many trials are simulated.
+fn run_until(config: &CollectConfig, trials: u64) -> Result<DatasetInfo, DatasetError> {
+    let cancelled = AtomicBool::new(false);
+    let seen = AtomicU64::new(0);
+    let on_progress = |_: Progress| {
+        if seen.fetch_add(1, Ordering::Relaxed) >= trials {
+            cancelled.store(true, Ordering::Relaxed);
+        }
+    };
+    collect(config, &on_progress, &cancelled)
+}
+
+fn finished() -> (TempDir, PathBuf) {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("set");
+    run(&config(&out)).unwrap();
+    (directory, out)
+}
+
+/// Every file below a directory, with its bytes.
+fn contents(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut open = vec![root.to_owned()];
+    while let Some(directory) = open.pop() {
+        for entry in fs::read_dir(directory).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else {
+                found.push((path.strip_prefix(root).unwrap().to_owned(), fs::read(&path).unwrap()));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn what_is_read_back_is_what_the_world_showed() {
+    let (_directory, out) = finished();
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.info().episode_count as u64, TRIALS);
+    let config = config(&out);
+    for trial in [0, TRIALS - 1] {
+        let mut world = World::new(config.scenario, &config.world, config.seed, trial).unwrap();
+        let episode = &dataset.episodes()[trial as usize];
+        assert_eq!(episode.trial.as_ref(), Some(world.parameters()));
+        for frame in episode.frames() {
+            let observation = world.observe();
+            assert_eq!(dataset.pixels(frame), observation.frame.pixels());
+            assert_eq!(dataset.mask(frame), Some(observation.mask.as_slice()));
+            assert_eq!(dataset.state(frame), observation.state.as_slice());
+            assert!((dataset.timestamp_s(frame) - observation.time_s).abs() < 1e-6);
+            if frame + 1 < episode.frames().end {
+                let action = world.policy_action();
+                assert_eq!(dataset.action(frame), action.as_slice());
+                world.step(&action).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
+fn one_thread_writes_the_bytes_of_two() {
+    let (_directory, two) = finished();
+    let directory = tempfile::tempdir().unwrap();
+    let one = directory.path().join("one");
+    run(&CollectConfig {
+        threads: 1,
+        ..config(&one)
+    })
+    .unwrap();
+    assert_eq!(contents(&one), contents(&two));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(12))]
+    #[test]
+    fn a_collection_stopped_anywhere_ends_with_the_bytes_of_one_that_was_not(
+        stops in proptest::collection::vec(0..TRIALS, 1..4),
+    ) {
+        let (_directory, whole) = finished();
+        let directory = tempfile::tempdir().unwrap();
+        let out = directory.path().join("set");
+        let mut kept_before = 0;
+        for trials in stops {
+            if let Err(error) = run_until(&config(&out), trials) {
+                let DatasetError::Cancelled { done, total } = error else { panic!("{error}") };
+                prop_assert!(total == TRIALS && done >= kept_before, "finished shards were lost");
+                kept_before = done;
+                prop_assert!(Dataset::open(&out).is_err());
+            }
+        }
+        run(&config(&out)).unwrap();
+        prop_assert_eq!(contents(&out), contents(&whole));
+    }
+}
+
+#[test]
+fn going_on_simulates_only_what_is_missing() {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("set");
+    let one_thread = CollectConfig {
+        threads: 1,
+        ..config(&out)
+    };
+    let error = run_until(&one_thread, 7).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "stopped with 6 of 11 trials kept; run the same command again to go on"
+    );
+    assert_eq!(Standing::of(&one_thread).unwrap(), Standing::Begun { trials: 6 });
+    let first = AtomicU64::new(u64::MAX);
+    let told = |progress: Progress| {
+        first.fetch_min(progress.done, Ordering::Relaxed);
+    };
+    collect(&one_thread, &told, &AtomicBool::new(false)).unwrap();
+    assert_eq!(first.into_inner(), 6);
+}
+
+#[test]
+fn a_damaged_shard_of_an_unfinished_collection_is_made_anew() {
+    let (_directory, whole) = finished();
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("set");
+    let one_thread = CollectConfig {
+        threads: 1,
+        ..config(&out)
+    };
+    run_until(&one_thread, 8).unwrap_err();
+    let shard = out.join("data/chunk-000/file-000.parquet");
+    let bytes = fs::read(&shard).unwrap();
+    fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
+    run(&config(&out)).unwrap();
+    assert_eq!(contents(&out), contents(&whole));
+}
+
+#[test]
+fn an_unfinished_set_says_so_and_how_to_go_on() {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("set");
+    run_until(&config(&out), 4).unwrap_err();
+    let message = Dataset::open(&out).unwrap_err().to_string();
+    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to go on"));
+    assert!(message.contains("\"trials\":11"), "{message}");
+}
+
+#[test]
+fn a_finished_set_is_returned_at_once() {
+    let (_directory, out) = finished();
+    let before = contents(&out);
+    let info = collect(
+        &config(&out),
+        &|_| panic!("nothing is left to do"),
+        &AtomicBool::new(false),
+    )
+    .unwrap();
+    assert_eq!(Standing::of(&config(&out)).unwrap(), Standing::Finished(Box::new(info)));
+    assert_eq!(contents(&out), before);
+}
+
+#[test]
+fn other_arguments_are_refused_by_name() {
+    let (_directory, out) = finished();
+    let other = CollectConfig {
+        trials: 12,
+        ..config(&out)
+    };
+    let message = run(&other).unwrap_err().to_string();
+    assert!(
+        message.ends_with(
+            "was begun with other arguments (trials: 11 there, 12 asked); use those to go on, or name another directory"
+        ),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_directory_in_other_use_is_refused_untouched() {
+    let directory = tempfile::tempdir().unwrap();
+    fs::write(directory.path().join("thesis.txt"), "years of work").unwrap();
+    let error = run(&config(directory.path())).unwrap_err();
+    assert!(error.to_string().contains("exists and is not a collection"));
+    assert_eq!(contents(directory.path()).len(), 1);
+    let error = run(&config(&directory.path().join("thesis.txt"))).unwrap_err();
+    assert!(matches!(error, DatasetError::OutExists { .. }));
+}
+
+#[test]
+fn an_empty_directory_is_taken() {
+    let directory = tempfile::tempdir().unwrap();
+    run(&config(directory.path())).unwrap();
+}
+
+#[test]
+fn no_trials_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let none = CollectConfig {
+        trials: 0,
+        ..config(&directory.path().join("set"))
+    };
+    assert_eq!(
+        run(&none).unwrap_err().to_string(),
+        "the number of trials is 0; it must be at least 1"
+    );
+    assert!(!none.out.exists());
+}
+
+#[test]
+fn a_changed_file_is_named_with_both_hashes() {
+    for file in [
+        "data/chunk-000/file-001.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+    ] {
+        let (_directory, out) = finished();
+        let path = out.join(file);
+        let mut bytes = fs::read(&path).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        fs::write(&path, bytes).unwrap();
+        let error = Dataset::open(&out).unwrap_err();
+        assert!(matches!(error, DatasetError::HashDiffers { .. }));
+        assert!(error.to_string().contains(file));
+    }
+}
+
+#[test]
+fn a_truncated_file_is_named() {
+    let (_directory, out) = finished();
+    let path = out.join("data/chunk-000/file-002.parquet");
+    let bytes = fs::read(&path).unwrap();
+    fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
+    assert!(
+        Dataset::open(&out)
+            .unwrap_err()
+            .to_string()
+            .contains("file-002.parquet")
+    );
+}
+
+#[test]
+fn a_missing_file_is_named() {
+    let (_directory, out) = finished();
+    fs::remove_file(out.join("data/chunk-000/file-002.parquet")).unwrap();
+    let error = Dataset::open(&out).unwrap_err();
+    assert!(matches!(&error, DatasetError::Io { .. }) && error.to_string().contains("file-002.parquet"));
+}
+
+#[test]
+fn a_directory_without_a_data_set_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let error = Dataset::open(directory.path()).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .ends_with("holds no data set: meta/info.json is missing")
+    );
+}

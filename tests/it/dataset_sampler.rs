@@ -1,0 +1,230 @@
+//! Splits and windows of data sets in memory.
+
+use std::collections::BTreeSet;
+
+use foreframe::dataset::{Dataset, DatasetError, DatasetInfo, EpisodeData, Split, Splits, Window, WindowShape};
+use foreframe::sim::{Scenario, TrialParameters};
+use foreframe::types::{Channel, Seed};
+use proptest::prelude::*;
+
+const PERIOD_S: f64 = 0.2;
+
+fn info() -> DatasetInfo {
+    DatasetInfo {
+        name: "made-up".to_owned(),
+        frame_width_px: 1,
+        frame_height_px: 1,
+        frame_period_s: PERIOD_S,
+        action_channels: vec![Channel::new("linear", "m/s")],
+        state_channels: vec![],
+        content_hash: String::new(),
+        scenario: None,
+        seed: None,
+        frame_count: 0,
+        episode_count: 0,
+        has_masks: false,
+    }
+}
+
+/// An episode of that many frames; the clock jumps by 10 s before each frame in `jumps`.
+fn episode(frames: usize, jumps: &[usize], trial: Option<TrialParameters>) -> EpisodeData {
+    let mut time_s = 0.0;
+    let timestamps_s = (0..frames)
+        .map(|frame| {
+            time_s += if jumps.contains(&frame) { 10.0 } else { PERIOD_S };
+            time_s
+        })
+        .collect();
+    EpisodeData {
+        timestamps_s,
+        pixels: vec![7; frames],
+        masks: None,
+        actions: vec![0.5; frames],
+        states: vec![],
+        trial,
+    }
+}
+
+fn simulated(trials: u64, frames: usize) -> Dataset {
+    let draw = |trial| TrialParameters::draw(Scenario::StaticObserver, Seed(5), trial);
+    let episodes = (0..trials)
+        .map(|trial| episode(frames, &[], Some(draw(trial))))
+        .collect();
+    Dataset::from_episodes(info(), episodes).unwrap()
+}
+
+fn recorded(lengths: &[usize], jumps: &[usize]) -> Dataset {
+    let episodes = lengths.iter().map(|&length| episode(length, jumps, None)).collect();
+    Dataset::from_episodes(info(), episodes).unwrap()
+}
+
+fn frames_of(windows: &[Window], shape: WindowShape) -> BTreeSet<usize> {
+    windows
+        .iter()
+        .flat_map(|window| window.first_frame..window.first_frame + shape.frames())
+        .collect()
+}
+
+proptest! {
+    #[test]
+    fn no_window_crosses_an_episode_or_a_gap_and_splits_share_no_frame(
+        lengths in proptest::collection::vec(12usize..80, 1..14),
+        jump in 1usize..80,
+        seed in any::<u64>(),
+        context in 1usize..4,
+        horizon in 1usize..4,
+        stride in 1usize..5,
+    ) {
+        let dataset = recorded(&lengths, &[jump]);
+        let splits = Splits::new(&dataset, Seed(seed));
+        let shape = WindowShape { context, horizon };
+        let mut taken = BTreeSet::new();
+        for split in Split::ALL {
+            // A split can be too short for the window; what matters is what the others give.
+            let Ok(windows) = splits.windows(&dataset, split, shape, stride) else { continue };
+            for window in &windows {
+                let frames = dataset.episodes()[window.episode].frames();
+                let last = window.first_frame + shape.frames() - 1;
+                prop_assert!(frames.contains(&window.first_frame) && frames.contains(&last));
+                let spans_s = dataset.timestamp_s(last) - dataset.timestamp_s(window.first_frame);
+                prop_assert!(spans_s < PERIOD_S * shape.frames() as f64);
+                prop_assert!(splits.episodes(split).contains(&window.episode));
+            }
+            let frames = frames_of(&windows, shape);
+            prop_assert!(taken.is_disjoint(&frames));
+            taken.extend(frames);
+        }
+    }
+
+    #[test]
+    fn a_larger_collection_keeps_the_split_of_a_smaller_one(seed in any::<u64>(), few in 1u64..60, more in 1u64..60) {
+        let (small, large) = (simulated(few, 1), simulated(few + more, 1));
+        let (of_small, of_large) = (Splits::new(&small, Seed(seed)), Splits::new(&large, Seed(seed)));
+        for split in Split::ALL {
+            let kept: Vec<_> = of_large.episodes(split).iter().copied().filter(|&e| e < few as usize).collect();
+            prop_assert_eq!(of_small.episodes(split), kept);
+        }
+    }
+
+    #[test]
+    fn every_trial_is_in_one_split_and_the_held_out_ones_in_their_own(seed in any::<u64>()) {
+        let dataset = simulated(100, 1);
+        let splits = Splits::new(&dataset, Seed(seed));
+        let mut all: Vec<_> = Split::ALL.iter().flat_map(|&split| splits.episodes(split).to_vec()).collect();
+        all.sort_unstable();
+        prop_assert_eq!(all, (0..100).collect::<Vec<_>>());
+        for episode in dataset.episodes() {
+            let held_out = episode.trial.as_ref().unwrap().is_held_out();
+            prop_assert_eq!(splits.episodes(Split::TestUnseen).contains(&episode.index), held_out);
+        }
+    }
+}
+
+#[test]
+fn of_a_hundred_whole_recordings_eighty_train() {
+    let dataset = recorded(&[12; 100], &[]);
+    let splits = Splits::new(&dataset, Seed(3));
+    let counts = Split::ALL.map(|split| splits.episodes(split).len());
+    assert_eq!(counts, [80, 10, 10, 0]);
+}
+
+#[test]
+fn a_single_recording_is_split_by_time_with_a_window_between_the_parts() {
+    let dataset = recorded(&[100], &[]);
+    let splits = Splits::new(&dataset, Seed(0));
+    let shape = WindowShape { context: 2, horizon: 1 };
+    let first_and_last = |split| {
+        let windows = splits.windows(&dataset, split, shape, 1).unwrap();
+        (windows[0].first_frame, windows[windows.len() - 1].first_frame)
+    };
+    assert_eq!(first_and_last(Split::Train), (0, 77));
+    assert_eq!(first_and_last(Split::Validation), (83, 87));
+    assert_eq!(first_and_last(Split::Test), (93, 97));
+}
+
+#[test]
+fn windows_are_taken_at_every_stride() {
+    let dataset = recorded(&[20], &[]);
+    let windows = Splits::new(&dataset, Seed(0))
+        .windows(&dataset, Split::Train, WindowShape { context: 5, horizon: 5 }, 3)
+        .unwrap();
+    let starts: Vec<_> = windows.iter().map(|window| window.first_frame).collect();
+    assert_eq!(starts, [0, 3, 6]);
+}
+
+#[test]
+fn a_window_longer_than_every_episode_is_refused_with_the_lengths() {
+    let dataset = simulated(20, 9);
+    let shape = WindowShape { context: 5, horizon: 5 };
+    let error = Splits::new(&dataset, Seed(0))
+        .windows(&dataset, Split::Train, shape, 1)
+        .unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "a window of 10 frames (5 seen, 5 to come) is longer than every episode of the train split; the longest runs \
+         9 frames without a gap"
+    );
+}
+
+#[test]
+fn a_draw_gives_different_windows_and_the_same_ones_again() {
+    let dataset = simulated(20, 30);
+    let splits = Splits::new(&dataset, Seed(0));
+    let shape = WindowShape { context: 5, horizon: 5 };
+    let draw = |seed| splits.sample(&dataset, Split::Train, shape, 100, Seed(seed)).unwrap();
+    assert_eq!(draw(1), draw(1));
+    assert_ne!(draw(1), draw(2));
+    assert_eq!(draw(1).iter().collect::<BTreeSet<_>>().len(), 100);
+}
+
+#[test]
+fn a_draw_of_more_windows_than_there_are_says_how_many_there_are() {
+    let dataset = recorded(&[100], &[]);
+    let splits = Splits::new(&dataset, Seed(0));
+    let shape = WindowShape { context: 5, horizon: 5 };
+    let error = splits.sample(&dataset, Split::Train, shape, 1000, Seed(0)).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "1000 windows asked of the train split, which has 71; ask for fewer or collect more"
+    );
+}
+
+#[test]
+fn an_action_that_is_not_finite_is_refused_with_its_place() {
+    let mut data = episode(5, &[], None);
+    data.actions[3] = f32::NAN;
+    let error = Dataset::from_episodes(info(), vec![episode(5, &[], None), data]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "episode 1, frame 3: action is NaN; every number must be finite"
+    );
+}
+
+#[test]
+fn parts_of_different_lengths_are_refused() {
+    let mut data = episode(5, &[], None);
+    data.actions.pop();
+    let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
+    assert_eq!(error.to_string(), "episode 0: action has 4 values; 5 frames take 5");
+}
+
+#[test]
+fn time_that_stands_still_is_refused() {
+    let mut data = episode(5, &[], None);
+    data.timestamps_s[2] = data.timestamps_s[1];
+    let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
+    assert!(matches!(error, DatasetError::TimeOrder { episode: 0, frame: 2 }));
+}
+
+#[test]
+fn a_data_set_of_another_shape_is_named_with_both_shapes() {
+    let dataset = recorded(&[12], &[]);
+    assert_eq!(
+        dataset.require_frame_size(64, 64).unwrap_err().to_string(),
+        "the data set \"made-up\" has frames of 1×1 px; 64×64 px are needed"
+    );
+    assert_eq!(
+        dataset.require_action_count(2).unwrap_err().to_string(),
+        "the data set \"made-up\" has actions of 1 components (linear); 2 are needed"
+    );
+}
