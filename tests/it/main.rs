@@ -1,2 +1,6 @@
 //! Behaviour of the whole library, one test binary.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
+
+mod nn_cell;
+mod nn_model;
+mod nn_optimizer;
