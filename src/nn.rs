@@ -6,7 +6,8 @@
 //! on the CPU. Frames are in the model's space ([`crate::frame::preprocess`]).
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
-//! → [`lstm`] (over time) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`].
+//! → [`lstm`] (over time; `recurrence` and `gates` are its
+//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`].
 
 mod activation;
 pub mod autoencoder;
@@ -20,7 +21,7 @@ pub mod lstm_cell;
 pub mod parameters;
 mod recurrence;
 pub mod spec;
-mod tensors;
+pub(crate) mod tensors;
 
 pub use autoencoder::{Feedback, Model};
 pub use conditioned::Condition;

@@ -1,5 +1,7 @@
 //! tanh and the logistic function as straight-line code that the compiler can vectorise (libm's are scalar calls).
 //! Both are within 3e-7 of the exact value everywhere.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
 /// tanh(x) = 2σ(2x) − 1.
 #[inline(always)]
@@ -27,7 +29,7 @@ fn exp(x: f32) -> f32 {
     p = p * r + 8.333_452e-3;
     p = p * r + 4.166_579_6e-2;
     p = p * r + 1.666_666_5e-1;
-    p = p * r + 5.000_000_1e-1;
+    p = p * r + 0.5;
     let mantissa = p * r * r + r + 1.0;
     let power = f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3F80_0000));
     mantissa * power

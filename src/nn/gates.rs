@@ -1,5 +1,7 @@
 //! Equations (1)–(5) of the paper on rows of plain numbers, and the way back. [`super::lstm_cell`] has them on tensors;
 //! a test holds the two together, values and gradients.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
 use super::activation::{sigmoid, tanh};
 
@@ -11,7 +13,7 @@ pub(super) struct Peepholes<'a> {
     pub(super) o: &'a [f32],
 }
 
-/// One row's step. `sums` [4H] holds W_x x + W_h h + b and becomes the activations i, f, tanh(·), o; `c_before` is the
+/// One row's step. `sums` [4H] holds `W_x x + W_h h + b` and becomes the activations i, f, tanh(·), o; `c_before` is the
 /// memory before, `c` and `h` [H] receive the new state.
 #[inline(always)]
 pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, c: &mut [f32], h: &mut [f32]) {
@@ -21,7 +23,9 @@ pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, 
     let (g, o) = rest.split_at_mut(hidden);
     gate(i, peepholes.i, c_before);
     gate(f, peepholes.f, c_before);
-    g.iter_mut().for_each(|g| *g = tanh(*g));
+    for g in &mut *g {
+        *g = tanh(*g);
+    }
     for ((((c, c_before), i), f), g) in c.iter_mut().zip(c_before).zip(&*i).zip(&*f).zip(&*g) {
         *c = f * c_before + i * g;
     }

@@ -25,7 +25,7 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
     Ok((Tensor::stack(&outputs, 1)?, state))
 }
 
-/// What x [B, T, D] adds to the cell's sums through w_x from row `first_row`, bias included: one product for all steps,
+/// What x [B, T, D] adds to the cell's sums through `w_x` from row `first_row`, bias included: one product for all steps,
 /// [T, B, 4H].
 fn drive(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let (batch, steps, inputs) = x.dims3()?;

@@ -27,7 +27,7 @@ pub struct PeepholeCell {
 }
 
 impl PeepholeCell {
-    /// A cell of those weights: w_x [D, 4H], w_h [H, 4H], bias [4H], and the diagonals of `W_ci`, `W_cf`, `W_co` [H].
+    /// A cell of those weights: `w_x` [D, 4H], `w_h` [H, 4H], bias [4H], and the diagonals of `W_ci`, `W_cf`, `W_co` [H].
     #[must_use]
     pub fn new(w_x: Tensor, w_h: Tensor, bias: Tensor, peepholes: [Tensor; 3]) -> Self {
         Self {

@@ -1,12 +1,16 @@
 //! A whole sequence of LSTM steps as one f32 operation with its own way back. Against one graph node per sum and gate it
 //! saves most passes over memory, and each weight's gradient is one product over all steps.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+mod back;
 
 use std::sync::{Mutex, PoisonError};
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use pulp::Arch;
 
-use super::gates::{self, Kept, Peepholes, add_product};
+use super::gates::{self, Peepholes};
 use super::lstm::Decoder;
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::tensors::{add_columns, matrix, slice, with_values};
@@ -45,7 +49,7 @@ struct Recurrence {
     trace: Mutex<Option<Trace>>,
 }
 
-/// Runs the cell on sums that are known beforehand, `drive` [T, B, 4H] = W_x x + b: every h [T, B, H] and the last c [B, H].
+/// Runs the cell on sums that are known beforehand, `drive` [T, B, 4H] = `W_x x + b`: every h [T, B, H] and the last c [B, H].
 pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
     let steps = drive.dim(0)?;
     let start = Tensor::cat(&[&state.h, &state.c], 1)?;
@@ -53,7 +57,7 @@ pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> 
     Ok((all.narrow(0, 0, steps)?, all.get(steps)?))
 }
 
-/// Runs a decoder on its own output: features [T, B, F]. Only the first F rows of the cell's w_x take features; `drive`
+/// Runs a decoder on its own output: features [T, B, F]. Only the first F rows of the cell's `w_x` take features; `drive`
 /// is what all else adds to the sums, [T, B, 4H], or [4H] if the same in every step.
 pub(super) fn fed_back(
     decoder: &Decoder,
@@ -145,10 +149,12 @@ impl Recurrence {
             } else {
                 &drive[before.start * 4 * hidden..before.end * 4 * hidden]
             };
-            with_values(&recurrent, |recurrent| match &fed {
-                Some(fed) => with_values(fed, |fed| self.advance(&mut trace, t, batch, [drive, recurrent, fed])),
-                None => {
-                    self.advance(&mut trace, t, batch, [drive, recurrent, &[]]);
+            let mut advance = |parts: [&[f32]; 3]| self.advance(&mut trace, t, batch, parts);
+            with_values(&recurrent, |recurrent| {
+                if let Some(fed) = &fed {
+                    with_values(fed, |fed| advance([drive, recurrent, fed]))
+                } else {
+                    advance([drive, recurrent, &[]]);
                     Ok(())
                 }
             })??;
@@ -231,117 +237,6 @@ impl Trace {
             trace.features[row * features..(row + 1) * features].copy_from_slice(first);
         }
         trace
-    }
-}
-
-/// Gradients on the way back.
-struct Back {
-    /// Of the sums [T · B, 4H].
-    sums: Vec<f32>,
-    /// Of h and c before the step, [B, H] each.
-    h: Vec<f32>,
-    c: Vec<f32>,
-    /// Of the features after each step [T · B, F], and of those before the first [B, F].
-    features: Vec<f32>,
-    first: Vec<f32>,
-    /// Of the peepholes, [H] each.
-    peepholes: [Vec<f32>; 3],
-}
-
-impl Recurrence {
-    /// From the gradient of the output back through every step.
-    fn back(&self, trace: &Trace, gradient: &[f32]) -> Result<Back> {
-        let (hidden, features, steps) = (self.hidden, self.features(), self.steps);
-        let batch = trace.h.len() / ((steps + 1) * hidden);
-        let rows = batch * hidden;
-        let mut back = Back {
-            sums: vec![0.0; steps * batch * 4 * hidden],
-            h: vec![0.0; rows],
-            c: vec![0.0; rows],
-            features: vec![0.0; steps * batch * features],
-            first: vec![0.0; batch * features],
-            peepholes: std::array::from_fn(|_| vec![0.0; hidden]),
-        };
-        if self.feedback.is_none() {
-            back.c.copy_from_slice(&gradient[steps * rows..]);
-        }
-        for t in (0..steps).rev() {
-            match &self.feedback {
-                None => add_columns(&mut back.h, &gradient[t * rows..(t + 1) * rows]),
-                Some(feedback) => {
-                    let step = t * batch * features..(t + 1) * batch * features;
-                    add_columns(&mut back.first, &gradient[step.clone()]);
-                    back.features[step].copy_from_slice(&back.first);
-                    let through = matrix(back.first.clone(), features)?.matmul(&feedback.weight.t()?)?;
-                    with_values(&through, |through| add_columns(&mut back.h, through))?;
-                    if !feedback.adds {
-                        back.first.fill(0.0);
-                    }
-                }
-            }
-            self.step_back(trace, &mut back, t, batch);
-            let sums = &back.sums[t * batch * 4 * hidden..(t + 1) * batch * 4 * hidden];
-            let sums = matrix(sums.to_vec(), 4 * hidden)?;
-            with_values(&sums.matmul(&self.w_h.t()?)?, |h| back.h.copy_from_slice(h))?;
-            if let Some(feedback) = &self.feedback {
-                with_values(&sums.matmul(&feedback.w_x.t()?)?, |first| {
-                    add_columns(&mut back.first, first)
-                })?;
-            }
-        }
-        Ok(back)
-    }
-
-    fn step_back(&self, trace: &Trace, back: &mut Back, t: usize, batch: usize) {
-        let hidden = self.hidden;
-        let Back {
-            sums,
-            h,
-            c,
-            peepholes: [p_i, p_f, p_o],
-            ..
-        } = back;
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for row in 0..batch {
-                    let before = (t * batch + row) * hidden;
-                    let after = before + batch * hidden;
-                    let kept = Kept {
-                        activations: &trace.activations[4 * before..4 * (before + hidden)],
-                        c_before: &trace.c[before..before + hidden],
-                        c: &trace.c[after..after + hidden],
-                    };
-                    let d_sums = &mut sums[4 * before..4 * (before + hidden)];
-                    let state = row * hidden..(row + 1) * hidden;
-                    gates::backward(kept, self.peepholes(), &h[state.clone()], &mut c[state], d_sums);
-                    add_product(p_i, &d_sums[..hidden], kept.c_before);
-                    add_product(p_f, &d_sums[hidden..2 * hidden], kept.c_before);
-                    add_product(p_o, &d_sums[3 * hidden..], kept.c);
-                }
-            },
-        );
-    }
-
-    /// Gradients of the weights in the order in which they were joined.
-    fn weights_back(&self, trace: &Trace, back: &Back, sums: &Tensor) -> Result<Tensor> {
-        let (hidden, features) = (self.hidden, self.features());
-        let batch = back.h.len() / hidden;
-        let past = |values: &[f32], side: usize| matrix(values[..values.len() - batch * side].to_vec(), side);
-        let mut parts = vec![past(&trace.h, hidden)?.t()?.matmul(sums)?.flatten_all()?];
-        for peephole in &back.peepholes {
-            parts.push(Tensor::from_slice(peephole, hidden, sums.device())?);
-        }
-        if self.feedback.is_some() {
-            parts.push(past(&trace.features, features)?.t()?.matmul(sums)?.flatten_all()?);
-            let after = matrix(trace.h[batch * hidden..].to_vec(), hidden)?;
-            let change = matrix(back.features.clone(), features)?;
-            parts.push(after.t()?.matmul(&change)?.flatten_all()?);
-            let mut bias = vec![0.0; features];
-            add_columns(&mut bias, &back.features);
-            parts.push(Tensor::from_vec(bias, features, sums.device())?);
-        }
-        Tensor::cat(&parts, 0)
     }
 }
 

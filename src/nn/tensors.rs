@@ -1,4 +1,6 @@
 //! Between tensors and plain slices, for the operations of our own.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, Device, Layout, Result, Storage, Tensor, bail};
 
@@ -11,7 +13,7 @@ pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a 
 }
 
 /// Calls `read` with the values of an f32 tensor.
-pub(super) fn with_values<T>(tensor: &Tensor, read: impl FnOnce(&[f32]) -> T) -> Result<T> {
+pub(crate) fn with_values<T>(tensor: &Tensor, read: impl FnOnce(&[f32]) -> T) -> Result<T> {
     let tensor = tensor.contiguous()?;
     let (storage, layout) = tensor.storage_and_layout();
     match &*storage {

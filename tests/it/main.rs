@@ -2,5 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod nn_cell;
+mod nn_common;
 mod nn_model;
 mod nn_optimizer;
+mod nn_spec;

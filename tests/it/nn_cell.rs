@@ -1,10 +1,12 @@
-//! The LSTM cell against onnxruntime's `LSTM` operator with peepholes (tests/fixtures/lstm_peephole.py).
+//! The LSTM cell against onnxruntime's `LSTM` operator with peepholes (`tests/fixtures/lstm_peephole.py`).
 
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
 use foreframe::nn::lstm::unroll;
 use foreframe::nn::lstm_cell::{LstmState, PeepholeCell};
+
+use crate::nn_common::largest_difference;
 
 type Tensors = HashMap<String, Tensor>;
 
@@ -23,11 +25,6 @@ fn start(t: &Tensors) -> LstmState {
         h: t["h0"].clone(),
         c: t["c0"].clone(),
     }
-}
-
-fn largest_difference(a: &Tensor, b: &Tensor) -> f32 {
-    let difference = (a - b).unwrap().abs().unwrap().flatten_all().unwrap();
-    difference.max(0).unwrap().to_scalar().unwrap()
 }
 
 #[test]
