@@ -6,3 +6,9 @@ mod training;
 mod dataset_collect;
 mod dataset_sampler;
 mod sim;
+
+mod nn_cell;
+mod nn_common;
+mod nn_model;
+mod nn_optimizer;
+mod nn_spec;
