@@ -24,7 +24,7 @@ pub enum SimError {
     /// A setting is out of range.
     #[error("{name} is {value}; it must be {rule}")]
     Setting {
-        /// The field of [`WorldConfig`] or [`TrialParameters`].
+        /// The field of `WorldConfig` or `TrialParameters`.
         name: &'static str,
         /// The value found.
         value: f64,
