@@ -12,3 +12,4 @@ mod nn_common;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
+mod sim_refusals;
