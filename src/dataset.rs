@@ -1,1 +1,369 @@
-//! Recorded and simulated episodes on disk and in memory.
+//! Recorded and simulated episodes, on disk and in memory.
+//!
+//! A [`Dataset`] lies in memory as a whole, its frames as bytes in one buffer. [`sampler`] says which [`Window`]s of it
+//! train, validate and test.
+
+mod error;
+pub mod sampler;
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+pub use error::DatasetError;
+pub use sampler::{Split, Splits, WindowShape};
+
+use crate::frame::MAX_SIDE_PX;
+use crate::types::{Channel, Seed};
+
+/// Everything that was drawn for one simulated trial.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrialParameters {
+    /// The trial's number.
+    pub trial: u64,
+    /// Whether it is one of the start/goal pairs or gains kept for `TestUnseen`.
+    pub held_out: bool,
+}
+
+impl TrialParameters {
+    /// Whether the trial belongs to [`Split::TestUnseen`].
+    #[must_use]
+    pub fn is_held_out(&self) -> bool {
+        self.held_out
+    }
+}
+
+/// What a data set is: sizes, rates, meanings and the hash of its content.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DatasetInfo {
+    /// Its name, for reports.
+    pub name: String,
+    /// Width of every frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of every frame in pixels.
+    pub frame_height_px: u32,
+    /// Seconds from one frame to the next.
+    pub frame_period_s: f64,
+    /// Components of an action; action t acts between frame t and t + 1.
+    pub action_channels: Vec<Channel>,
+    /// Components of a state.
+    pub state_channels: Vec<Channel>,
+    /// Hex sha256 of what is in it; [`Dataset::from_episodes`] computes one where this is empty.
+    pub content_hash: String,
+    /// The simulated scenario; none for recordings.
+    pub scenario: Option<String>,
+    /// The seed it was simulated from; none for recordings.
+    pub seed: Option<Seed>,
+    /// Frames of all episodes; filled in by [`Dataset::from_episodes`].
+    pub frame_count: usize,
+    /// Episodes; filled in by [`Dataset::from_episodes`].
+    pub episode_count: usize,
+    /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`].
+    pub has_masks: bool,
+}
+
+impl DatasetInfo {
+    /// Pixels of one frame.
+    #[must_use]
+    pub fn frame_pixels(&self) -> usize {
+        self.frame_width_px as usize * self.frame_height_px as usize
+    }
+}
+
+/// One trial or recording: its place among all frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Episode {
+    /// Its position among the episodes.
+    pub index: usize,
+    /// Its first frame, counted over the whole data set.
+    pub first_frame: usize,
+    /// Its number of frames.
+    pub frame_count: usize,
+    /// What was drawn for it, where it was simulated.
+    pub trial: Option<TrialParameters>,
+}
+
+impl Episode {
+    /// Its frames, counted over the whole data set.
+    #[must_use]
+    pub fn frames(&self) -> Range<usize> {
+        self.first_frame..self.first_frame + self.frame_count
+    }
+}
+
+/// What one episode holds, part by part; every part holds one item for each timestamp, one after another.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EpisodeData {
+    /// Seconds from the episode's start, growing.
+    pub timestamps_s: Vec<f64>,
+    /// Intensities, frame by frame, row by row.
+    pub pixels: Vec<u8>,
+    /// Ids of who is seen at each pixel (0 = scene, 1 = the other robot, …), laid out as `pixels`.
+    pub masks: Option<Vec<u8>>,
+    /// Actions, frame by frame.
+    pub actions: Vec<f32>,
+    /// States, frame by frame.
+    pub states: Vec<f32>,
+    /// What was drawn for it, where it was simulated.
+    pub trial: Option<TrialParameters>,
+}
+
+/// The frames seen and those to come after them: `context + horizon` consecutive frames of one episode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Window {
+    /// Position in [`Dataset::episodes`].
+    pub episode: usize,
+    /// The first frame seen, counted over the whole data set.
+    pub first_frame: usize,
+}
+
+/// A whole data set in memory.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Dataset {
+    info: DatasetInfo,
+    episodes: Vec<Episode>,
+    pixels: Vec<u8>,
+    masks: Option<Vec<u8>>,
+    actions: Vec<f32>,
+    states: Vec<f32>,
+    timestamps_s: Vec<f64>,
+}
+
+impl Dataset {
+    /// A data set of these episodes; the counts in `info` are filled in, and its hash where that is empty.
+    /// Errors: parts that don't fit together, numbers that aren't finite, time that doesn't grow, no frames.
+    pub fn from_episodes(info: DatasetInfo, episodes: Vec<EpisodeData>) -> Result<Self, DatasetError> {
+        check_description(&info)?;
+        let has_masks = episodes.first().is_some_and(|episode| episode.masks.is_some());
+        let frame_count: usize = episodes.iter().map(|episode| episode.timestamps_s.len()).sum();
+        let mut dataset = Self {
+            episodes: Vec::with_capacity(episodes.len()),
+            pixels: Vec::with_capacity(frame_count * info.frame_pixels()),
+            masks: has_masks.then(|| Vec::with_capacity(frame_count * info.frame_pixels())),
+            actions: Vec::with_capacity(frame_count * info.action_channels.len()),
+            states: Vec::with_capacity(frame_count * info.state_channels.len()),
+            timestamps_s: Vec::with_capacity(frame_count),
+            info,
+        };
+        for episode in episodes {
+            dataset.push(episode)?;
+        }
+        if dataset.timestamps_s.is_empty() {
+            return Err(DatasetError::Empty {
+                name: dataset.info.name,
+            });
+        }
+        dataset.info.frame_count = dataset.timestamps_s.len();
+        dataset.info.episode_count = dataset.episodes.len();
+        dataset.info.has_masks = has_masks;
+        if dataset.info.content_hash.is_empty() {
+            dataset.info.content_hash = dataset.hash_content();
+        }
+        Ok(dataset)
+    }
+
+    fn push(&mut self, data: EpisodeData) -> Result<(), DatasetError> {
+        let index = self.episodes.len();
+        check_episode(&self.info, index, &data)?;
+        match (&mut self.masks, data.masks) {
+            (Some(all), Some(masks)) => all.extend(masks),
+            (None, None) => {}
+            _ => return Err(DatasetError::MixedMasks { episode: index }),
+        }
+        self.episodes.push(Episode {
+            index,
+            first_frame: self.timestamps_s.len(),
+            frame_count: data.timestamps_s.len(),
+            trial: data.trial,
+        });
+        self.pixels.extend(data.pixels);
+        self.actions.extend(data.actions);
+        self.states.extend(data.states);
+        self.timestamps_s.extend(data.timestamps_s);
+        Ok(())
+    }
+
+    fn hash_content(&self) -> String {
+        let mut hasher = Sha256::new();
+        for episode in &self.episodes {
+            hasher.update((episode.frame_count as u64).to_le_bytes());
+        }
+        hasher.update(&self.pixels);
+        hasher.update(self.masks.as_deref().unwrap_or_default());
+        for value in self.actions.iter().chain(&self.states) {
+            hasher.update(value.to_le_bytes());
+        }
+        for value in &self.timestamps_s {
+            hasher.update(value.to_le_bytes());
+        }
+        hex(&hasher.finalize())
+    }
+
+    /// What the data set is.
+    #[must_use]
+    pub fn info(&self) -> &DatasetInfo {
+        &self.info
+    }
+
+    /// The episodes in order.
+    #[must_use]
+    pub fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    /// The intensities of a frame, row by row. Panics if there is no such frame.
+    #[must_use]
+    pub fn pixels(&self, frame: usize) -> &[u8] {
+        item(&self.pixels, frame, self.info.frame_pixels())
+    }
+
+    /// The ids of who is seen at each pixel of a frame, where there are masks. Panics if there is no such frame.
+    #[must_use]
+    pub fn mask(&self, frame: usize) -> Option<&[u8]> {
+        let masks = self.masks.as_deref()?;
+        Some(item(masks, frame, self.info.frame_pixels()))
+    }
+
+    /// What acts between that frame and the next. Panics if there is no such frame.
+    #[must_use]
+    pub fn action(&self, frame: usize) -> &[f32] {
+        item(&self.actions, frame, self.info.action_channels.len())
+    }
+
+    /// What the robot said of itself at that frame. Panics if there is no such frame.
+    #[must_use]
+    pub fn state(&self, frame: usize) -> &[f32] {
+        item(&self.states, frame, self.info.state_channels.len())
+    }
+
+    /// Seconds from the start of the frame's episode. Panics if there is no such frame.
+    #[must_use]
+    pub fn timestamp_s(&self, frame: usize) -> f64 {
+        self.timestamps_s[frame]
+    }
+
+    /// Errors: `FrameSize` unless frames are of that size.
+    pub fn require_frame_size(&self, width_px: u32, height_px: u32) -> Result<(), DatasetError> {
+        let info = &self.info;
+        if (info.frame_width_px, info.frame_height_px) == (width_px, height_px) {
+            return Ok(());
+        }
+        Err(DatasetError::FrameSize {
+            name: info.name.clone(),
+            width: info.frame_width_px,
+            height: info.frame_height_px,
+            wanted_width: width_px,
+            wanted_height: height_px,
+        })
+    }
+
+    /// Errors: `Channels` unless actions have that many components.
+    pub fn require_action_count(&self, wanted: usize) -> Result<(), DatasetError> {
+        self.require_channels("action", &self.info.action_channels, wanted)
+    }
+
+    /// Errors: `Channels` unless states have that many components.
+    pub fn require_state_count(&self, wanted: usize) -> Result<(), DatasetError> {
+        self.require_channels("state", &self.info.state_channels, wanted)
+    }
+
+    fn require_channels(&self, kind: &'static str, channels: &[Channel], wanted: usize) -> Result<(), DatasetError> {
+        if channels.len() == wanted {
+            return Ok(());
+        }
+        let names: Vec<_> = channels.iter().map(|channel| channel.name.as_str()).collect();
+        Err(DatasetError::Channels {
+            name: self.info.name.clone(),
+            kind,
+            found: channels.len(),
+            names: names.join(", "),
+            wanted,
+        })
+    }
+}
+
+fn item<T>(all: &[T], index: usize, size: usize) -> &[T] {
+    &all[index * size..(index + 1) * size]
+}
+
+/// Lower-case hexadecimal digits of the bytes.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write;
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+fn check_description(info: &DatasetInfo) -> Result<(), DatasetError> {
+    let sides = 1..=MAX_SIDE_PX;
+    if !sides.contains(&info.frame_width_px) || !sides.contains(&info.frame_height_px) {
+        return Err(DatasetError::Description(format!(
+            "frames of {}×{} px are out of range; each side must be 1 to {MAX_SIDE_PX} px",
+            info.frame_width_px, info.frame_height_px
+        )));
+    }
+    if !(info.frame_period_s.is_finite() && info.frame_period_s > 0.0) {
+        return Err(DatasetError::Description(format!(
+            "the frame period is {} s; it must be a finite number above 0",
+            info.frame_period_s
+        )));
+    }
+    Ok(())
+}
+
+fn check_episode(info: &DatasetInfo, episode: usize, data: &EpisodeData) -> Result<(), DatasetError> {
+    let frames = data.timestamps_s.len();
+    let pixels = info.frame_pixels();
+    let mask_count = data.masks.as_ref().map_or(frames * pixels, Vec::len);
+    for (part, found, size) in [
+        ("pixels", data.pixels.len(), pixels),
+        ("mask", mask_count, pixels),
+        ("action", data.actions.len(), info.action_channels.len()),
+        ("state", data.states.len(), info.state_channels.len()),
+    ] {
+        if found != frames * size {
+            return Err(DatasetError::PartLength {
+                episode,
+                part,
+                frames,
+                found,
+                expected: frames * size,
+            });
+        }
+    }
+    check_finite(episode, "action", &data.actions, info.action_channels.len())?;
+    check_finite(episode, "state", &data.states, info.state_channels.len())?;
+    check_time(episode, &data.timestamps_s)
+}
+
+fn check_finite(episode: usize, part: &'static str, values: &[f32], size: usize) -> Result<(), DatasetError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(place) => Err(DatasetError::NotFinite {
+            episode,
+            frame: place / size,
+            part,
+            value: f64::from(values[place]),
+        }),
+        None => Ok(()),
+    }
+}
+
+fn check_time(episode: usize, timestamps_s: &[f64]) -> Result<(), DatasetError> {
+    if let Some(frame) = timestamps_s.iter().position(|time| !time.is_finite()) {
+        return Err(DatasetError::NotFinite {
+            episode,
+            frame,
+            part: "timestamp",
+            value: timestamps_s[frame],
+        });
+    }
+    match timestamps_s.windows(2).position(|pair| pair[1] <= pair[0]) {
+        Some(before) => Err(DatasetError::TimeOrder {
+            episode,
+            frame: before + 1,
+        }),
+        None => Ok(()),
+    }
+}

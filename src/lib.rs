@@ -4,6 +4,8 @@
 
 pub mod types;
 
+pub mod files;
+
 pub mod frame;
 
 pub mod nn;

@@ -1,1 +1,3 @@
 //! From windows to weights: pre-training, fitting, checkpoints.
+
+pub mod optimizer;

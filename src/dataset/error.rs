@@ -1,0 +1,187 @@
+//! Why a data set was refused.
+
+use std::path::PathBuf;
+
+use crate::frame::FrameError;
+
+/// Why a data set could not be made, read or sampled: what was wrong and what would be right.
+#[derive(Debug, thiserror::Error)]
+pub enum DatasetError {
+    /// The parts of an episode don't hold the same number of frames.
+    #[error("episode {episode}: {part} has {found} values; {frames} frames take {expected}")]
+    PartLength {
+        /// Position of the episode.
+        episode: usize,
+        /// `pixels`, `mask`, `action` or `state`.
+        part: &'static str,
+        /// Frames of the episode, one for each timestamp.
+        frames: usize,
+        /// Values found.
+        found: usize,
+        /// Values needed.
+        expected: usize,
+    },
+    /// An action, state or timestamp was NaN or infinite.
+    #[error("episode {episode}, frame {frame}: {part} is {value}; every number must be finite")]
+    NotFinite {
+        /// Position of the episode.
+        episode: usize,
+        /// Frame within the episode.
+        frame: usize,
+        /// `action`, `state` or `timestamp`.
+        part: &'static str,
+        /// The value found.
+        value: f64,
+    },
+    /// Time stands still or runs back within an episode.
+    #[error("episode {episode}, frame {frame}: its timestamp is not after the one before; timestamps must grow")]
+    TimeOrder {
+        /// Position of the episode.
+        episode: usize,
+        /// Frame within the episode.
+        frame: usize,
+    },
+    /// Some episodes have masks and others not.
+    #[error("episode {episode}: masks must be there for every episode or for none")]
+    MixedMasks {
+        /// Position of the first episode that differs.
+        episode: usize,
+    },
+    /// No frames at all.
+    #[error("the data set \"{name}\" has no frames; at least one episode with one frame is needed")]
+    Empty {
+        /// The data set's name.
+        name: String,
+    },
+    /// The description of the data set can't be right.
+    #[error("{0}")]
+    Description(String),
+    /// Its frames have another size than what uses them.
+    #[error("the data set \"{name}\" has frames of {width}×{height} px; {wanted_width}×{wanted_height} px are needed")]
+    FrameSize {
+        /// The data set's name.
+        name: String,
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+        /// Width needed.
+        wanted_width: u32,
+        /// Height needed.
+        wanted_height: u32,
+    },
+    /// Its actions or states have another number of components than what uses them.
+    #[error("the data set \"{name}\" has {kind}s of {found} components ({names}); {wanted} are needed")]
+    Channels {
+        /// The data set's name.
+        name: String,
+        /// `action` or `state`.
+        kind: &'static str,
+        /// Components there are.
+        found: usize,
+        /// Their names.
+        names: String,
+        /// Components needed.
+        wanted: usize,
+    },
+    /// A window or stride of no frames.
+    #[error("{what} is 0; it must be at least 1")]
+    Zero {
+        /// The value, as the user knows it.
+        what: &'static str,
+    },
+    /// No episode is long enough.
+    #[error(
+        "a window of {window} frames ({context} seen, {horizon} to come) is longer than every episode of the {split} \
+         split; the longest runs {longest} frames without a gap"
+    )]
+    WindowTooLong {
+        /// Frames of the window.
+        window: usize,
+        /// Frames seen.
+        context: usize,
+        /// Frames to come.
+        horizon: usize,
+        /// The split asked for.
+        split: &'static str,
+        /// The longest stretch in it.
+        longest: usize,
+    },
+    /// Fewer windows than asked for.
+    #[error("{asked} windows asked of the {split} split, which has {available}; ask for fewer or collect more")]
+    TooFewWindows {
+        /// Windows asked for.
+        asked: usize,
+        /// The split asked.
+        split: &'static str,
+        /// Windows there are.
+        available: usize,
+    },
+    /// A file could not be read or written.
+    #[error("could not {action} {path}", path = path.display())]
+    Io {
+        /// `read`, `write`, …
+        action: &'static str,
+        /// The file or directory.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A file is not what its place says.
+    #[error("{path} is damaged or not a Foreframe data set's file: {reason}", path = path.display())]
+    Corrupt {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A frame in a file is no image of the right size.
+    #[error("{path}, row {row}: frame is damaged", path = path.display())]
+    CorruptFrame {
+        /// The file.
+        path: PathBuf,
+        /// Row in it.
+        row: usize,
+        /// What is wrong with the image.
+        source: FrameError,
+    },
+    /// A file is not the one that was collected.
+    #[error(
+        "{path} has the sha256 {found}, but {expected} was recorded when it was made; restore the file or collect the \
+         data set anew",
+        path = path.display()
+    )]
+    HashDiffers {
+        /// The file.
+        path: PathBuf,
+        /// Hash recorded.
+        expected: String,
+        /// Hash found.
+        found: String,
+    },
+    /// The directory holds no data set.
+    #[error("{path} holds no data set: meta/info.json is missing", path = path.display())]
+    NotADataset {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The collection was interrupted.
+    #[error(
+        "the data set in {path} is unfinished; run `foreframe collect` with the same arguments to go on: {arguments}",
+        path = path.display()
+    )]
+    Unfinished {
+        /// The directory.
+        path: PathBuf,
+        /// The arguments it was begun with.
+        arguments: String,
+    },
+}
+
+impl DatasetError {
+    /// An [`DatasetError::Io`] of that action on that path.
+    pub(crate) fn io(action: &'static str, path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+}

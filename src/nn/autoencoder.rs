@@ -1,0 +1,210 @@
+//! The whole model: frames to features and back, what has been seen to what will be, and what has been seen again.
+
+use candle_core::Tensor;
+
+use super::conditioned::Condition;
+use super::dense::{Activation, Dense};
+use super::lstm::unroll;
+use super::lstm_cell::{LstmState, PeepholeCell};
+use super::{ModelSpec, NnError, Parameters, Reconstruction};
+
+/// What the predictor takes as its own last frame.
+#[derive(Clone, Copy, Debug)]
+pub enum Feedback<'a> {
+    /// The features it predicted: how it is used.
+    Prediction,
+    /// The true features [B, horizon, F] of the frames to come ("teacher forcing"); the last of them is not used.
+    Truth(&'a Tensor),
+}
+
+/// The network: a frame codec, an LSTM encoder and two LSTM decoders. Holds weights only, so one model serves many.
+#[derive(Clone, Debug)]
+pub struct Model {
+    spec: ModelSpec,
+    frame_encoder: Dense,
+    frame_decoder: Dense,
+    encoder: PeepholeCell,
+    predictor: PeepholeCell,
+    predictor_output: Dense,
+    reconstructor: PeepholeCell,
+    reconstructor_output: Dense,
+}
+
+impl Model {
+    /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor.
+    /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
+    pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
+        Self::with_frozen(spec, parameters, &[])
+    }
+
+    /// As [`Model::new`], without any gradients: for prediction.
+    pub fn detached(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
+        Self::with_frozen(spec, parameters, &[""])
+    }
+
+    /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
+    pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+        spec.validate()?;
+        let shapes = spec.tensor_shapes();
+        let tensor = |name: String| {
+            let expected = shapes.get(&name).cloned().unwrap_or_default();
+            match parameters.get(&name) {
+                None => Err(NnError::TensorMissing { name, expected }),
+                Some(var) if var.dims() != expected => {
+                    let found = var.dims().to_vec();
+                    Err(NnError::TensorShape { name, found, expected })
+                }
+                Some(var) if frozen.iter().any(|prefix| name.starts_with(prefix)) => Ok(var.as_detached_tensor()),
+                Some(var) => Ok(var.as_tensor().clone()),
+            }
+        };
+        let dense = |name: &str, activation| {
+            let (weight, bias) = (tensor(format!("{name}.weight"))?, tensor(format!("{name}.bias"))?);
+            Ok::<_, NnError>(Dense::new(weight, bias, activation))
+        };
+        let cell = |name: &str| {
+            let peephole = |gate: &str| tensor(format!("{name}.peephole_{gate}"));
+            Ok::<_, NnError>(PeepholeCell {
+                w_x: tensor(format!("{name}.w_x"))?,
+                w_h: tensor(format!("{name}.w_h"))?,
+                bias: tensor(format!("{name}.bias"))?,
+                peepholes: [peephole("i")?, peephole("f")?, peephole("o")?],
+            })
+        };
+        Ok(Self {
+            frame_encoder: dense("frame_encoder", Activation::Tanh)?,
+            frame_decoder: dense("frame_decoder", Activation::Linear)?,
+            encoder: cell("encoder")?,
+            predictor: cell("predictor")?,
+            predictor_output: dense("predictor.output", Activation::Linear)?,
+            reconstructor: cell("reconstructor")?,
+            reconstructor_output: dense("reconstructor.output", Activation::Linear)?,
+            spec,
+        })
+    }
+
+    /// The model's dimensions and meaning.
+    #[must_use]
+    pub fn spec(&self) -> &ModelSpec {
+        &self.spec
+    }
+
+    /// Features [N, F] of frames [N, P] in the model's space. Errors: `Shape`.
+    pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
+        self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
+        self.frame_encoder.forward(frames)
+    }
+
+    /// Frames [N, P] in the model's space, not clamped, of features [N, F]. Errors: `Shape`.
+    pub fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
+        self.check("features", features, &[None, Some(self.spec.features)])?;
+        self.frame_decoder.forward(features)
+    }
+
+    /// Features [B, horizon, F] of the frames that follow those with `features` [B, context, F]. The predictor starts
+    /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
+    /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
+    pub fn predict(&self, features: &Tensor, condition: &Condition, feedback: Feedback) -> Result<Tensor, NnError> {
+        let batch = self.check_windows(features)?;
+        if let Feedback::Truth(truth) = feedback {
+            self.check(
+                "true features",
+                truth,
+                &[Some(batch), Some(self.spec.horizon), Some(self.spec.features)],
+            )?;
+        }
+        let condition = condition.inputs(&self.spec, batch)?;
+        let (_, mut state) = self.encode(features)?;
+        let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
+        let mut predicted = Vec::with_capacity(self.spec.horizon);
+        for k in 0..self.spec.horizon {
+            let input = match &condition {
+                Some(condition) => Tensor::cat(&[&last, &condition.get_on_dim(1, k)?], 1)?,
+                None => last.clone(),
+            };
+            state = self.predictor.step(&input, &state)?;
+            let next = (&last + self.predictor_output.forward(&state.h)?)?;
+            last = match feedback {
+                Feedback::Prediction => next.clone(),
+                Feedback::Truth(truth) => truth.get_on_dim(1, k)?.contiguous()?,
+            };
+            predicted.push(next);
+        }
+        Ok(Tensor::stack(&predicted, 1)?)
+    }
+
+    /// The features [B, context, F] again, from what the encoder kept of them. Errors: `Shape`.
+    pub fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
+        let batch = self.check_windows(features)?;
+        let (outputs, state) = self.encode(features)?;
+        match self.spec.reconstruction {
+            Reconstruction::Sequence => self.reconstruct_sequence(features, state),
+            Reconstruction::Stepwise => {
+                let (outputs, _) = unroll(&self.reconstructor, &outputs, self.reconstructor.zero_state(batch)?)?;
+                let flat = self.reconstructor_output.forward(&outputs.flatten(0, 1)?)?;
+                Ok(flat.reshape(features.dims())?)
+            }
+        }
+    }
+
+    /// Approach 1: decodes the whole sequence from the encoder's last state; the first input is zeros, then the decoder's
+    /// own output.
+    fn reconstruct_sequence(&self, features: &Tensor, state: LstmState) -> Result<Tensor, NnError> {
+        let mut state = state;
+        let mut last = features.get_on_dim(1, 0)?.zeros_like()?;
+        let mut outputs = Vec::with_capacity(self.spec.context);
+        for _ in 0..self.spec.context {
+            state = self.reconstructor.step(&last, &state)?;
+            last = self.reconstructor_output.forward(&state.h)?;
+            outputs.push(last.clone());
+        }
+        Ok(Tensor::stack(&outputs, 1)?)
+    }
+
+    /// Frames [B, horizon, P] that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
+    pub fn predict_frames(&self, frames: &Tensor, condition: &Condition) -> Result<Tensor, NnError> {
+        let (context, pixels) = (self.spec.context, self.spec.pixels());
+        let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
+        let features = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;
+        let features = features.reshape((batch, context, self.spec.features))?;
+        let predicted = self.predict(&features, condition, Feedback::Prediction)?;
+        let frames = self.decode_frames(&predicted.flatten(0, 1)?)?;
+        Ok(frames.reshape((batch, self.spec.horizon, pixels))?)
+    }
+
+    /// The encoder's outputs [B, context, H] and its last state.
+    fn encode(&self, features: &Tensor) -> Result<(Tensor, LstmState), NnError> {
+        unroll(&self.encoder, features, self.encoder.zero_state(features.dim(0)?)?)
+    }
+
+    fn check_windows(&self, features: &Tensor) -> Result<usize, NnError> {
+        self.check(
+            "features",
+            features,
+            &[None, Some(self.spec.context), Some(self.spec.features)],
+        )
+    }
+
+    /// Checks a shape, `None` for any size but 0; gives the first side.
+    fn check(&self, what: &'static str, tensor: &Tensor, shape: &[Option<usize>]) -> Result<usize, NnError> {
+        let fits = |(&side, &wanted): (&usize, &Option<usize>)| wanted.map_or(side > 0, |wanted| side == wanted);
+        if tensor.rank() == shape.len() && tensor.dims().iter().zip(shape).all(fits) {
+            return Ok(tensor.dims()[0]);
+        }
+        let sides: Vec<String> = shape
+            .iter()
+            .map(|side| side.map_or("any".to_owned(), |side| side.to_string()))
+            .collect();
+        let spec = &self.spec;
+        let expected = format!(
+            "[{}] ({}×{} px frames, {} in, {} out, {} features)",
+            sides.join(", "),
+            spec.frame_width_px,
+            spec.frame_height_px,
+            spec.context,
+            spec.horizon,
+            spec.features
+        );
+        Err(NnError::shape(what, tensor, expected))
+    }
+}

@@ -1,0 +1,87 @@
+//! The state and the action tuple that the prediction is conditioned on (paper, "Proposed Action and State Conditioned
+//! LSTM Autoencoder Model"), scaled to the network's range.
+
+use candle_core::{Device, Tensor};
+
+use super::spec::MIN_CHANNEL_STD;
+use super::{ChannelScale, ModelSpec, NnError};
+
+/// What a prediction is conditioned on, in the channels' own units. What the model's conditioning doesn't take is
+/// ignored; what it takes and isn't there is an error.
+#[derive(Clone, Debug, Default)]
+pub struct Condition {
+    /// Actions to come [B, horizon, A]; action k leads to predicted frame k.
+    pub actions: Option<Tensor>,
+    /// State at the last context frame [B, S].
+    pub state: Option<Tensor>,
+}
+
+impl Condition {
+    /// No actions and no state.
+    #[must_use]
+    pub fn none() -> Self {
+        Self::default()
+    }
+
+    /// The inputs that follow the features in each step of the predictor [B, horizon, A + S], scaled; `None` if the
+    /// conditioning is none. Errors: `Missing`, `Shape`.
+    pub(super) fn inputs(&self, spec: &ModelSpec, batch: usize) -> Result<Option<Tensor>, NnError> {
+        let horizon = spec.horizon;
+        let Some(count) = spec.action_inputs() else {
+            return Ok(None);
+        };
+        let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
+        let actions = scaled(actions, &spec.actions)?;
+        let Some(count) = spec.state_inputs() else {
+            return Ok(Some(actions));
+        };
+        let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+        let state = scaled(state, &spec.states)?
+            .unsqueeze(1)?
+            .expand((batch, horizon, count))?;
+        Ok(Some(Tensor::cat(&[&actions, &state], 2)?))
+    }
+}
+
+/// The tensor, if it is there and has that shape.
+fn checked<'a>(
+    spec: &ModelSpec,
+    what: &'static str,
+    given: Option<&'a Tensor>,
+    shape: &[usize],
+) -> Result<&'a Tensor, NnError> {
+    let expected = || match (what, shape) {
+        ("actions", &[batch, horizon, count]) => {
+            format!(
+                "[{batch}, {horizon}, {count}]: windows, predicted frames, components {}",
+                names(&spec.actions)
+            )
+        }
+        _ => format!("{shape:?}: windows, components {}", names(&spec.states)),
+    };
+    match given {
+        None => Err(NnError::Missing {
+            what,
+            conditioning: spec.conditioning,
+            expected: expected(),
+        }),
+        Some(tensor) if tensor.dims() != shape => Err(NnError::shape(what, tensor, expected())),
+        Some(tensor) => Ok(tensor),
+    }
+}
+
+fn names(channels: &[ChannelScale]) -> String {
+    let names: Vec<&str> = channels.iter().map(|channel| channel.name.as_str()).collect();
+    format!("({})", names.join(", "))
+}
+
+/// (values − mean) / std along the last dimension.
+fn scaled(values: &Tensor, channels: &[ChannelScale]) -> Result<Tensor, NnError> {
+    let mean: Vec<f32> = channels.iter().map(|channel| channel.mean).collect();
+    let std: Vec<f32> = channels
+        .iter()
+        .map(|channel| channel.std.max(MIN_CHANNEL_STD))
+        .collect();
+    let row = |row: Vec<f32>| Tensor::new(row, &Device::Cpu)?.to_dtype(values.dtype());
+    Ok(values.broadcast_sub(&row(mean)?)?.broadcast_div(&row(std)?)?)
+}

@@ -1,0 +1,50 @@
+//! Fresh weights from our own seeded generator. Each tensor draws from a stream of its own name, so that one tensor's
+//! values don't depend on which others a model has.
+//!
+//! - Dense weights [D, O]: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
+//! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
+//! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts "nothing changes".
+
+use candle_core::{Device, Tensor};
+use rand::Rng;
+
+use super::NnError;
+use crate::types::Seed;
+
+/// A fresh tensor for that name and shape.
+pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, NnError> {
+    let count = shape.iter().product();
+    let (_, part) = name.rsplit_once('.').unwrap_or(("", name));
+    let values = match (part, shape) {
+        ("bias", &[gates]) if is_lstm(name) => forget_gate_open(gates),
+        ("bias", _) => vec![0.0; count],
+        ("weight", &[inputs, outputs]) => {
+            let gain = if name == "predictor.output.weight" { 0.1 } else { 1.0 };
+            uniform(count, gain * (6.0 / (inputs + outputs) as f32).sqrt(), name, seed)
+        }
+        (_, &[.., last]) => {
+            let hidden = if part.starts_with("peephole") { last } else { last / 4 };
+            uniform(count, 1.0 / (hidden as f32).sqrt(), name, seed)
+        }
+        _ => vec![0.0; count],
+    };
+    Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
+}
+
+/// Whether the tensor belongs to an LSTM itself, not to a dense layer.
+fn is_lstm(name: &str) -> bool {
+    matches!(name.split_once('.'), Some(("encoder" | "predictor" | "reconstructor", part)) if !part.contains('.'))
+}
+
+/// Biases of the gates i, f, c, o: 0, 1, 0, 0.
+fn forget_gate_open(gates: usize) -> Vec<f32> {
+    let hidden = gates / 4;
+    (0..gates)
+        .map(|unit| if unit / hidden == 1 { 1.0 } else { 0.0 })
+        .collect()
+}
+
+fn uniform(count: usize, bound: f32, name: &str, seed: Seed) -> Vec<f32> {
+    let mut rng = seed.derive(name, 0).rng();
+    (0..count).map(|_| bound * (2.0 * rng.random::<f32>() - 1.0)).collect()
+}

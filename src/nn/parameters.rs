@@ -1,0 +1,147 @@
+//! The trained tensors of a model by name.
+
+use std::collections::BTreeMap;
+
+use candle_core::{DType, Tensor, Var};
+
+use super::{ModelSpec, NnError, init};
+use crate::types::Seed;
+
+/// The trained tensors of a model. Names are sorted, so every pass over them has one order.
+#[derive(Clone, Debug)]
+pub struct Parameters(BTreeMap<String, Var>);
+
+impl Parameters {
+    /// Fresh weights, f32: the same seed gives the same bits. Errors: those of [`ModelSpec::validate`].
+    pub fn initialize(spec: &ModelSpec, seed: Seed) -> Result<Self, NnError> {
+        spec.validate()?;
+        let tensors = spec
+            .tensor_shapes()
+            .into_iter()
+            .map(|(name, shape)| Ok((name.clone(), Var::from_tensor(&init::tensor(&name, &shape, seed)?)?)))
+            .collect::<Result<_, NnError>>()?;
+        Ok(Self(tensors))
+    }
+
+    /// Weights that were stored, any float type, as f32. Errors: `TensorMissing`, `TensorUnknown`, `TensorShape`,
+    /// `TensorNotFinite`, and those of [`ModelSpec::validate`].
+    pub fn from_tensors(spec: &ModelSpec, mut tensors: BTreeMap<String, Tensor>) -> Result<Self, NnError> {
+        spec.validate()?;
+        let mut vars = BTreeMap::new();
+        for (name, expected) in spec.tensor_shapes() {
+            let Some(tensor) = tensors.remove(&name) else {
+                return Err(NnError::TensorMissing { name, expected });
+            };
+            if tensor.dims() != expected {
+                let found = tensor.dims().to_vec();
+                return Err(NnError::TensorShape { name, found, expected });
+            }
+            let tensor = tensor.to_dtype(DType::F32)?.force_contiguous()?;
+            if !is_finite(&tensor)? {
+                return Err(NnError::TensorNotFinite { name });
+            }
+            vars.insert(name, Var::from_tensor(&tensor)?);
+        }
+        match tensors.into_keys().next() {
+            Some(name) => Err(NnError::TensorUnknown { name }),
+            None => Ok(Self(vars)),
+        }
+    }
+
+    /// Every tensor with its name, in the order of the names.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.0.iter().map(|(name, var)| (name.as_str(), var))
+    }
+
+    /// The tensor of that name.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&Var> {
+        self.0.get(name)
+    }
+
+    /// Copies of the tensors as they are now, which later updates don't change.
+    pub fn snapshot(&self) -> Result<BTreeMap<String, Tensor>, NnError> {
+        self.0
+            .iter()
+            .map(|(name, var)| Ok((name.clone(), var.as_detached_tensor().copy()?)))
+            .collect()
+    }
+
+    /// Gives every tensor the value that `snapshot` held, in place: models that share the storage see it.
+    /// Errors: `TensorMissing`, `TensorShape`.
+    pub fn restore(&self, snapshot: &BTreeMap<String, Tensor>) -> Result<(), NnError> {
+        for (name, var) in &self.0 {
+            let expected = var.dims().to_vec();
+            match snapshot.get(name) {
+                None => {
+                    let name = name.clone();
+                    return Err(NnError::TensorMissing { name, expected });
+                }
+                Some(tensor) if tensor.dims() != expected => {
+                    let (name, found) = (name.clone(), tensor.dims().to_vec());
+                    return Err(NnError::TensorShape { name, found, expected });
+                }
+                Some(_) => {}
+            }
+        }
+        for (name, var) in &self.0 {
+            if let Some(tensor) = snapshot.get(name) {
+                var.set(&tensor.to_dtype(var.dtype())?)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Number of trained values.
+    #[must_use]
+    pub fn count(&self) -> u64 {
+        self.0.values().map(|var| var.elem_count() as u64).sum()
+    }
+
+    /// Fresh variables of another float type with these values; f64 serves to check gradients.
+    pub fn to_dtype(&self, dtype: DType) -> Result<Self, NnError> {
+        let tensors = self
+            .0
+            .iter()
+            .map(|(name, var)| {
+                Ok((
+                    name.clone(),
+                    Var::from_tensor(&var.as_detached_tensor().to_dtype(dtype)?.copy()?)?,
+                ))
+            })
+            .collect::<Result<_, NnError>>()?;
+        Ok(Self(tensors))
+    }
+
+    /// Sets the codec from the mean frame of the training data, `mean` [P] in the model's space: the decoder's bias
+    /// becomes the mean frame, and the encoder sees frames less the mean (its bias becomes −mean · weight). Pre-training
+    /// then starts from the mean frame instead of black.
+    pub fn center_codec(&self, mean: &Tensor) -> Result<(), NnError> {
+        let var = |name: &str| {
+            self.get(name).ok_or_else(|| NnError::TensorMissing {
+                name: name.to_owned(),
+                expected: Vec::new(),
+            })
+        };
+        let (weight, bias) = (var("frame_encoder.weight")?, var("frame_encoder.bias")?);
+        let decoder_bias = var("frame_decoder.bias")?;
+        if mean.dims() != decoder_bias.dims() {
+            return Err(NnError::shape("mean frame", mean, format!("{:?}", decoder_bias.dims())));
+        }
+        decoder_bias.set(&mean.copy()?)?;
+        bias.set(
+            &mean
+                .unsqueeze(0)?
+                .matmul(&weight.as_detached_tensor())?
+                .squeeze(0)?
+                .neg()?,
+        )?;
+        Ok(())
+    }
+}
+
+/// Whether every value is a finite number.
+fn is_finite(tensor: &Tensor) -> Result<bool, NnError> {
+    let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+    Ok(values.iter().all(|value| value.is_finite()))
+}

@@ -1,0 +1,298 @@
+//! All that determines a model's shape and its meaning, validated; the sizes that follow from it.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::NnError;
+use crate::frame::preprocess::Preprocess;
+
+/// Greatest side of a frame that a model takes, in pixels.
+pub const MAX_MODEL_SIDE_PX: u32 = 512;
+/// Greatest period between two frames, in seconds; the least is [`MIN_FRAME_PERIOD_S`].
+pub const MAX_FRAME_PERIOD_S: f64 = 3600.0;
+/// Least period between two frames, in seconds.
+pub const MIN_FRAME_PERIOD_S: f64 = 1e-4;
+/// Greatest number of context frames, and of predicted frames.
+pub const MAX_STEPS: usize = 256;
+/// Greatest number of features of a frame.
+pub const MAX_FEATURES: usize = 4096;
+/// Greatest number of hidden units of an LSTM.
+pub const MAX_HIDDEN: usize = 4096;
+/// Greatest number of components of an action, and of a state.
+pub const MAX_CHANNELS: usize = 64;
+/// Greatest standard deviation of the smoothing, in pixels.
+pub const MAX_BLUR_SIGMA_PX: f32 = 16.0;
+/// Greatest number of trained values of a model (1 GiB in f32).
+pub const MAX_PARAMETERS: u64 = 1 << 28;
+/// A channel that varies less than this (in its own unit) is scaled as if it varied this much, so that a constant
+/// channel doesn't divide by zero.
+pub const MIN_CHANNEL_STD: f32 = 1e-3;
+
+macro_rules! named_enum {
+    ($(#[$doc:meta])* $name:ident, $kind:literal, $known:literal, { $($(#[$vdoc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum $name {
+            $($(#[$vdoc])* $variant,)+
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.pad(match self { $(Self::$variant => $text,)+ })
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = NnError;
+
+            fn from_str(name: &str) -> Result<Self, NnError> {
+                match name {
+                    $($text => Ok(Self::$variant),)+
+                    _ => Err(NnError::UnknownName { kind: $kind, name: name.to_owned(), known: $known }),
+                }
+            }
+        }
+    };
+}
+pub(super) use named_enum;
+
+named_enum!(
+    /// The paper's two approaches to reconstruct the frames seen.
+    Reconstruction, "reconstruction", "\"sequence\" and \"stepwise\"", {
+        /// Encodes the whole sequence, then decodes it (approach 1).
+        Sequence = "sequence",
+        /// Reconstructs after each frame (approach 2).
+        Stepwise = "stepwise",
+    }
+);
+
+named_enum!(
+    /// What the prediction is conditioned on, besides the frames seen.
+    Conditioning, "conditioning", "\"none\", \"action\" and \"state-action\"", {
+        /// Nothing.
+        None = "none",
+        /// The action that leads to each predicted frame.
+        Action = "action",
+        /// The action that leads to each predicted frame, and the state at the last frame seen.
+        StateAction = "state-action",
+    }
+);
+
+/// One component of an action or a state, and the scale by which it enters the network: (value − mean) / std.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelScale {
+    /// What the component is, for example `linear`.
+    pub name: String,
+    /// Its unit, for example `m/s`; empty where it has none.
+    pub unit: String,
+    /// Mean over the training data, in that unit.
+    pub mean: f32,
+    /// Standard deviation over the training data, in that unit; taken as [`MIN_CHANNEL_STD`] where less.
+    pub std: f32,
+}
+
+/// All dimensions of a model, and what its numbers mean.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ModelSpec {
+    /// Width of a frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of a frame in pixels.
+    pub frame_height_px: u32,
+    /// Time from one frame to the next in seconds.
+    pub frame_period_s: f64,
+    /// How frames enter the model's space.
+    pub preprocess: Preprocess,
+    /// Frames seen before the prediction starts.
+    pub context: usize,
+    /// Frames predicted.
+    pub horizon: usize,
+    /// Features of a frame, F.
+    pub features: usize,
+    /// Hidden units of each LSTM, H.
+    pub hidden: usize,
+    /// How the frames seen are reconstructed.
+    pub reconstruction: Reconstruction,
+    /// What the prediction is conditioned on.
+    pub conditioning: Conditioning,
+    /// Components of an action.
+    pub actions: Vec<ChannelScale>,
+    /// Components of a state.
+    pub states: Vec<ChannelScale>,
+}
+
+impl Default for ModelSpec {
+    fn default() -> Self {
+        Self {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            frame_period_s: 0.2,
+            preprocess: Preprocess::default(),
+            context: 5,
+            horizon: 5,
+            features: 128,
+            hidden: 256,
+            reconstruction: Reconstruction::Sequence,
+            conditioning: Conditioning::None,
+            actions: Vec::new(),
+            states: Vec::new(),
+        }
+    }
+}
+
+impl ModelSpec {
+    /// Checks every field against its bound. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`.
+    pub fn validate(&self) -> Result<(), NnError> {
+        let side = f64::from(MAX_MODEL_SIDE_PX);
+        in_range("frame_width_px", f64::from(self.frame_width_px), 1.0, side)?;
+        in_range("frame_height_px", f64::from(self.frame_height_px), 1.0, side)?;
+        in_range(
+            "frame_period_s",
+            self.frame_period_s,
+            MIN_FRAME_PERIOD_S,
+            MAX_FRAME_PERIOD_S,
+        )?;
+        let sigma = f64::from(self.preprocess.blur_sigma_px);
+        in_range("preprocess.blur_sigma_px", sigma, 0.0, f64::from(MAX_BLUR_SIGMA_PX))?;
+        in_range("context", self.context as f64, 1.0, MAX_STEPS as f64)?;
+        in_range("horizon", self.horizon as f64, 1.0, MAX_STEPS as f64)?;
+        in_range("features", self.features as f64, 1.0, MAX_FEATURES as f64)?;
+        in_range("hidden", self.hidden as f64, 1.0, MAX_HIDDEN as f64)?;
+        in_range("number of actions", self.actions.len() as f64, 0.0, MAX_CHANNELS as f64)?;
+        in_range("number of states", self.states.len() as f64, 0.0, MAX_CHANNELS as f64)?;
+        self.check_channels()?;
+        in_range(
+            "number of parameters",
+            self.parameter_count() as f64,
+            1.0,
+            MAX_PARAMETERS as f64,
+        )
+    }
+
+    fn check_channels(&self) -> Result<(), NnError> {
+        let used = [
+            ("action", &self.actions, self.action_inputs()),
+            ("state", &self.states, self.state_inputs()),
+        ];
+        for (kind, channels, inputs) in used {
+            if inputs == Some(0) {
+                return Err(NnError::NoChannels {
+                    conditioning: self.conditioning,
+                    kind,
+                });
+            }
+            if let Some(channel) = channels
+                .iter()
+                .find(|channel| !channel.mean.is_finite() || !channel.std.is_finite() || channel.std < 0.0)
+            {
+                return Err(NnError::ChannelScale {
+                    kind,
+                    name: channel.name.clone(),
+                    mean: channel.mean,
+                    std: channel.std,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Pixels of a frame, P.
+    #[must_use]
+    pub fn pixels(&self) -> usize {
+        self.frame_width_px as usize * self.frame_height_px as usize
+    }
+
+    /// Components of an action that enter the predictor; `None` if the conditioning ignores actions.
+    #[must_use]
+    pub fn action_inputs(&self) -> Option<usize> {
+        (self.conditioning != Conditioning::None).then_some(self.actions.len())
+    }
+
+    /// Components of a state that enter the predictor; `None` if the conditioning ignores states.
+    #[must_use]
+    pub fn state_inputs(&self) -> Option<usize> {
+        (self.conditioning == Conditioning::StateAction).then_some(self.states.len())
+    }
+
+    /// Inputs of the predictor's LSTM: features, then the action, then the state.
+    #[must_use]
+    pub fn predictor_inputs(&self) -> usize {
+        self.features + self.action_inputs().unwrap_or(0) + self.state_inputs().unwrap_or(0)
+    }
+
+    /// Inputs of the reconstructor's LSTM: its own output fed back (approach 1), or the encoder's output (approach 2).
+    #[must_use]
+    pub fn reconstructor_inputs(&self) -> usize {
+        match self.reconstruction {
+            Reconstruction::Sequence => self.features,
+            Reconstruction::Stepwise => self.hidden,
+        }
+    }
+
+    /// Name and shape of every trained tensor. Gate order in `w_x`, `w_h` and `bias` is i, f, c, o.
+    #[must_use]
+    pub fn tensor_shapes(&self) -> BTreeMap<String, Vec<usize>> {
+        let (pixels, features, hidden) = (self.pixels(), self.features, self.hidden);
+        let mut shapes = BTreeMap::new();
+        let mut dense = |name: &str, inputs: usize, outputs: usize| {
+            shapes.insert(format!("{name}.weight"), vec![inputs, outputs]);
+            shapes.insert(format!("{name}.bias"), vec![outputs]);
+        };
+        dense("frame_encoder", pixels, features);
+        dense("frame_decoder", features, pixels);
+        dense("predictor.output", hidden, features);
+        dense("reconstructor.output", hidden, features);
+        let lstms = [
+            ("encoder", features),
+            ("predictor", self.predictor_inputs()),
+            ("reconstructor", self.reconstructor_inputs()),
+        ];
+        for (name, inputs) in lstms {
+            shapes.insert(format!("{name}.w_x"), vec![inputs, 4 * hidden]);
+            shapes.insert(format!("{name}.w_h"), vec![hidden, 4 * hidden]);
+            shapes.insert(format!("{name}.bias"), vec![4 * hidden]);
+            for gate in ["i", "f", "o"] {
+                shapes.insert(format!("{name}.peephole_{gate}"), vec![hidden]);
+            }
+        }
+        shapes
+    }
+
+    /// Number of trained values, the reconstructor's among them.
+    #[must_use]
+    pub fn parameter_count(&self) -> u64 {
+        self.tensor_shapes()
+            .values()
+            .map(|shape| shape.iter().map(|&side| side as u64).product::<u64>())
+            .sum()
+    }
+
+    /// Multiply–adds of weights (biases and the gates' own products apart) per predicted frame, with the context's
+    /// encoding spread over the frames predicted, rounded up:
+    ///
+    /// `(context · (P·F + L(F)) + horizon · (L(F+A+S) + H·F + F·P)) / horizon`, `L(D) = 4H·(D + H) + 3H`.
+    ///
+    /// A session that keeps the encoder's state does less; the reconstructor has no part in a prediction.
+    #[must_use]
+    pub fn multiply_adds_per_frame(&self) -> u64 {
+        let (context, horizon) = (self.context as u64, self.horizon.max(1) as u64);
+        let (pixels, features, hidden) = (self.pixels() as u64, self.features as u64, self.hidden as u64);
+        let lstm = |inputs: u64| 4 * hidden * (inputs + hidden) + 3 * hidden;
+        let seen = context * (pixels * features + lstm(features));
+        let predicted = lstm(self.predictor_inputs() as u64) + hidden * features + features * pixels;
+        seen.div_ceil(horizon) + predicted
+    }
+}
+
+/// Refuses a value outside its bounds, NaN with it.
+fn in_range(field: &'static str, value: f64, min: f64, max: f64) -> Result<(), NnError> {
+    if (min..=max).contains(&value) {
+        return Ok(());
+    }
+    Err(NnError::OutOfRange { field, value, min, max })
+}
