@@ -100,27 +100,30 @@ pub(super) fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
 pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
     let height = values.len() / width;
     let radius = kernel.len() / 2;
-    let clamped = |position: usize, tap: usize, len: usize| (position + tap).saturating_sub(radius).min(len - 1);
     let mut rows = vec![0.0; values.len()];
+    let mut padded = vec![0.0; width + 2 * radius];
     for (row, out) in values.chunks_exact(width).zip(rows.chunks_exact_mut(width)) {
-        for (x, out) in out.iter_mut().enumerate() {
-            *out = kernel
-                .iter()
-                .enumerate()
-                .map(|(tap, weight)| weight * row[clamped(x, tap, width)])
-                .sum();
+        padded[..radius].fill(row[0]);
+        padded[radius..radius + width].copy_from_slice(row);
+        padded[radius + width..].fill(row[width - 1]);
+        for (tap, weight) in kernel.iter().enumerate() {
+            add_scaled(out, &padded[tap..tap + width], *weight);
         }
     }
     let mut result = vec![0.0; values.len()];
     for (y, out) in result.chunks_exact_mut(width).enumerate() {
         for (tap, weight) in kernel.iter().enumerate() {
-            let from = clamped(y, tap, height) * width;
-            for (out, value) in out.iter_mut().zip(&rows[from..from + width]) {
-                *out += weight * value;
-            }
+            let from = (y + tap).saturating_sub(radius).min(height - 1) * width;
+            add_scaled(out, &rows[from..from + width], *weight);
         }
     }
     result
+}
+
+fn add_scaled(out: &mut [f32], values: &[f32], weight: f32) {
+    for (out, value) in out.iter_mut().zip(values) {
+        *out += weight * value;
+    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,75 @@
+//! `foreframe collect`
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use super::{CliError, interrupt, progress::Progress, say};
+use crate::dataset::collect::{CollectConfig, collect};
+use crate::sim::{Scenario, WorldConfig};
+use crate::types::Seed;
+
+/// Simulate trials and store their frames, actions and states.
+///
+/// The data set is Parquet in the LeRobot v3 layout. Collection can be stopped at any time: the same command goes on where
+/// it was, and the result is the same as if it had never stopped.
+#[derive(clap::Args)]
+#[command(after_help = "Example: foreframe collect --scenario moving-observer --trials 500")]
+pub(super) struct Args {
+    /// static-observer (the paper's: a standing camera, one robot), moving-observer (the camera's robot drives too) or
+    /// crowded (several robots)
+    #[arg(long, default_value = "static-observer")]
+    scenario: Scenario,
+    /// How many trials to simulate
+    #[arg(long, default_value_t = 1000)]
+    trials: u64,
+    /// The origin of all randomness: the same seed gives the same bytes
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// The data set's directory [default: data/SCENARIO]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Threads to simulate on [default: one a core]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Width and height of the frames, in pixels
+    #[arg(long, value_name = "PX", default_value_t = WorldConfig::default().frame_width_px)]
+    frame_size: u32,
+    /// Standard deviation of the camera's noise, where 1 is white
+    #[arg(long, value_name = "STD", default_value_t = WorldConfig::default().camera.noise_std)]
+    noise: f32,
+}
+
+pub(super) fn run(args: Args) -> Result<(), CliError> {
+    if args.trials == 0 {
+        return Err(CliError::Usage("--trials is 0; a data set takes at least 1".to_owned()));
+    }
+    let out = args.out.unwrap_or_else(|| PathBuf::from("data").join(args.scenario.to_string()));
+    let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), out.clone());
+    config.world.frame_width_px = args.frame_size;
+    config.world.frame_height_px = args.frame_size;
+    config.world.camera.noise_std = args.noise;
+    config.world.validate().map_err(|error| CliError::Usage(error.to_string()))?;
+    if let Some(threads) = args.threads {
+        config.threads = threads;
+    }
+    let (cancelled, progress) = (interrupt::flag()?, Progress::new("trials"));
+    progress.start(&format!("collecting {}", config.scenario), 0, config.trials);
+    let collected = collect(&config, &|now| progress.update(now.done, now.total, String::new), &cancelled);
+    progress.finish();
+    match collected {
+        Ok(info) => say(format!(
+            "{}: {} trials, {} frames of {}×{} px, content {}\nnext: foreframe train --dataset {}",
+            out.display(),
+            info.episode_count,
+            info.frame_count,
+            info.frame_width_px,
+            info.frame_height_px,
+            info.content_hash,
+            out.display(),
+        )),
+        Err(_) if cancelled.load(Ordering::Relaxed) => Err(CliError::Interrupted(
+            "stopped; finished trials are kept, the same command goes on from there".to_owned(),
+        )),
+        Err(error) => Err(CliError::failed(error)),
+    }
+}

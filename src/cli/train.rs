@@ -1,0 +1,124 @@
+//! `foreframe train`
+
+use std::path::{Path, PathBuf};
+
+use super::{CliError, command_line, interrupt, progress::Progress, say};
+use crate::dataset::Dataset;
+use crate::training::{self, Event, Outcome, TrainConfig, Training};
+
+/// Train a model on a data set.
+///
+/// Two stages: the dense codec alone (pretrain), then the recurrent network (fit). Validation chooses the weights. Ctrl-C
+/// writes a checkpoint, and so does every few hundred steps; the same command goes on from it, to the same weights as if
+/// it had never stopped.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  foreframe train --preset paper --dataset data/static-observer
+  foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
+  foreframe train --preset paper --print-config > mine.toml   # every field, to edit and pass with --config")]
+pub(super) struct Args {
+    /// paper (1000 windows), static (all windows) or moving (told the robot's state and actions)
+    #[arg(long, default_value = "paper")]
+    preset: String,
+    /// The data set's directory [default: data/static-observer or, for moving, data/moving-observer]
+    #[arg(long, value_name = "DIR")]
+    dataset: Option<PathBuf>,
+    /// The run's directory: configuration, checkpoint and at the end the model [default: runs/NAME]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// A TOML file whose fields replace the preset's
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// One field, as in fit.steps=3000; may be given many times, and goes over --config
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Print the configuration and stop
+    #[arg(long)]
+    print_config: bool,
+}
+
+pub(super) fn run(args: &Args) -> Result<(), CliError> {
+    let file = args.config.as_deref().map(read_config).transpose()?;
+    let config = TrainConfig::layered(&args.preset, file.as_deref(), &args.settings)?;
+    if args.print_config {
+        return say(config.to_toml()?.trim_end());
+    }
+    let dataset_dir = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
+    let dataset = Dataset::open(&dataset_dir).map_err(CliError::failed)?;
+    let run_dir = args.out.clone().unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
+    let command = command_line();
+    let job = Training { config: &config, dataset: &dataset, run_dir: &run_dir, command: &command };
+    let cancelled = interrupt::flag()?;
+    let progress = Progress::new("steps");
+    let mut watch = Watch::new(&progress, &config);
+    let outcome = training::run(&job, &mut |event: Event| watch.on_event(event), &cancelled);
+    progress.finish();
+    match outcome? {
+        Outcome::Finished { model_dir, manifest } => say(format!(
+            "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}",
+            model_dir.display(),
+            manifest.parameters,
+            manifest.metrics["validation"],
+            model_dir.display(),
+            dataset_dir.display(),
+        )),
+        Outcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
+            "stopped in {stage} after step {step}; the checkpoint is in {}, the same command goes on from it",
+            run_dir.display()
+        ))),
+    }
+}
+
+fn read_config(path: &Path) -> Result<String, CliError> {
+    std::fs::read_to_string(path).map_err(|error| CliError::io("read", path, &error))
+}
+
+fn default_dataset(preset: &str) -> PathBuf {
+    Path::new("data").join(if preset == "moving" { "moving-observer" } else { "static-observer" })
+}
+
+/// Shows a training's events.
+struct Watch<'a> {
+    progress: &'a Progress,
+    steps: [usize; 2],
+    is_started: bool,
+    validation: Option<f64>,
+}
+
+impl<'a> Watch<'a> {
+    fn new(progress: &'a Progress, config: &TrainConfig) -> Self {
+        Self { progress, steps: [config.pretrain.steps, config.fit.steps], is_started: false, validation: None }
+    }
+
+    fn on_event(&mut self, event: Event) {
+        match event {
+            Event::Started { stage, step, windows } => {
+                self.start(stage, step);
+                self.progress.line(&format!("from step {step}, on {windows} windows"));
+            }
+            Event::Step { stage, step, steps, loss } => {
+                if step == 1 && !self.is_started {
+                    self.start(stage, 0);
+                }
+                self.is_started = false;
+                let validation = self.validation;
+                self.progress.update(step as u64, steps as u64, || match validation {
+                    Some(best) => format!("loss {loss:.6}, validation {best:.6}"),
+                    None => format!("loss {loss:.6}"),
+                });
+            }
+            Event::Validated { step, loss, is_best, .. } => {
+                self.validation = Some(loss);
+                let kept = if is_best { ", the best so far" } else { "" };
+                self.progress.line(&format!("step {step}: validation MSE {loss:.6} in the model's space{kept}"));
+            }
+            Event::Checkpointed { .. } => {}
+        }
+    }
+
+    fn start(&mut self, stage: training::Stage, step: usize) {
+        let total = self.steps[usize::from(stage == training::Stage::Fit)];
+        self.progress.start(&stage.to_string(), step as u64, total as u64);
+        self.is_started = true;
+    }
+}

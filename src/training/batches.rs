@@ -1,0 +1,138 @@
+//! Batches of frames and windows as tensors, and the order in which they are drawn.
+
+use candle_core::{Device, Tensor};
+use rand::seq::SliceRandom;
+use rayon::prelude::*;
+
+use super::TrainError;
+use crate::dataset::sampler::WindowShape;
+use crate::dataset::{Dataset, Window};
+use crate::frame::Frame;
+use crate::frame::preprocess::Preprocess;
+use crate::nn::Condition;
+use crate::types::Seed;
+
+/// A data set's frames in the model's space.
+pub(super) struct FrameSource<'a> {
+    dataset: &'a Dataset,
+    preprocess: Preprocess,
+}
+
+/// One batch of windows.
+pub(super) struct WindowBatch {
+    /// `[B, T, P]`
+    pub(super) inputs: Tensor,
+    /// `[B, horizon, P]`
+    pub(super) targets: Tensor,
+    /// The actions that lead to the targets, and the state at the last input.
+    pub(super) condition: Condition,
+}
+
+impl<'a> FrameSource<'a> {
+    pub(super) fn new(dataset: &'a Dataset, preprocess: Preprocess) -> Self {
+        Self { dataset, preprocess }
+    }
+
+    /// The frames as `[N, P]`.
+    pub(super) fn frames(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
+        let pixels = self.pixel_count();
+        let mut values = vec![0.0; frames.len() * pixels];
+        values
+            .par_chunks_exact_mut(pixels)
+            .zip(frames)
+            .try_for_each(|(out, &frame)| self.fill(frame, out))?;
+        Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
+    }
+
+    /// The windows' inputs, targets and conditions.
+    pub(super) fn windows(&self, windows: &[&Window], shape: WindowShape) -> Result<WindowBatch, TrainError> {
+        let (context, horizon) = (shape.context, shape.horizon);
+        let length = context + horizon;
+        let frames: Vec<usize> =
+            windows.iter().flat_map(|window| window.first_frame..window.first_frame + length).collect();
+        let all = self.frames(&frames)?.reshape((windows.len(), length, self.pixel_count()))?;
+        Ok(WindowBatch {
+            inputs: all.narrow(1, 0, context)?.contiguous()?,
+            targets: all.narrow(1, context, horizon)?.contiguous()?,
+            condition: self.condition(windows, shape)?,
+        })
+    }
+
+    fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<Condition, TrainError> {
+        let (actions, states) = (self.dataset.info().actions.len(), self.dataset.info().states.len());
+        let last_inputs = || windows.iter().map(|window| window.first_frame + shape.context - 1);
+        // The action of a frame acts from it to the next, so the first target's is that of the last input.
+        let future: Vec<f32> = last_inputs()
+            .flat_map(|last| (last..last + shape.horizon).flat_map(|frame| self.dataset.action(frame)))
+            .copied()
+            .collect();
+        let present: Vec<f32> = last_inputs().flat_map(|last| self.dataset.state(last)).copied().collect();
+        let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
+        Ok(Condition {
+            actions: (actions > 0).then(|| tensor(future, &[windows.len(), shape.horizon, actions])).transpose()?,
+            state: (states > 0).then(|| tensor(present, &[windows.len(), states])).transpose()?,
+        })
+    }
+
+    fn pixel_count(&self) -> usize {
+        let info = self.dataset.info();
+        info.frame_width_px as usize * info.frame_height_px as usize
+    }
+
+    fn fill(&self, frame: usize, out: &mut [f32]) -> Result<(), TrainError> {
+        let info = self.dataset.info();
+        let frame = Frame::new(info.frame_width_px, info.frame_height_px, self.dataset.pixels(frame).to_vec())?;
+        out.copy_from_slice(&self.preprocess.forward(&frame));
+        Ok(())
+    }
+}
+
+/// Draws positions `0..count`, each once an epoch, in an order that depends on the seed and the draw alone, so that a
+/// resumed training draws as the unbroken one would.
+pub(super) struct Shuffle {
+    count: usize,
+    seed: Seed,
+}
+
+impl Shuffle {
+    pub(super) fn new(count: usize, seed: Seed) -> Self {
+        Self { count, seed }
+    }
+
+    /// The positions of batch `step`.
+    pub(super) fn batch(&self, step: usize, batch_size: usize) -> Vec<usize> {
+        let draws = step * batch_size..(step + 1) * batch_size;
+        let mut epoch = usize::MAX;
+        let mut order: Vec<usize> = Vec::new();
+        draws
+            .map(|draw| {
+                if draw / self.count != epoch {
+                    epoch = draw / self.count;
+                    order = (0..self.count).collect();
+                    order.shuffle(&mut self.seed.derive("epoch", epoch as u64).rng());
+                }
+                order[draw % self.count]
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_epoch_draws_every_position_once() {
+        let shuffle = Shuffle::new(10, Seed(3));
+        let mut first: Vec<usize> = (0..2).flat_map(|step| shuffle.batch(step, 5)).collect();
+        first.sort_unstable();
+        assert_eq!(first, (0..10).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_batch_does_not_depend_on_those_before_it() {
+        let (early, late) = (Shuffle::new(7, Seed(1)), Shuffle::new(7, Seed(1)));
+        (0..9).for_each(|step| drop(early.batch(step, 4)));
+        assert_eq!(early.batch(9, 4), late.batch(9, 4));
+    }
+}

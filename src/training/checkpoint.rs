@@ -1,0 +1,173 @@
+//! A run's directory: its configuration, and the state of its last checkpoint in one safetensors file, replaced whole.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use candle_core::{Device, Tensor};
+use safetensors::SafeTensors;
+use serde::{Deserialize, Serialize};
+
+use super::config::TrainConfig;
+use super::observer::Stage;
+use super::optimizer::Adam;
+use super::stage::{HistoryPoint, TrainState};
+use super::{TrainError, fingerprint};
+use crate::files::write_atomically;
+use crate::nn::{ModelSpec, Parameters};
+
+/// The key of the state's numbers in the file's metadata.
+const META_KEY: &str = "foreframe.training";
+const PARAMETERS: &str = "parameters.";
+const BEST: &str = "best.";
+const OPTIMIZER: &str = "optimizer.";
+
+/// The directory of one run.
+pub(super) struct RunFiles {
+    run_dir: PathBuf,
+    fingerprint: String,
+}
+
+impl RunFiles {
+    /// Makes the directory of a new run, or checks that an old one is of the same configuration and data.
+    /// Errors: `NotARun`, `OtherRun`, `Io`.
+    pub(super) fn open(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
+        let text = config.to_toml()?;
+        let files =
+            Self { run_dir: run_dir.to_owned(), fingerprint: fingerprint(&format!("{text}\n{content_hash}")) };
+        let (config_path, data_path) = (run_dir.join("config.toml"), run_dir.join("dataset.sha256"));
+        if config_path.is_file() && data_path.is_file() {
+            for (path, expected, what) in
+                [(&config_path, text.as_str(), "configuration"), (&data_path, content_hash, "data set")]
+            {
+                if fs::read_to_string(path).map_err(unreadable(path))? != expected {
+                    return Err(TrainError::OtherRun { run_dir: run_dir.to_owned(), what });
+                }
+            }
+            return Ok(files);
+        }
+        let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
+            entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != "dataset.sha256"))
+        });
+        if is_occupied || run_dir.is_file() {
+            return Err(TrainError::NotARun(run_dir.to_owned()));
+        }
+        fs::create_dir_all(run_dir).map_err(unwritable(run_dir))?;
+        write_atomically(&data_path, content_hash.as_bytes()).map_err(unwritable(&data_path))?;
+        write_atomically(&config_path, text.as_bytes()).map_err(unwritable(&config_path))?;
+        Ok(files)
+    }
+
+    /// Where the trained model is published.
+    pub(super) fn model_dir(&self) -> PathBuf {
+        self.run_dir.join("model")
+    }
+
+    /// Where the loss curves are written.
+    pub(super) fn history(&self) -> PathBuf {
+        self.run_dir.join("history.json")
+    }
+
+    fn checkpoint(&self) -> PathBuf {
+        self.run_dir.join("checkpoint.safetensors")
+    }
+}
+
+fn unreadable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
+    let path = path.to_owned();
+    move |source| TrainError::Io { action: "read", path: path.clone(), source }
+}
+
+fn unwritable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
+    let path = path.to_owned();
+    move |source| TrainError::Io { action: "write", path: path.clone(), source }
+}
+
+/// The numbers beside the tensors.
+#[derive(Serialize, Deserialize)]
+struct Meta {
+    fingerprint: String,
+    stage: Stage,
+    step: usize,
+    optimizer_step: u64,
+    best_step: usize,
+    best_loss: Option<f64>,
+    history: Vec<HistoryPoint>,
+}
+
+/// A training's state as read from disk.
+pub(super) struct Checkpoint {
+    state: TrainState,
+}
+
+impl Checkpoint {
+    /// Replaces the run's checkpoint by this state. Errors: `Io`, `Checkpoint`.
+    pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
+        let path = files.checkpoint();
+        let meta = Meta {
+            fingerprint: files.fingerprint.clone(),
+            stage: state.stage,
+            step: state.step,
+            optimizer_step: state.optimizer.step_count(),
+            best_step: state.best_step,
+            best_loss: state.best_loss,
+            history: state.history.clone(),
+        };
+        let failed = |reason: String| TrainError::Checkpoint { path: path.clone(), reason };
+        let text = serde_json::to_string(&meta).map_err(|error| failed(error.to_string()))?;
+        let prefixed = |prefix: &'static str, tensors: BTreeMap<String, Tensor>| {
+            tensors.into_iter().map(move |(name, tensor)| (format!("{prefix}{name}"), tensor))
+        };
+        let tensors: BTreeMap<String, Tensor> = prefixed(PARAMETERS, state.parameters.snapshot()?)
+            .chain(prefixed(BEST, state.best.clone()))
+            .chain(prefixed(OPTIMIZER, state.optimizer.export()?))
+            .collect();
+        let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(META_KEY.to_owned(), text)])))
+            .map_err(|error| failed(error.to_string()))?;
+        write_atomically(&path, &bytes).map_err(unwritable(&path))
+    }
+
+    /// The run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or of another run.
+    pub(super) fn load(files: &RunFiles, spec: &ModelSpec) -> Result<Option<Self>, TrainError> {
+        let path = files.checkpoint();
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let failed = |reason: String| TrainError::Checkpoint { path: path.clone(), reason };
+        let bytes = fs::read(&path).map_err(unreadable(&path))?;
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| failed(error.to_string()))?;
+        let text = header
+            .metadata()
+            .as_ref()
+            .and_then(|metadata| metadata.get(META_KEY))
+            .ok_or_else(|| failed("it carries no training state".to_owned()))?;
+        let meta: Meta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
+        if meta.fingerprint != files.fingerprint {
+            return Err(failed("it belongs to another run".to_owned()));
+        }
+        let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
+        let group = |prefix: &str| -> BTreeMap<String, Tensor> {
+            tensors
+                .iter()
+                .filter_map(|(name, tensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone())))
+                .collect()
+        };
+        let misfit = |error: crate::nn::NnError| failed(error.to_string());
+        let state = TrainState {
+            stage: meta.stage,
+            step: meta.step,
+            parameters: Parameters::from_tensors(spec, group(PARAMETERS)).map_err(misfit)?,
+            optimizer: Adam::import(meta.optimizer_step, group(OPTIMIZER))?,
+            best: Parameters::from_tensors(spec, group(BEST)).map_err(misfit)?.snapshot()?,
+            best_step: meta.best_step,
+            best_loss: meta.best_loss,
+            history: meta.history,
+        };
+        Ok(Some(Self { state }))
+    }
+
+    /// The state to go on from.
+    pub(super) fn into_state(self) -> TrainState {
+        self.state
+    }
+}

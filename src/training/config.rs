@@ -1,0 +1,349 @@
+//! What a training is told: the presets, and how a file and single settings change them.
+
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use super::TrainError;
+use crate::dataset::{Dataset, sampler::WindowShape};
+use crate::frame::preprocess::Preprocess;
+use crate::nn::loss::Loss;
+use crate::nn::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
+use crate::types::{Channel, Seed};
+
+/// Name and text of each preset.
+const PRESETS: [(&str, &str); 3] = [
+    ("paper", include_str!("presets/paper.toml")),
+    ("static", include_str!("presets/static.toml")),
+    ("moving", include_str!("presets/moving.toml")),
+];
+
+/// The most steps of one stage.
+const MAX_STEPS: usize = 10_000_000;
+/// The most windows or frames in one batch.
+const MAX_BATCH_SIZE: usize = 4096;
+
+/// Everything that, with a data set, decides the weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// The model's name.
+    pub name: String,
+    /// The origin of all randomness.
+    pub seed: Seed,
+    /// The network.
+    pub model: ModelConfig,
+    /// Which windows.
+    pub data: DataConfig,
+    /// Stage 1: the dense codec alone, as an autoencoder of single frames.
+    pub pretrain: PretrainConfig,
+    /// Stage 2: the recurrent network.
+    pub fit: FitConfig,
+    /// What both stages share.
+    pub run: RunConfig,
+}
+
+/// The network's free choices; the data set gives the rest of the [`ModelSpec`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Frames that the encoder reads.
+    pub context: usize,
+    /// Frames that the predictor writes.
+    pub horizon: usize,
+    /// Units of the dense codec.
+    pub features: usize,
+    /// Units of each recurrent layer.
+    pub hidden: usize,
+    /// Which of the paper's two ways to reconstruct.
+    pub reconstruction: Reconstruction,
+    /// What the predictor is told.
+    pub conditioning: Conditioning,
+    /// How frames enter the model's space.
+    pub preprocess: Preprocess,
+}
+
+/// The windows that are trained on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataConfig {
+    /// How many, drawn at random, or `"all"`.
+    pub windows: WindowBudget,
+    /// How many windows of the validation split choose the best weights, at most.
+    pub validation_windows: usize,
+    /// The seed of the split into training, validation and test.
+    pub split_seed: Seed,
+}
+
+/// A number of windows, or all there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum WindowBudget {
+    /// So many.
+    Count(usize),
+    /// Every one.
+    All(All),
+}
+
+/// The word `all`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum All {
+    /// `"all"`
+    All,
+}
+
+/// Stage 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PretrainConfig {
+    /// Updates.
+    pub steps: usize,
+    /// Frames an update.
+    pub batch_size: usize,
+    /// Adam's, at its highest.
+    pub learning_rate: f64,
+}
+
+/// Stage 2.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FitConfig {
+    /// Updates.
+    pub steps: usize,
+    /// Windows an update.
+    pub batch_size: usize,
+    /// Adam's, at its highest.
+    pub learning_rate: f64,
+    /// Whether the pre-trained codec is trained on.
+    pub codec: CodecTraining,
+    /// What is minimized, in the model's space.
+    pub loss: Loss,
+    /// What the predictor reads after its first step while it is trained.
+    pub feedback: TrainingFeedback,
+    /// Weight of the reconstruction's loss beside the prediction's; 0 leaves the reconstruction decoder untrained.
+    pub reconstruction_weight: f64,
+}
+
+/// What becomes of the pre-trained codec in stage 2.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CodecTraining {
+    /// It stays as pre-trained.
+    Frozen,
+    /// It is trained on with the rest.
+    FineTuned,
+}
+
+/// What the predictor reads after its first step while it is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TrainingFeedback {
+    /// Its own last prediction, as when it is used.
+    Prediction,
+    /// The true frame's features (teacher forcing).
+    Truth,
+}
+
+/// What both stages share.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Updates over which the learning rate rises from 0.
+    pub warmup_steps: usize,
+    /// The last learning rate as a share of the highest, reached along a cosine.
+    pub final_learning_rate: f64,
+    /// The largest norm of all gradients together.
+    pub clip_norm: f64,
+    /// Updates from one validation to the next.
+    pub validate_every_steps: usize,
+    /// Updates from one checkpoint to the next.
+    pub checkpoint_every_steps: usize,
+}
+
+impl TrainConfig {
+    /// The names of the presets.
+    #[must_use]
+    pub fn preset_names() -> Vec<&'static str> {
+        PRESETS.iter().map(|(name, _)| *name).collect()
+    }
+
+    /// A preset as it is. Errors: `UnknownPreset` with the names there are.
+    pub fn preset(name: &str) -> Result<Self, TrainError> {
+        Self::layered(name, None, &[])
+    }
+
+    /// A preset, changed by a TOML text, then by settings `KEY=VALUE` with dotted keys, and checked.
+    /// Errors: `UnknownPreset`, `Config` with the field that is wrong.
+    pub fn layered(preset: &str, file: Option<&str>, settings: &[String]) -> Result<Self, TrainError> {
+        let (_, text) = PRESETS
+            .iter()
+            .find(|(name, _)| *name == preset)
+            .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
+        let mut table: Table = text.parse().map_err(describe)?;
+        if let Some(file) = file {
+            merge(&mut table, file.parse().map_err(describe)?);
+        }
+        for setting in settings {
+            merge(&mut table, parse_setting(setting)?);
+        }
+        let config: Self = table.try_into().map_err(describe)?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// The configuration as a TOML text.
+    pub fn to_toml(&self) -> Result<String, TrainError> {
+        toml::to_string_pretty(self).map_err(|error| TrainError::Config(error.to_string()))
+    }
+
+    /// Errors: `Config` with the first field that is out of range and its range.
+    pub fn validate(&self) -> Result<(), TrainError> {
+        if !crate::registry::is_valid_name(&self.name) {
+            return Err(crate::registry::RegistryError::Name(self.name.clone()).into());
+        }
+        let (run, fit, pretrain) = (&self.run, &self.fit, &self.pretrain);
+        let counts = [
+            ("pretrain.steps", pretrain.steps, 1, MAX_STEPS),
+            ("pretrain.batch_size", pretrain.batch_size, 1, MAX_BATCH_SIZE),
+            ("fit.steps", fit.steps, 1, MAX_STEPS),
+            ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),
+            ("data.validation_windows", self.data.validation_windows, 1, MAX_STEPS),
+            ("run.validate_every_steps", run.validate_every_steps, 1, MAX_STEPS),
+            ("run.checkpoint_every_steps", run.checkpoint_every_steps, 1, MAX_STEPS),
+            ("run.warmup_steps", run.warmup_steps, 0, MAX_STEPS),
+        ];
+        for (field, value, least, most) in counts {
+            if !(least..=most).contains(&value) {
+                return Err(TrainError::Config(format!("{field} is {value}; it must be {least} to {most}")));
+            }
+        }
+        let numbers = [
+            ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
+            ("fit.learning_rate", fit.learning_rate, 1.0),
+            ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
+            ("run.final_learning_rate", run.final_learning_rate, 1.0),
+            ("run.clip_norm", run.clip_norm, 1e6),
+        ];
+        for (field, value, most) in numbers {
+            if !(0.0..=most).contains(&value) {
+                return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {most}")));
+            }
+        }
+        if self.data.windows == WindowBudget::Count(0) {
+            return Err(TrainError::Config("data.windows is 0; it must be at least 1, or \"all\"".to_owned()));
+        }
+        Ok(())
+    }
+
+    /// Inputs and targets of one window.
+    #[must_use]
+    pub fn window_shape(&self) -> WindowShape {
+        WindowShape { context: self.model.context, horizon: self.model.horizon }
+    }
+
+    /// The model's description on that data set, channels scaled by the given training frames.
+    #[must_use]
+    pub fn model_spec(&self, dataset: &Dataset, frames: &[usize]) -> ModelSpec {
+        let (info, model) = (dataset.info(), &self.model);
+        let actions = scales(&info.actions, frames, |frame| dataset.action(frame));
+        let states = scales(&info.states, frames, |frame| dataset.state(frame));
+        ModelSpec {
+            frame_width_px: info.frame_width_px,
+            frame_height_px: info.frame_height_px,
+            frame_period_s: info.frame_period_s,
+            preprocess: model.preprocess,
+            context: model.context,
+            horizon: model.horizon,
+            features: model.features,
+            hidden: model.hidden,
+            reconstruction: model.reconstruction,
+            conditioning: model.conditioning,
+            actions,
+            states,
+        }
+    }
+}
+
+/// Mean and standard deviation of each channel over the frames.
+fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> &'a [f32]) -> Vec<ChannelScale> {
+    let count = frames.len().max(1) as f64;
+    let moment = |index: usize, power: i32, mean: f64| {
+        frames.iter().map(|&frame| (f64::from(values(frame)[index]) - mean).powi(power)).sum::<f64>() / count
+    };
+    let scale = |(index, channel): (usize, &Channel)| {
+        let mean = moment(index, 1, 0.0);
+        ChannelScale {
+            name: channel.name.clone(),
+            unit: channel.unit.clone(),
+            mean: mean as f32,
+            std: (moment(index, 2, mean).sqrt() as f32).max(1e-3),
+        }
+    };
+    channels.iter().enumerate().map(scale).collect()
+}
+
+fn describe(error: toml::de::Error) -> TrainError {
+    TrainError::Config(error.message().to_owned())
+}
+
+/// `fit.steps=3000` as the table it stands for; a value that is no TOML is taken as a string.
+fn parse_setting(setting: &str) -> Result<Table, TrainError> {
+    let (key, value) = setting
+        .split_once('=')
+        .ok_or_else(|| TrainError::Config(format!("{setting:?} is no setting; write KEY=VALUE, as in fit.steps=3000")))?;
+    let (key, value) = (key.trim(), value.trim());
+    format!("{key} = {value}").parse().or_else(|_| format!("{key} = {value:?}").parse()).map_err(describe)
+}
+
+/// Lays `over` upon `base`, table by table.
+fn merge(base: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(Value::Table(inner)), Value::Table(value)) => merge(inner, value),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_is_valid_and_named_as_its_file() {
+        for name in TrainConfig::preset_names() {
+            assert_eq!(TrainConfig::preset(name).unwrap().name, name);
+        }
+    }
+
+    #[test]
+    fn settings_override_the_file_which_overrides_the_preset() {
+        let file = "seed = 5\n[fit]\nsteps = 10\nlearning_rate = 0.5\n";
+        let settings = ["fit.steps=20".to_owned(), "data.windows=all".to_owned(), "fit.codec=frozen".to_owned()];
+        let config = TrainConfig::layered("paper", Some(file), &settings).unwrap();
+        assert_eq!((config.seed, config.fit.steps, config.fit.learning_rate), (Seed(5), 20, 0.5));
+        assert_eq!((config.data.windows, config.fit.codec), (WindowBudget::All(All::All), CodecTraining::Frozen));
+    }
+
+    #[test]
+    fn an_unknown_preset_is_answered_with_the_names_there_are() {
+        let error = TrainConfig::preset("papper").unwrap_err().to_string();
+        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving");
+    }
+
+    #[test]
+    fn a_misspelt_field_is_refused_by_name() {
+        let error = TrainConfig::layered("paper", None, &["fit.stepz=3".to_owned()]).unwrap_err().to_string();
+        assert!(error.contains("unknown field `stepz`"), "{error}");
+    }
+
+    #[test]
+    fn a_number_out_of_range_is_refused_with_its_range() {
+        let error = TrainConfig::layered("paper", None, &["fit.learning_rate=nan".to_owned()]).unwrap_err().to_string();
+        assert_eq!(error, "fit.learning_rate is NaN; it must be 0 to 1");
+        let error = TrainConfig::layered("paper", None, &["fit.batch_size=0".to_owned()]).unwrap_err().to_string();
+        assert_eq!(error, "fit.batch_size is 0; it must be 1 to 4096");
+    }
+}

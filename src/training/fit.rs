@@ -1,0 +1,111 @@
+//! Stage 2: the encoder with its two decoders, the prediction's and the reconstruction's, trained together.
+
+use candle_core::Tensor;
+
+use super::batches::{Shuffle, WindowBatch};
+use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
+use super::observer::Stage;
+use super::pretrain::CODEC_PREFIX;
+use super::stage::Objective;
+use super::{Plan, TrainError};
+use crate::dataset::Window;
+use crate::nn::loss::Loss;
+use crate::nn::{Feedback, Model, Parameters};
+
+/// Windows that are validated in one batch.
+const VALIDATION_BATCH_SIZE: usize = 64;
+
+/// The error of prediction and reconstruction.
+pub(super) struct SequenceObjective<'a> {
+    plan: &'a Plan<'a>,
+    config: &'a TrainConfig,
+    shuffle: Shuffle,
+}
+
+impl<'a> SequenceObjective<'a> {
+    pub(super) fn new(plan: &'a Plan<'a>, config: &'a TrainConfig) -> Self {
+        Self { plan, config, shuffle: Shuffle::new(plan.train.len(), config.seed.derive("fit", 0)) }
+    }
+
+    fn is_frozen(&self) -> bool {
+        self.config.fit.codec == CodecTraining::Frozen
+    }
+
+    fn batch(&self, windows: &[&Window]) -> Result<WindowBatch, TrainError> {
+        self.plan.source.windows(windows, self.config.window_shape())
+    }
+
+    /// The features of `[B, T, P]` frames as `[B, T, F]`.
+    fn features(&self, model: &Model, frames: &Tensor) -> Result<Tensor, TrainError> {
+        let (batch, time, pixels) = frames.dims3()?;
+        let features = model.encode_frames(&frames.reshape((batch * time, pixels))?)?;
+        Ok(features.reshape((batch, time, self.plan.spec.features))?)
+    }
+
+    /// The frames of `[B, T, F]` features as `[B, T, P]`.
+    fn frames(model: &Model, features: &Tensor) -> Result<Tensor, TrainError> {
+        let (batch, time, width) = features.dims3()?;
+        let frames = model.decode_frames(&features.reshape((batch * time, width))?)?;
+        Ok(frames.reshape((batch, time, ()))?)
+    }
+}
+
+impl Objective for SequenceObjective<'_> {
+    fn stage(&self) -> Stage {
+        Stage::Fit
+    }
+
+    fn steps(&self) -> usize {
+        self.config.fit.steps
+    }
+
+    fn learning_rate(&self) -> f64 {
+        self.config.fit.learning_rate
+    }
+
+    fn trains(&self, name: &str) -> bool {
+        let is_idle = self.config.fit.reconstruction_weight == 0.0 && name.starts_with("reconstructor.");
+        !is_idle && !(self.is_frozen() && name.starts_with(CODEC_PREFIX))
+    }
+
+    fn loss(&self, parameters: &Parameters, step: usize) -> Result<Tensor, TrainError> {
+        let fit = &self.config.fit;
+        let windows: Vec<&Window> = self
+            .shuffle
+            .batch(step, fit.batch_size)
+            .into_iter()
+            .map(|position| &self.plan.train[position])
+            .collect();
+        let batch = self.batch(&windows)?;
+        let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
+        let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
+        let inputs = self.features(&model, &batch.inputs)?;
+        let predicted = match fit.feedback {
+            TrainingFeedback::Prediction => model.predict(&inputs, &batch.condition, Feedback::Prediction)?,
+            TrainingFeedback::Truth => {
+                let truth = self.features(&model, &batch.targets)?;
+                model.predict(&inputs, &batch.condition, Feedback::Truth(&truth))?
+            }
+        };
+        let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
+        if fit.reconstruction_weight == 0.0 {
+            return Ok(loss);
+        }
+        let reconstructed = Self::frames(&model, &model.reconstruct(&inputs)?)?;
+        let reconstruction = fit.loss.between(&reconstructed, &batch.inputs)?;
+        Ok((loss + (reconstruction * fit.reconstruction_weight)?)?)
+    }
+
+    fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
+        let model = Model::new(self.plan.spec.clone(), parameters)?;
+        let windows: Vec<&Window> = self.plan.validation.iter().collect();
+        let mut sum = 0.0;
+        for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
+            let batch = self.batch(chunk)?;
+            let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
+            let loss = Loss::Mse.between(&predicted, &batch.targets)?.to_scalar::<f32>()?;
+            sum += f64::from(loss) * chunk.len() as f64;
+        }
+        Ok(sum / windows.len().max(1) as f64)
+    }
+}

@@ -1,0 +1,77 @@
+//! What a training tells whoever watches.
+
+use serde::{Deserialize, Serialize};
+
+/// The two stages of a training.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// The dense codec alone.
+    Pretrain,
+    /// The recurrent network.
+    Fit,
+}
+
+impl std::fmt::Display for Stage {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str(match self {
+            Self::Pretrain => "pretrain",
+            Self::Fit => "fit",
+        })
+    }
+}
+
+/// Something that happened.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Event {
+    /// The run starts, or goes on, here.
+    Started {
+        /// In this stage.
+        stage: Stage,
+        /// After so many updates of it.
+        step: usize,
+        /// Training windows there are.
+        windows: usize,
+    },
+    /// An update was made.
+    Step {
+        /// In this stage.
+        stage: Stage,
+        /// Updates made, this one included.
+        step: usize,
+        /// Updates to make.
+        steps: usize,
+        /// The loss of its batch.
+        loss: f64,
+    },
+    /// The validation windows were predicted.
+    Validated {
+        /// In this stage.
+        stage: Stage,
+        /// After so many updates.
+        step: usize,
+        /// Mean squared error in the model's space.
+        loss: f64,
+        /// Whether it is the lowest so far, whose weights are kept.
+        is_best: bool,
+    },
+    /// The state was written to disk.
+    Checkpointed {
+        /// In this stage.
+        stage: Stage,
+        /// After so many updates.
+        step: usize,
+    },
+}
+
+/// Whoever watches a training.
+pub trait Observer {
+    /// Is told of each event on the training's thread; a slow answer slows the training.
+    fn on_event(&mut self, event: Event);
+}
+
+impl<F: FnMut(Event)> Observer for F {
+    fn on_event(&mut self, event: Event) {
+        self(event);
+    }
+}

@@ -1,0 +1,82 @@
+//! Stage 1: the dense encoder and the reconstruction layer as an autoencoder of single frames.
+
+use candle_core::Tensor;
+
+use super::batches::Shuffle;
+use super::config::TrainConfig;
+use super::observer::Stage;
+use super::stage::Objective;
+use super::{Plan, TrainError, window_frames};
+use crate::nn::loss::Loss;
+use crate::nn::{Model, Parameters};
+
+/// What the names of the codec's tensors start with.
+pub(super) const CODEC_PREFIX: &str = "frame_";
+
+/// How many frames of the validation windows choose the best codec, at most.
+const MAX_VALIDATION_FRAMES: usize = 1024;
+
+/// The codec's reconstruction error.
+pub(super) struct CodecObjective<'a> {
+    plan: &'a Plan<'a>,
+    config: &'a TrainConfig,
+    frames: Vec<usize>,
+    shuffle: Shuffle,
+    validation: Tensor,
+}
+
+impl<'a> CodecObjective<'a> {
+    pub(super) fn new(plan: &'a Plan<'a>, config: &'a TrainConfig) -> Result<Self, TrainError> {
+        let length = config.model.context + config.model.horizon;
+        let frames = window_frames(&plan.train, length);
+        let validation = window_frames(&plan.validation, length);
+        let stride = validation.len().div_ceil(MAX_VALIDATION_FRAMES).max(1);
+        let validation: Vec<usize> = validation.into_iter().step_by(stride).collect();
+        Ok(Self {
+            plan,
+            config,
+            shuffle: Shuffle::new(frames.len(), config.seed.derive("pretrain", 0)),
+            frames,
+            validation: plan.source.frames(&validation)?,
+        })
+    }
+
+    fn reconstruct(&self, parameters: &Parameters, frames: &Tensor) -> Result<Tensor, TrainError> {
+        let model = Model::new(self.plan.spec.clone(), parameters)?;
+        Ok(model.decode_frames(&model.encode_frames(frames)?)?)
+    }
+}
+
+impl Objective for CodecObjective<'_> {
+    fn stage(&self) -> Stage {
+        Stage::Pretrain
+    }
+
+    fn steps(&self) -> usize {
+        self.config.pretrain.steps
+    }
+
+    fn learning_rate(&self) -> f64 {
+        self.config.pretrain.learning_rate
+    }
+
+    fn trains(&self, name: &str) -> bool {
+        name.starts_with(CODEC_PREFIX)
+    }
+
+    fn loss(&self, parameters: &Parameters, step: usize) -> Result<Tensor, TrainError> {
+        let batch: Vec<usize> = self
+            .shuffle
+            .batch(step, self.config.pretrain.batch_size)
+            .into_iter()
+            .map(|position| self.frames[position])
+            .collect();
+        let frames = self.plan.source.frames(&batch)?;
+        Ok(self.config.fit.loss.between(&self.reconstruct(parameters, &frames)?, &frames)?)
+    }
+
+    fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
+        let loss = Loss::Mse.between(&self.reconstruct(parameters, &self.validation)?, &self.validation)?;
+        Ok(f64::from(loss.to_scalar::<f32>()?))
+    }
+}
