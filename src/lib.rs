@@ -27,5 +27,3 @@ pub mod jobs;
 pub mod server;
 
 pub mod telemetry;
-
-pub mod cli;

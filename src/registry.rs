@@ -101,7 +101,11 @@ pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> 
     if !models_dir.exists() {
         return Ok(Vec::new());
     }
-    let unlisted = |source| RegistryError::Io { action: "list", path: models_dir.to_owned(), source };
+    let unlisted = |source| RegistryError::Io {
+        action: "list",
+        path: models_dir.to_owned(),
+        source,
+    };
     let mut models = Vec::new();
     for entry in std::fs::read_dir(models_dir).map_err(unlisted)? {
         let path = entry.map_err(unlisted)?.path();
@@ -124,7 +128,11 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
         return Ok(path);
     }
     let known = list(models_dir)?.into_iter().map(|(name, _)| name).collect();
-    Err(RegistryError::Unknown { name: name.to_owned(), dir: models_dir.to_owned(), known })
+    Err(RegistryError::Unknown {
+        name: name.to_owned(),
+        dir: models_dir.to_owned(),
+        known,
+    })
 }
 
 /// Writes weights (as f16) and manifest into `model_dir`, the manifest last and with the weights' hash filled in.
@@ -132,12 +140,21 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
     let weights_path = model_dir.join(WEIGHTS_FILE);
     let failed = |path: &Path| {
         let path = path.to_owned();
-        move |source| RegistryError::Io { action: "write", path, source }
+        move |source| RegistryError::Io {
+            action: "write",
+            path,
+            source,
+        }
     };
     std::fs::create_dir_all(model_dir).map_err(failed(model_dir))?;
-    let weights = loader::serialize_f16(parameters)
-        .map_err(|source| RegistryError::Safetensors { path: weights_path.clone(), source })?;
-    let manifest = Manifest { weights_sha256: sha256_hex(&weights), ..manifest.clone() };
+    let weights = loader::serialize_f16(parameters).map_err(|source| RegistryError::Weights {
+        path: weights_path.clone(),
+        source,
+    })?;
+    let manifest = Manifest {
+        weights_sha256: sha256_hex(&weights),
+        ..manifest.clone()
+    };
     write_atomically(&weights_path, &weights).map_err(failed(&weights_path))?;
     write_manifest(model_dir, &manifest)?;
     Ok(manifest)
@@ -152,10 +169,16 @@ pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<()
 
 fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), RegistryError> {
     let path = model_dir.join(MANIFEST_FILE);
-    let mut text = serde_json::to_string_pretty(manifest)
-        .map_err(|source| RegistryError::Manifest { path: path.clone(), source })?;
+    let mut text = serde_json::to_string_pretty(manifest).map_err(|source| RegistryError::Manifest {
+        path: path.clone(),
+        source,
+    })?;
     text.push('\n');
-    write_atomically(&path, text.as_bytes()).map_err(|source| RegistryError::Io { action: "write", path, source })
+    write_atomically(&path, text.as_bytes()).map_err(|source| RegistryError::Io {
+        action: "write",
+        path,
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -176,6 +199,9 @@ mod tests {
         std::fs::create_dir(dir.path().join("paper")).unwrap();
         std::fs::write(dir.path().join("paper").join(MANIFEST_FILE), "{}").unwrap();
         let error = find(dir.path(), "papper").unwrap_err().to_string();
-        assert!(error.contains("no model \"papper\"") && error.ends_with("there are: paper"), "{error}");
+        assert!(
+            error.contains("no model \"papper\"") && error.ends_with("there are: paper"),
+            "{error}"
+        );
     }
 }

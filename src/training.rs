@@ -31,13 +31,13 @@ use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError}
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// There is no preset of that name.
-    #[error("there is no preset {0:?}; there are: {}", TrainConfig::preset_names().join(", "))]
+    #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]
     UnknownPreset(String),
     /// A setting is misspelt or out of range.
     #[error("{0}")]
     Config(String),
     /// The directory holds something else.
-    #[error("{} exists and holds no training run; name a new directory", .0.display())]
+    #[error("{dir} exists and holds no training run; name a new directory", dir = .0.display())]
     NotARun(PathBuf),
     /// The directory holds a run with other settings or data.
     #[error(
@@ -50,9 +50,9 @@ pub enum TrainError {
         /// `configuration` or `data set`.
         what: &'static str,
     },
-    /// A loss or gradient became NaN or infinite.
+    /// The loss or a gradient became NaN or infinite, or the loss absurdly large.
     #[error(
-        "training diverged in {stage} at step {step}: {what} is not finite; the checkpoint of step {kept} is kept; \
+        "training diverged in {stage} at step {step}: {what}; the checkpoint of step {kept} is kept; \
          try a lower learning rate"
     )]
     Diverged {
@@ -60,8 +60,8 @@ pub enum TrainError {
         stage: Stage,
         /// The update that would have been made.
         step: usize,
-        /// `the loss` or `a gradient`.
-        what: &'static str,
+        /// What the loss or the gradient is.
+        what: String,
         /// The step of the last good checkpoint.
         kept: usize,
     },
@@ -92,6 +92,9 @@ pub enum TrainError {
     /// The network refused its input.
     #[error(transparent)]
     Network(#[from] NnError),
+    /// An update failed.
+    #[error(transparent)]
+    Optimizer(#[from] optimizer::OptimizerError),
     /// The model could not be published.
     #[error(transparent)]
     Registry(#[from] RegistryError),
@@ -150,23 +153,40 @@ pub fn run(
         return Ok(Outcome::Finished { model_dir, manifest });
     }
     let plan = Plan::new(config, dataset)?;
-    let mut state = match Checkpoint::load(&files, &plan.spec)? {
+    let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
         Some(checkpoint) => checkpoint.into_state(),
-        None => TrainState::new(Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?)?,
+        None => TrainState::new(
+            Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?,
+            &config.run,
+        )?,
     };
-    observer.on_event(Event::Started { stage: state.stage, step: state.step, windows: plan.train.len() });
-    let runner = StageRunner { files: &files, run: &config.run, cancelled };
+    observer.on_event(Event::Started {
+        stage: state.stage,
+        step: state.step,
+        windows: plan.train.len(),
+    });
+    let runner = StageRunner {
+        files: &files,
+        run: &config.run,
+        cancelled,
+    };
     if state.stage == Stage::Pretrain {
         let codec = pretrain::CodecObjective::new(&plan, config)?;
         if runner.run(&codec, &mut state, observer)? == Flow::Interrupted {
-            return Ok(Outcome::Interrupted { stage: Stage::Pretrain, step: state.step });
+            return Ok(Outcome::Interrupted {
+                stage: Stage::Pretrain,
+                step: state.step,
+            });
         }
-        state.enter(Stage::Fit)?;
+        state.enter(Stage::Fit, &config.run)?;
         runner.save(&state, observer)?;
     }
     let sequence = fit::SequenceObjective::new(&plan, config);
     if runner.run(&sequence, &mut state, observer)? == Flow::Interrupted {
-        return Ok(Outcome::Interrupted { stage: Stage::Fit, step: state.step });
+        return Ok(Outcome::Interrupted {
+            stage: Stage::Fit,
+            step: state.step,
+        });
     }
     state.restore_best()?;
     let manifest = plan.manifest(training, &state)?;
@@ -179,7 +199,11 @@ fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError>
     let path = files.history();
     let text = serde_json::to_vec(&state.history)
         .map_err(|error| TrainError::Config(format!("the history is not writable as JSON: {error}")))?;
-    write_atomically(&path, &text).map_err(|source| TrainError::Io { action: "write", path, source })
+    write_atomically(&path, &text).map_err(|source| TrainError::Io {
+        action: "write",
+        path,
+        source,
+    })
 }
 
 /// What is decided before the first step: the windows and the model's description.
@@ -206,7 +230,12 @@ impl<'a> Plan<'a> {
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
         spec.validate()?;
-        Ok(Self { source: FrameSource::new(dataset, spec.preprocess), spec, train, validation })
+        Ok(Self {
+            source: FrameSource::new(dataset, spec.preprocess),
+            spec,
+            train,
+            validation,
+        })
     }
 
     fn manifest(&self, training: &Training<'_>, state: &TrainState) -> Result<Manifest, TrainError> {
@@ -239,8 +268,10 @@ impl<'a> Plan<'a> {
 
 /// The distinct frames that windows of `length` frames cover, in order.
 fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
-    let mut frames: Vec<usize> =
-        windows.iter().flat_map(|window| window.first_frame..window.first_frame + length).collect();
+    let mut frames: Vec<usize> = windows
+        .iter()
+        .flat_map(|window| window.first_frame..window.first_frame + length)
+        .collect();
     frames.sort_unstable();
     frames.dedup();
     frames

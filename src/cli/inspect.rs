@@ -87,8 +87,8 @@ fn describe_dataset(dir: &Path) -> Result<(), CliError> {
     say(format!("  frames      {} of {}×{} px, {} s apart", info.frame_count, info.frame_width_px,
         info.frame_height_px, info.frame_period_s))?;
     say(format!("  episodes    {}", info.episode_count))?;
-    say(format!("  action      [{}]", list(&info.actions)))?;
-    say(format!("  state       [{}]", list(&info.states)))?;
+    say(format!("  action      [{}]", list(&info.action_channels)))?;
+    say(format!("  state       [{}]", list(&info.state_channels)))?;
     say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
     say(format!("  scenario    {}", info.scenario.as_deref().unwrap_or("none: recorded")))?;
     say(format!("  content     SHA-256 {}", info.content_hash))

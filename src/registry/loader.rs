@@ -9,7 +9,7 @@ use candle_core::{DType, Device, Tensor};
 use super::manifest::{self, Manifest};
 use super::{RegistryError, WEIGHTS_FILE};
 use crate::files::sha256_hex;
-use crate::nn::{Model, Parameters};
+use crate::nn::{Model, NnError, Parameters};
 
 /// The largest weights' file that is read, in bytes.
 const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
@@ -27,30 +27,46 @@ pub struct LoadedModel {
 pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     let manifest = manifest::read(model_dir)?;
     let path = model_dir.join(WEIGHTS_FILE);
-    let unread = |source| RegistryError::Io { action: "read", path: path.clone(), source };
+    let unread = |source| RegistryError::Io {
+        action: "read",
+        path: path.clone(),
+        source,
+    };
     let size = std::fs::metadata(&path).map_err(unread)?.len();
     if size > MAX_WEIGHTS_BYTES {
-        return Err(unread(std::io::Error::other(format!("{size} bytes, over the limit of {MAX_WEIGHTS_BYTES}"))));
+        return Err(unread(std::io::Error::other(format!(
+            "{size} bytes, over the limit of {MAX_WEIGHTS_BYTES}"
+        ))));
     }
     let bytes = std::fs::read(&path).map_err(unread)?;
     let found = sha256_hex(&bytes);
     if found != manifest.weights_sha256 {
-        return Err(RegistryError::Hash { path, found, expected: manifest.weights_sha256 });
+        return Err(RegistryError::Hash {
+            path,
+            found,
+            expected: manifest.weights_sha256,
+        });
     }
-    let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
-        .map_err(|source| RegistryError::Safetensors { path: path.clone(), source })?;
-    let misfit = |source| RegistryError::Weights { path: path.clone(), source };
+    let tensors =
+        candle_core::safetensors::load_buffer(&bytes, &Device::Cpu).map_err(|source| RegistryError::Safetensors {
+            path: path.clone(),
+            source,
+        })?;
+    let misfit = |source| RegistryError::Weights {
+        path: path.clone(),
+        source,
+    };
     let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(misfit)?;
     let model = Model::detached(manifest.spec.clone(), &parameters).map_err(misfit)?;
     Ok(LoadedModel { manifest, model })
 }
 
 /// The parameters as a safetensors file of half-precision numbers, tensors sorted by name.
-pub(super) fn serialize_f16(parameters: &Parameters) -> Result<Vec<u8>, candle_core::Error> {
+pub(super) fn serialize_f16(parameters: &Parameters) -> Result<Vec<u8>, NnError> {
     let halves = parameters
         .snapshot()?
         .into_iter()
         .map(|(name, tensor)| Ok((name, tensor.to_dtype(DType::F16)?)))
-        .collect::<Result<BTreeMap<String, Tensor>, candle_core::Error>>()?;
-    Ok(safetensors::tensor::serialize(&halves, None::<HashMap<String, String>>)?)
+        .collect::<Result<BTreeMap<String, Tensor>, NnError>>()?;
+    Ok(safetensors::tensor::serialize(&halves, None::<HashMap<String, String>>).map_err(candle_core::Error::from)?)
 }

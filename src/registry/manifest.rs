@@ -82,11 +82,19 @@ impl ProgramStamp {
 /// Reads the manifest in a model's directory. Errors: `Io`, `Manifest`.
 pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
     let path = model_dir.join(MANIFEST_FILE);
-    let failed = |source| RegistryError::Io { action: "read", path: path.clone(), source };
+    let failed = |source| RegistryError::Io {
+        action: "read",
+        path: path.clone(),
+        source,
+    };
     let size = std::fs::metadata(&path).map_err(failed)?.len();
     if size > MAX_MANIFEST_BYTES {
         let source = std::io::Error::other(format!("{size} bytes, over the limit of {MAX_MANIFEST_BYTES}"));
-        return Err(RegistryError::Io { action: "read", path, source });
+        return Err(RegistryError::Io {
+            action: "read",
+            path,
+            source,
+        });
     }
     let text = std::fs::read(&path).map_err(failed)?;
     serde_json::from_slice(&text).map_err(|source| RegistryError::Manifest { path, source })

@@ -48,9 +48,13 @@ impl<'a> FrameSource<'a> {
     pub(super) fn windows(&self, windows: &[&Window], shape: WindowShape) -> Result<WindowBatch, TrainError> {
         let (context, horizon) = (shape.context, shape.horizon);
         let length = context + horizon;
-        let frames: Vec<usize> =
-            windows.iter().flat_map(|window| window.first_frame..window.first_frame + length).collect();
-        let all = self.frames(&frames)?.reshape((windows.len(), length, self.pixel_count()))?;
+        let frames: Vec<usize> = windows
+            .iter()
+            .flat_map(|window| window.first_frame..window.first_frame + length)
+            .collect();
+        let all = self
+            .frames(&frames)?
+            .reshape((windows.len(), length, self.pixel_count()))?;
         Ok(WindowBatch {
             inputs: all.narrow(1, 0, context)?.contiguous()?,
             targets: all.narrow(1, context, horizon)?.contiguous()?,
@@ -59,18 +63,28 @@ impl<'a> FrameSource<'a> {
     }
 
     fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<Condition, TrainError> {
-        let (actions, states) = (self.dataset.info().actions.len(), self.dataset.info().states.len());
+        let (actions, states) = (
+            self.dataset.info().action_channels.len(),
+            self.dataset.info().state_channels.len(),
+        );
         let last_inputs = || windows.iter().map(|window| window.first_frame + shape.context - 1);
         // The action of a frame acts from it to the next, so the first target's is that of the last input.
         let future: Vec<f32> = last_inputs()
             .flat_map(|last| (last..last + shape.horizon).flat_map(|frame| self.dataset.action(frame)))
             .copied()
             .collect();
-        let present: Vec<f32> = last_inputs().flat_map(|last| self.dataset.state(last)).copied().collect();
+        let present: Vec<f32> = last_inputs()
+            .flat_map(|last| self.dataset.state(last))
+            .copied()
+            .collect();
         let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
         Ok(Condition {
-            actions: (actions > 0).then(|| tensor(future, &[windows.len(), shape.horizon, actions])).transpose()?,
-            state: (states > 0).then(|| tensor(present, &[windows.len(), states])).transpose()?,
+            actions: (actions > 0)
+                .then(|| tensor(future, &[windows.len(), shape.horizon, actions]))
+                .transpose()?,
+            state: (states > 0)
+                .then(|| tensor(present, &[windows.len(), states]))
+                .transpose()?,
         })
     }
 
@@ -81,7 +95,11 @@ impl<'a> FrameSource<'a> {
 
     fn fill(&self, frame: usize, out: &mut [f32]) -> Result<(), TrainError> {
         let info = self.dataset.info();
-        let frame = Frame::new(info.frame_width_px, info.frame_height_px, self.dataset.pixels(frame).to_vec())?;
+        let frame = Frame::new(
+            info.frame_width_px,
+            info.frame_height_px,
+            self.dataset.pixels(frame).to_vec(),
+        )?;
         out.copy_from_slice(&self.preprocess.forward(&frame));
         Ok(())
     }

@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
-use super::config::TrainConfig;
+use super::config::{RunConfig, TrainConfig};
 use super::observer::Stage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
@@ -33,15 +33,21 @@ impl RunFiles {
     /// Errors: `NotARun`, `OtherRun`, `Io`.
     pub(super) fn open(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let text = config.to_toml()?;
-        let files =
-            Self { run_dir: run_dir.to_owned(), fingerprint: fingerprint(&format!("{text}\n{content_hash}")) };
+        let files = Self {
+            run_dir: run_dir.to_owned(),
+            fingerprint: fingerprint(&format!("{text}\n{content_hash}")),
+        };
         let (config_path, data_path) = (run_dir.join("config.toml"), run_dir.join("dataset.sha256"));
         if config_path.is_file() && data_path.is_file() {
-            for (path, expected, what) in
-                [(&config_path, text.as_str(), "configuration"), (&data_path, content_hash, "data set")]
-            {
+            for (path, expected, what) in [
+                (&config_path, text.as_str(), "configuration"),
+                (&data_path, content_hash, "data set"),
+            ] {
                 if fs::read_to_string(path).map_err(unreadable(path))? != expected {
-                    return Err(TrainError::OtherRun { run_dir: run_dir.to_owned(), what });
+                    return Err(TrainError::OtherRun {
+                        run_dir: run_dir.to_owned(),
+                        what,
+                    });
                 }
             }
             return Ok(files);
@@ -75,12 +81,20 @@ impl RunFiles {
 
 fn unreadable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
     let path = path.to_owned();
-    move |source| TrainError::Io { action: "read", path: path.clone(), source }
+    move |source| TrainError::Io {
+        action: "read",
+        path: path.clone(),
+        source,
+    }
 }
 
 fn unwritable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
     let path = path.to_owned();
-    move |source| TrainError::Io { action: "write", path: path.clone(), source }
+    move |source| TrainError::Io {
+        action: "write",
+        path: path.clone(),
+        source,
+    }
 }
 
 /// The numbers beside the tensors.
@@ -89,7 +103,6 @@ struct Meta {
     fingerprint: String,
     stage: Stage,
     step: usize,
-    optimizer_step: u64,
     best_step: usize,
     best_loss: Option<f64>,
     history: Vec<HistoryPoint>,
@@ -108,15 +121,19 @@ impl Checkpoint {
             fingerprint: files.fingerprint.clone(),
             stage: state.stage,
             step: state.step,
-            optimizer_step: state.optimizer.step_count(),
             best_step: state.best_step,
             best_loss: state.best_loss,
             history: state.history.clone(),
         };
-        let failed = |reason: String| TrainError::Checkpoint { path: path.clone(), reason };
+        let failed = |reason: String| TrainError::Checkpoint {
+            path: path.clone(),
+            reason,
+        };
         let text = serde_json::to_string(&meta).map_err(|error| failed(error.to_string()))?;
         let prefixed = |prefix: &'static str, tensors: BTreeMap<String, Tensor>| {
-            tensors.into_iter().map(move |(name, tensor)| (format!("{prefix}{name}"), tensor))
+            tensors
+                .into_iter()
+                .map(move |(name, tensor)| (format!("{prefix}{name}"), tensor))
         };
         let tensors: BTreeMap<String, Tensor> = prefixed(PARAMETERS, state.parameters.snapshot()?)
             .chain(prefixed(BEST, state.best.clone()))
@@ -128,12 +145,15 @@ impl Checkpoint {
     }
 
     /// The run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or of another run.
-    pub(super) fn load(files: &RunFiles, spec: &ModelSpec) -> Result<Option<Self>, TrainError> {
+    pub(super) fn load(files: &RunFiles, spec: &ModelSpec, run: &RunConfig) -> Result<Option<Self>, TrainError> {
         let path = files.checkpoint();
         if !path.is_file() {
             return Ok(None);
         }
-        let failed = |reason: String| TrainError::Checkpoint { path: path.clone(), reason };
+        let failed = |reason: String| TrainError::Checkpoint {
+            path: path.clone(),
+            reason,
+        };
         let bytes = fs::read(&path).map_err(unreadable(&path))?;
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| failed(error.to_string()))?;
         let text = header
@@ -153,12 +173,16 @@ impl Checkpoint {
                 .collect()
         };
         let misfit = |error: crate::nn::NnError| failed(error.to_string());
+        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(misfit)?;
+        let optimizer = Adam::import(run.adam(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
         let state = TrainState {
             stage: meta.stage,
             step: meta.step,
-            parameters: Parameters::from_tensors(spec, group(PARAMETERS)).map_err(misfit)?,
-            optimizer: Adam::import(meta.optimizer_step, group(OPTIMIZER))?,
-            best: Parameters::from_tensors(spec, group(BEST)).map_err(misfit)?.snapshot()?,
+            parameters,
+            optimizer,
+            best: Parameters::from_tensors(spec, group(BEST))
+                .map_err(misfit)?
+                .snapshot()?,
             best_step: meta.best_step,
             best_loss: meta.best_loss,
             history: meta.history,

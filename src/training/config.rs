@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use super::TrainError;
+use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
 use crate::nn::loss::Loss;
@@ -154,10 +155,22 @@ pub struct RunConfig {
     pub final_learning_rate: f64,
     /// The largest norm of all gradients together.
     pub clip_norm: f64,
+    /// Equal parts of a batch that are differentiated side by side, each on a core.
+    pub batch_parts: usize,
     /// Updates from one validation to the next.
     pub validate_every_steps: usize,
     /// Updates from one checkpoint to the next.
     pub checkpoint_every_steps: usize,
+}
+
+impl RunConfig {
+    /// The optimizer's constants.
+    pub(super) fn adam(&self) -> AdamConfig {
+        AdamConfig {
+            clip_norm: self.clip_norm,
+            ..AdamConfig::default()
+        }
+    }
 }
 
 impl TrainConfig {
@@ -208,13 +221,16 @@ impl TrainConfig {
             ("fit.steps", fit.steps, 1, MAX_STEPS),
             ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),
             ("data.validation_windows", self.data.validation_windows, 1, MAX_STEPS),
+            ("run.batch_parts", run.batch_parts, 1, 64),
             ("run.validate_every_steps", run.validate_every_steps, 1, MAX_STEPS),
             ("run.checkpoint_every_steps", run.checkpoint_every_steps, 1, MAX_STEPS),
             ("run.warmup_steps", run.warmup_steps, 0, MAX_STEPS),
         ];
         for (field, value, least, most) in counts {
             if !(least..=most).contains(&value) {
-                return Err(TrainError::Config(format!("{field} is {value}; it must be {least} to {most}")));
+                return Err(TrainError::Config(format!(
+                    "{field} is {value}; it must be {least} to {most}"
+                )));
             }
         }
         let numbers = [
@@ -226,11 +242,26 @@ impl TrainConfig {
         ];
         for (field, value, most) in numbers {
             if !(0.0..=most).contains(&value) {
-                return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {most}")));
+                return Err(TrainError::Config(format!(
+                    "{field} is {value}; it must be 0 to {most}"
+                )));
+            }
+        }
+        for (field, size) in [
+            ("pretrain.batch_size", pretrain.batch_size),
+            ("fit.batch_size", fit.batch_size),
+        ] {
+            if !size.is_multiple_of(run.batch_parts) {
+                return Err(TrainError::Config(format!(
+                    "{field} is {size}; it must be a multiple of run.batch_parts, {}",
+                    run.batch_parts
+                )));
             }
         }
         if self.data.windows == WindowBudget::Count(0) {
-            return Err(TrainError::Config("data.windows is 0; it must be at least 1, or \"all\"".to_owned()));
+            return Err(TrainError::Config(
+                "data.windows is 0; it must be at least 1, or \"all\"".to_owned(),
+            ));
         }
         Ok(())
     }
@@ -238,15 +269,18 @@ impl TrainConfig {
     /// Inputs and targets of one window.
     #[must_use]
     pub fn window_shape(&self) -> WindowShape {
-        WindowShape { context: self.model.context, horizon: self.model.horizon }
+        WindowShape {
+            context: self.model.context,
+            horizon: self.model.horizon,
+        }
     }
 
     /// The model's description on that data set, channels scaled by the given training frames.
     #[must_use]
     pub fn model_spec(&self, dataset: &Dataset, frames: &[usize]) -> ModelSpec {
         let (info, model) = (dataset.info(), &self.model);
-        let actions = scales(&info.actions, frames, |frame| dataset.action(frame));
-        let states = scales(&info.states, frames, |frame| dataset.state(frame));
+        let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
+        let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
         ModelSpec {
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,
@@ -268,7 +302,11 @@ impl TrainConfig {
 fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> &'a [f32]) -> Vec<ChannelScale> {
     let count = frames.len().max(1) as f64;
     let moment = |index: usize, power: i32, mean: f64| {
-        frames.iter().map(|&frame| (f64::from(values(frame)[index]) - mean).powi(power)).sum::<f64>() / count
+        frames
+            .iter()
+            .map(|&frame| (f64::from(values(frame)[index]) - mean).powi(power))
+            .sum::<f64>()
+            / count
     };
     let scale = |(index, channel): (usize, &Channel)| {
         let mean = moment(index, 1, 0.0);
@@ -288,11 +326,16 @@ fn describe(error: toml::de::Error) -> TrainError {
 
 /// `fit.steps=3000` as the table it stands for; a value that is no TOML is taken as a string.
 fn parse_setting(setting: &str) -> Result<Table, TrainError> {
-    let (key, value) = setting
-        .split_once('=')
-        .ok_or_else(|| TrainError::Config(format!("{setting:?} is no setting; write KEY=VALUE, as in fit.steps=3000")))?;
+    let (key, value) = setting.split_once('=').ok_or_else(|| {
+        TrainError::Config(format!(
+            "{setting:?} is no setting; write KEY=VALUE, as in fit.steps=3000"
+        ))
+    })?;
     let (key, value) = (key.trim(), value.trim());
-    format!("{key} = {value}").parse().or_else(|_| format!("{key} = {value:?}").parse()).map_err(describe)
+    format!("{key} = {value}")
+        .parse()
+        .or_else(|_| format!("{key} = {value:?}").parse())
+        .map_err(describe)
 }
 
 /// Lays `over` upon `base`, table by table.
@@ -321,10 +364,20 @@ mod tests {
     #[test]
     fn settings_override_the_file_which_overrides_the_preset() {
         let file = "seed = 5\n[fit]\nsteps = 10\nlearning_rate = 0.5\n";
-        let settings = ["fit.steps=20".to_owned(), "data.windows=all".to_owned(), "fit.codec=frozen".to_owned()];
+        let settings = [
+            "fit.steps=20".to_owned(),
+            "data.windows=all".to_owned(),
+            "fit.codec=frozen".to_owned(),
+        ];
         let config = TrainConfig::layered("paper", Some(file), &settings).unwrap();
-        assert_eq!((config.seed, config.fit.steps, config.fit.learning_rate), (Seed(5), 20, 0.5));
-        assert_eq!((config.data.windows, config.fit.codec), (WindowBudget::All(All::All), CodecTraining::Frozen));
+        assert_eq!(
+            (config.seed, config.fit.steps, config.fit.learning_rate),
+            (Seed(5), 20, 0.5)
+        );
+        assert_eq!(
+            (config.data.windows, config.fit.codec),
+            (WindowBudget::All(All::All), CodecTraining::Frozen)
+        );
     }
 
     #[test]
@@ -335,15 +388,21 @@ mod tests {
 
     #[test]
     fn a_misspelt_field_is_refused_by_name() {
-        let error = TrainConfig::layered("paper", None, &["fit.stepz=3".to_owned()]).unwrap_err().to_string();
+        let error = TrainConfig::layered("paper", None, &["fit.stepz=3".to_owned()])
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("unknown field `stepz`"), "{error}");
     }
 
     #[test]
     fn a_number_out_of_range_is_refused_with_its_range() {
-        let error = TrainConfig::layered("paper", None, &["fit.learning_rate=nan".to_owned()]).unwrap_err().to_string();
+        let error = TrainConfig::layered("paper", None, &["fit.learning_rate=nan".to_owned()])
+            .unwrap_err()
+            .to_string();
         assert_eq!(error, "fit.learning_rate is NaN; it must be 0 to 1");
-        let error = TrainConfig::layered("paper", None, &["fit.batch_size=0".to_owned()]).unwrap_err().to_string();
+        let error = TrainConfig::layered("paper", None, &["fit.batch_size=0".to_owned()])
+            .unwrap_err()
+            .to_string();
         assert_eq!(error, "fit.batch_size is 0; it must be 1 to 4096");
     }
 }

@@ -5,13 +5,14 @@ use candle_core::Tensor;
 use super::batches::{Shuffle, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
 use super::observer::Stage;
-use super::pretrain::CODEC_PREFIX;
-use super::stage::Objective;
+use super::stage::{Objective, Part};
 use super::{Plan, TrainError};
 use crate::dataset::Window;
 use crate::nn::loss::Loss;
 use crate::nn::{Feedback, Model, Parameters};
 
+/// What the names of the codec's tensors start with.
+const CODEC_PREFIX: &str = "frame_";
 /// Windows that are validated in one batch.
 const VALIDATION_BATCH_SIZE: usize = 64;
 
@@ -24,7 +25,11 @@ pub(super) struct SequenceObjective<'a> {
 
 impl<'a> SequenceObjective<'a> {
     pub(super) fn new(plan: &'a Plan<'a>, config: &'a TrainConfig) -> Self {
-        Self { plan, config, shuffle: Shuffle::new(plan.train.len(), config.seed.derive("fit", 0)) }
+        Self {
+            plan,
+            config,
+            shuffle: Shuffle::new(plan.train.len(), config.seed.derive("fit", 0)),
+        }
     }
 
     fn is_frozen(&self) -> bool {
@@ -63,19 +68,10 @@ impl Objective for SequenceObjective<'_> {
         self.config.fit.learning_rate
     }
 
-    fn trains(&self, name: &str) -> bool {
-        let is_idle = self.config.fit.reconstruction_weight == 0.0 && name.starts_with("reconstructor.");
-        !is_idle && !(self.is_frozen() && name.starts_with(CODEC_PREFIX))
-    }
-
-    fn loss(&self, parameters: &Parameters, step: usize) -> Result<Tensor, TrainError> {
+    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError> {
         let fit = &self.config.fit;
-        let windows: Vec<&Window> = self
-            .shuffle
-            .batch(step, fit.batch_size)
-            .into_iter()
-            .map(|position| &self.plan.train[position])
-            .collect();
+        let drawn = part.of(self.shuffle.batch(step, fit.batch_size));
+        let windows: Vec<&Window> = drawn.into_iter().map(|position| &self.plan.train[position]).collect();
         let batch = self.batch(&windows)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;

@@ -1,1 +1,365 @@
-//! Adam.
+//! Adam (Kingma & Ba 2015) with its moments in the open, so that a resumed run goes on bit for bit, and gradients as
+//! values of their own, so that parts of a batch can be computed apart and joined.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+
+use candle_core::{CpuStorage, DType, Device, InplaceOp1, Layout, Storage, Tensor};
+use pulp::Arch;
+
+use crate::nn::Parameters;
+
+/// Prefixes of the exported tensors' names: first and second moments, and the number of steps.
+const FIRST: &str = "adam.first.";
+const SECOND: &str = "adam.second.";
+const STEP: &str = "adam.step";
+
+/// Why an update was refused. The parameters and the moments are then as they were.
+#[derive(Debug, thiserror::Error)]
+pub enum OptimizerError {
+    /// The loss is NaN or infinite.
+    #[error("the loss is {value}; it must be a finite number")]
+    LossNotFinite {
+        /// The value found.
+        value: f64,
+    },
+    /// A gradient holds NaN or an infinity.
+    #[error("the gradient of tensor \"{name}\" is not finite")]
+    GradientNotFinite {
+        /// The tensor.
+        name: String,
+    },
+    /// Gradients that are to be joined are not of the same tensors, or there are none.
+    #[error("gradients to be joined must be of the same tensors, and of one part at least")]
+    Join,
+    /// An exported state doesn't fit the parameters.
+    #[error("optimizer state: tensor \"{name}\" {problem}")]
+    State {
+        /// The exported tensor.
+        name: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The tensor library failed.
+    #[error("tensor computation failed")]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// Gradients of a loss by tensor name, with the loss.
+#[derive(Debug)]
+pub struct Gradients {
+    loss: f64,
+    by_name: BTreeMap<String, Tensor>,
+}
+
+impl Gradients {
+    /// Gradients of the scalar `loss` for all parameters it depends on, but those whose name starts with one of the
+    /// `frozen` prefixes. Errors: `LossNotFinite`.
+    pub fn of(loss: &Tensor, parameters: &Parameters, frozen: &[&str]) -> Result<Self, OptimizerError> {
+        let value = loss.to_dtype(DType::F64)?.to_scalar::<f64>()?;
+        if !value.is_finite() {
+            return Err(OptimizerError::LossNotFinite { value });
+        }
+        let mut store = loss.backward()?;
+        let mut by_name = BTreeMap::new();
+        for (name, var) in parameters.iter() {
+            if frozen.iter().any(|prefix| name.starts_with(prefix)) {
+                continue;
+            }
+            if let Some(gradient) = store.remove(var.as_tensor()) {
+                by_name.insert(name.to_owned(), gradient.detach().contiguous()?);
+            }
+        }
+        Ok(Self { loss: value, by_name })
+    }
+
+    /// The mean of the gradients and losses of equally large parts of a batch, summed in the order given.
+    /// Errors: `Join`.
+    pub fn mean(parts: Vec<Self>) -> Result<Self, OptimizerError> {
+        let weight = 1.0 / parts.len() as f64;
+        let mut parts = parts.into_iter();
+        let mut joined = parts.next().ok_or(OptimizerError::Join)?;
+        for part in parts {
+            if !part.by_name.keys().eq(joined.by_name.keys()) {
+                return Err(OptimizerError::Join);
+            }
+            joined.loss += part.loss;
+            for (sum, gradient) in joined.by_name.values_mut().zip(part.by_name.values()) {
+                *sum = (&*sum + gradient)?;
+            }
+        }
+        joined.loss *= weight;
+        for sum in joined.by_name.values_mut() {
+            *sum = (&*sum * weight)?;
+        }
+        Ok(joined)
+    }
+
+    /// The loss.
+    #[must_use]
+    pub fn loss(&self) -> f64 {
+        self.loss
+    }
+
+    /// The gradient of the tensor of that name, if the loss depends on it.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&Tensor> {
+        self.by_name.get(name)
+    }
+
+    /// Euclidean norm over all tensors. Errors: `GradientNotFinite`.
+    pub fn norm(&self) -> Result<f64, OptimizerError> {
+        let mut sum = 0.0;
+        for (name, gradient) in &self.by_name {
+            let squares = with_values(gradient, sum_of_squares)?;
+            if !squares.is_finite() {
+                return Err(OptimizerError::GradientNotFinite { name: name.clone() });
+            }
+            sum += squares;
+        }
+        Ok(sum.sqrt())
+    }
+}
+
+/// Adam's constants.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdamConfig {
+    /// Decay of the first moment.
+    pub beta1: f64,
+    /// Decay of the second moment.
+    pub beta2: f64,
+    /// Added to the root of the second moment.
+    pub epsilon: f64,
+    /// Gradients of a larger norm are scaled down to this one; infinite for no clipping.
+    pub clip_norm: f64,
+}
+
+impl Default for AdamConfig {
+    fn default() -> Self {
+        Self {
+            beta1: 0.9,
+            beta2: 0.999,
+            epsilon: 1e-8,
+            clip_norm: 1.0,
+        }
+    }
+}
+
+/// Running means of a tensor's gradient and of its square.
+#[derive(Clone, Debug)]
+struct Moments {
+    shape: Vec<usize>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+}
+
+/// The optimizer with its moments, by tensor name.
+#[derive(Clone, Debug)]
+pub struct Adam {
+    config: AdamConfig,
+    step: u64,
+    moments: BTreeMap<String, Moments>,
+}
+
+impl Adam {
+    /// An optimizer that has seen no gradient.
+    #[must_use]
+    pub fn new(config: AdamConfig) -> Self {
+        Self {
+            config,
+            step: 0,
+            moments: BTreeMap::new(),
+        }
+    }
+
+    /// Updates done.
+    #[must_use]
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Moves the parameters against the gradients; gives the gradients' norm before clipping. Parameters without a
+    /// gradient stay. Errors: `GradientNotFinite`, and then nothing has changed.
+    pub fn update(
+        &mut self,
+        parameters: &Parameters,
+        gradients: &Gradients,
+        learning_rate: f64,
+    ) -> Result<f64, OptimizerError> {
+        let norm = gradients.norm()?;
+        self.step += 1;
+        let steps = i32::try_from(self.step).unwrap_or(i32::MAX);
+        let AdamConfig {
+            beta1,
+            beta2,
+            epsilon,
+            clip_norm,
+        } = self.config;
+        let second_correction = 1.0 - beta2.powi(steps);
+        let rule = Rule {
+            scale: if norm > clip_norm {
+                (clip_norm / norm) as f32
+            } else {
+                1.0
+            },
+            beta1: beta1 as f32,
+            beta2: beta2 as f32,
+            // θ −= lr · (m / b1) / (√(v / b2) + ε), with √b2 taken out of the root.
+            rate: (learning_rate * second_correction.sqrt() / (1.0 - beta1.powi(steps))) as f32,
+            epsilon: (epsilon * second_correction.sqrt()) as f32,
+        };
+        for (name, var) in parameters.iter() {
+            let Some(gradient) = gradients.get(name) else {
+                continue;
+            };
+            let moments = self.moments.entry(name.to_owned()).or_insert_with(|| Moments {
+                shape: var.dims().to_vec(),
+                first: vec![0.0; var.elem_count()],
+                second: vec![0.0; var.elem_count()],
+            });
+            with_values(gradient, |gradient| {
+                var.inplace_op1(&Apply {
+                    rule,
+                    gradient,
+                    moments: RefCell::new(moments),
+                })
+            })??;
+        }
+        Ok(norm)
+    }
+
+    /// The moments and the number of steps as tensors for a checkpoint.
+    pub fn export(&self) -> Result<BTreeMap<String, Tensor>, OptimizerError> {
+        let mut tensors = BTreeMap::new();
+        let steps = i64::try_from(self.step).unwrap_or(i64::MAX);
+        tensors.insert(STEP.to_owned(), Tensor::from_vec(vec![steps], 1, &Device::Cpu)?);
+        for (name, moments) in &self.moments {
+            for (prefix, values) in [(FIRST, &moments.first), (SECOND, &moments.second)] {
+                let tensor = Tensor::from_slice(values, moments.shape.as_slice(), &Device::Cpu)?;
+                tensors.insert(format!("{prefix}{name}"), tensor);
+            }
+        }
+        Ok(tensors)
+    }
+
+    /// The optimizer that [`Adam::export`] wrote down, bit for bit. Tensors of other names are not looked at.
+    /// Errors: `State`.
+    pub fn import(
+        config: AdamConfig,
+        tensors: &BTreeMap<String, Tensor>,
+        parameters: &Parameters,
+    ) -> Result<Self, OptimizerError> {
+        let problem = |name: &str, problem: String| OptimizerError::State {
+            name: name.to_owned(),
+            problem,
+        };
+        let steps = tensors
+            .get(STEP)
+            .ok_or_else(|| problem(STEP, "is missing".to_owned()))?;
+        let step = match steps.flatten_all()?.to_vec1::<i64>()?.as_slice() {
+            &[step] if step >= 0 => step as u64,
+            other => return Err(problem(STEP, format!("is {other:?}; it must be one count"))),
+        };
+        let mut moments = BTreeMap::new();
+        for (name, var) in parameters.iter() {
+            let read = |key: &str, tensor: &Tensor| {
+                if tensor.dims() != var.dims() {
+                    let wrong = format!("has shape {:?}; the parameter has {:?}", tensor.dims(), var.dims());
+                    return Err(problem(key, wrong));
+                }
+                Ok(tensor.flatten_all()?.to_vec1::<f32>()?)
+            };
+            let keys = [format!("{FIRST}{name}"), format!("{SECOND}{name}")];
+            match (tensors.get(&keys[0]), tensors.get(&keys[1])) {
+                (None, None) => {}
+                (Some(first), Some(second)) => {
+                    let shape = var.dims().to_vec();
+                    let (first, second) = (read(&keys[0], first)?, read(&keys[1], second)?);
+                    moments.insert(name.to_owned(), Moments { shape, first, second });
+                }
+                (first, _) => return Err(problem(&keys[usize::from(first.is_some())], "is missing".to_owned())),
+            }
+        }
+        Ok(Self { config, step, moments })
+    }
+}
+
+/// The numbers of one update.
+#[derive(Clone, Copy)]
+struct Rule {
+    scale: f32,
+    beta1: f32,
+    beta2: f32,
+    rate: f32,
+    epsilon: f32,
+}
+
+impl Rule {
+    #[inline(always)]
+    fn apply(self, parameters: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32]) {
+        let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
+        for (((parameter, &gradient), m), v) in values {
+            let gradient = gradient * self.scale;
+            *m = self.beta1 * *m + (1.0 - self.beta1) * gradient;
+            *v = self.beta2 * *v + (1.0 - self.beta2) * gradient * gradient;
+            *parameter -= self.rate * *m / (v.sqrt() + self.epsilon);
+        }
+    }
+}
+
+/// One tensor's update, in one pass and in place: candle's own operations would take a dozen passes.
+struct Apply<'a> {
+    rule: Rule,
+    gradient: &'a [f32],
+    moments: RefCell<&'a mut Moments>,
+}
+
+impl InplaceOp1 for Apply<'_> {
+    fn name(&self) -> &'static str {
+        "adam"
+    }
+
+    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
+        let (CpuStorage::F32(values), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
+            candle_core::bail!("adam takes contiguous f32 parameters");
+        };
+        let mut moments = self.moments.borrow_mut();
+        let Moments { first, second, .. } = &mut **moments;
+        Arch::new().dispatch(
+            #[inline(always)]
+            || self.rule.apply(&mut values[from..to], self.gradient, first, second),
+        );
+        Ok(())
+    }
+}
+
+/// Calls `read` with a contiguous tensor's values.
+fn with_values<T>(tensor: &Tensor, read: impl FnOnce(&[f32]) -> T) -> Result<T, candle_core::Error> {
+    let (storage, layout) = tensor.storage_and_layout();
+    let (Storage::Cpu(CpuStorage::F32(values)), Some((from, to))) = (&*storage, layout.contiguous_offsets()) else {
+        candle_core::bail!("gradients must be contiguous f32 on the CPU");
+    };
+    Ok(read(&values[from..to]))
+}
+
+/// Sum of squares, in f64 over blocks short enough that f32 loses nothing that matters.
+fn sum_of_squares(values: &[f32]) -> f64 {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            let mut total = 0.0;
+            for block in values.chunks(1024) {
+                let mut lanes = [0.0f32; 16];
+                let whole = block.chunks_exact(16);
+                let rest: f32 = whole.remainder().iter().map(|value| value * value).sum();
+                for part in whole {
+                    for (lane, value) in lanes.iter_mut().zip(part) {
+                        *lane += value * value;
+                    }
+                }
+                total += f64::from(lanes.iter().sum::<f32>() + rest);
+            }
+            total
+        },
+    )
+}

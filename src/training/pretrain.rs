@@ -5,13 +5,10 @@ use candle_core::Tensor;
 use super::batches::Shuffle;
 use super::config::TrainConfig;
 use super::observer::Stage;
-use super::stage::Objective;
+use super::stage::{Objective, Part};
 use super::{Plan, TrainError, window_frames};
 use crate::nn::loss::Loss;
 use crate::nn::{Model, Parameters};
-
-/// What the names of the codec's tensors start with.
-pub(super) const CODEC_PREFIX: &str = "frame_";
 
 /// How many frames of the validation windows choose the best codec, at most.
 const MAX_VALIDATION_FRAMES: usize = 1024;
@@ -60,19 +57,15 @@ impl Objective for CodecObjective<'_> {
         self.config.pretrain.learning_rate
     }
 
-    fn trains(&self, name: &str) -> bool {
-        name.starts_with(CODEC_PREFIX)
-    }
-
-    fn loss(&self, parameters: &Parameters, step: usize) -> Result<Tensor, TrainError> {
-        let batch: Vec<usize> = self
-            .shuffle
-            .batch(step, self.config.pretrain.batch_size)
-            .into_iter()
-            .map(|position| self.frames[position])
-            .collect();
+    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError> {
+        let batch = part.of(self.shuffle.batch(step, self.config.pretrain.batch_size));
+        let batch: Vec<usize> = batch.into_iter().map(|position| self.frames[position]).collect();
         let frames = self.plan.source.frames(&batch)?;
-        Ok(self.config.fit.loss.between(&self.reconstruct(parameters, &frames)?, &frames)?)
+        Ok(self
+            .config
+            .fit
+            .loss
+            .between(&self.reconstruct(parameters, &frames)?, &frames)?)
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {

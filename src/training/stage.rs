@@ -5,29 +5,47 @@ use std::f64::consts::PI;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use candle_core::Tensor;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::TrainError;
 use super::checkpoint::{Checkpoint, RunFiles};
 use super::config::RunConfig;
 use super::observer::{Event, Observer, Stage};
-use super::optimizer::{Adam, OptimizerError};
-use super::TrainError;
+use super::optimizer::{Adam, Gradients, OptimizerError};
 use crate::nn::Parameters;
 
+/// Pixels lie in 0…1, so a loss above this is no prediction any more.
+const MAX_LOSS: f64 = 1e3;
+
 /// What a stage minimizes.
-pub(super) trait Objective {
+pub(super) trait Objective: Sync {
     /// Which of the two it is.
     fn stage(&self) -> Stage;
     /// Updates to make.
     fn steps(&self) -> usize;
     /// Adam's learning rate at its highest.
     fn learning_rate(&self) -> f64;
-    /// Whether the tensor of that name is trained in this stage.
-    fn trains(&self, name: &str) -> bool;
-    /// The loss of the batch that belongs to a step, a scalar to differentiate.
-    fn loss(&self, parameters: &Parameters, step: usize) -> Result<Tensor, TrainError>;
+    /// The loss of one part of the batch that belongs to a step, a scalar to differentiate.
+    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError>;
     /// The mean squared error of the validation split, in the model's space.
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
+}
+
+/// One of the equal parts of a batch, which are differentiated side by side. Their number is a setting, not the machine's
+/// count of cores, so that the same bits come out everywhere.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Part {
+    pub(super) index: usize,
+    pub(super) count: usize,
+}
+
+impl Part {
+    /// This part of the batch's items.
+    pub(super) fn of(self, items: Vec<usize>) -> Vec<usize> {
+        let size = items.len() / self.count;
+        items.into_iter().skip(self.index * size).take(size).collect()
+    }
 }
 
 /// A point of the loss curves.
@@ -54,13 +72,13 @@ pub(super) struct TrainState {
 }
 
 impl TrainState {
-    pub(super) fn new(parameters: Parameters) -> Result<Self, TrainError> {
+    pub(super) fn new(parameters: Parameters, run: &RunConfig) -> Result<Self, TrainError> {
         let best = parameters.snapshot()?;
         Ok(Self {
             stage: Stage::Pretrain,
             step: 0,
             parameters,
-            optimizer: Adam::default(),
+            optimizer: Adam::new(run.adam()),
             best,
             best_step: 0,
             best_loss: None,
@@ -69,11 +87,11 @@ impl TrainState {
     }
 
     /// Takes the best weights of this stage and starts the next with a fresh optimizer.
-    pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
+    pub(super) fn enter(&mut self, stage: Stage, run: &RunConfig) -> Result<(), TrainError> {
         self.restore_best()?;
         self.stage = stage;
         self.step = 0;
-        self.optimizer = Adam::default();
+        self.optimizer = Adam::new(run.adam());
         self.best_step = 0;
         self.best_loss = None;
         Ok(())
@@ -119,7 +137,12 @@ impl StageRunner<'_> {
             let loss = self.update(objective, state, saved_step)?;
             state.step += 1;
             let step = state.step;
-            observer.on_event(Event::Step { stage, step, steps, loss });
+            observer.on_event(Event::Step {
+                stage,
+                step,
+                steps,
+                loss,
+            });
             if step.is_multiple_of(self.run.validate_every_steps) || step == steps {
                 self.validate(objective, state, loss, observer)?;
             }
@@ -134,19 +157,43 @@ impl StageRunner<'_> {
     /// One update; returns the batch's loss.
     fn update(&self, objective: &dyn Objective, state: &mut TrainState, kept: usize) -> Result<f64, TrainError> {
         let step = state.step;
-        let diverged = |what| TrainError::Diverged { stage: objective.stage(), step: step + 1, what, kept };
-        let loss = objective.loss(&state.parameters, step)?;
-        let value = f64::from(loss.to_scalar::<f32>()?);
-        if !value.is_finite() {
-            return Err(diverged("the loss"));
-        }
-        let gradients = loss.backward()?;
+        let diverged = |what| TrainError::Diverged {
+            stage: objective.stage(),
+            step: step + 1,
+            what,
+            kept,
+        };
+        let parameters = &state.parameters;
+        let part = |index| -> Result<Result<Gradients, OptimizerError>, TrainError> {
+            let loss = objective.loss(
+                parameters,
+                step,
+                Part {
+                    index,
+                    count: self.run.batch_parts,
+                },
+            )?;
+            Ok(Gradients::of(&loss, parameters, &[]))
+        };
+        let parts = (0..self.run.batch_parts)
+            .into_par_iter()
+            .map(part)
+            .collect::<Result<Vec<_>, _>>()?;
         let rate = objective.learning_rate() * self.schedule(step, objective.steps());
-        let trains = |name: &str| objective.trains(name);
-        match state.optimizer.step(&state.parameters, &gradients, rate, self.run.clip_norm, &trains) {
-            Ok(_) => Ok(value),
-            Err(OptimizerError::NotFinite { .. }) => Err(diverged("a gradient")),
-            Err(OptimizerError::Candle(error)) => Err(error.into()),
+        let updated = parts
+            .into_iter()
+            .collect::<Result<_, _>>()
+            .and_then(Gradients::mean)
+            .and_then(|gradients| {
+                state.optimizer.update(&state.parameters, &gradients, rate)?;
+                Ok(gradients.loss())
+            });
+        match updated {
+            Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, over {MAX_LOSS}"))),
+            Ok(loss) => Ok(loss),
+            Err(OptimizerError::LossNotFinite { value }) => Err(diverged(format!("the loss is {value}"))),
+            Err(error @ OptimizerError::GradientNotFinite { .. }) => Err(diverged(error.to_string())),
+            Err(other) => Err(TrainError::Optimizer(other)),
         }
     }
 
@@ -176,15 +223,28 @@ impl StageRunner<'_> {
             state.best_step = step;
             state.best_loss = Some(loss);
         }
-        state.history.push(HistoryPoint { stage, step, train_loss, validation_loss: loss });
-        observer.on_event(Event::Validated { stage, step, loss, is_best });
+        state.history.push(HistoryPoint {
+            stage,
+            step,
+            train_loss,
+            validation_loss: loss,
+        });
+        observer.on_event(Event::Validated {
+            stage,
+            step,
+            loss,
+            is_best,
+        });
         Ok(())
     }
 
     /// Writes the state to disk.
     pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
         Checkpoint::save(self.files, state)?;
-        observer.on_event(Event::Checkpointed { stage: state.stage, step: state.step });
+        observer.on_event(Event::Checkpointed {
+            stage: state.stage,
+            step: state.step,
+        });
         Ok(())
     }
 }

@@ -1,2 +1,3 @@
 //! Behaviour of the whole library, one test binary.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
+mod training;

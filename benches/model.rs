@@ -1,0 +1,78 @@
+//! Times of prediction and of training steps with the default model: 64×64 px, 128 features, 256 hidden units, 5 → 5.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+use candle_core::{Device, Tensor};
+use criterion::{Criterion, criterion_group, criterion_main};
+use foreframe::nn::{Condition, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe::training::optimizer::{Adam, AdamConfig, Gradients};
+use foreframe::types::Seed;
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+const WINDOWS: usize = 64;
+
+/// Smooth values 0…1 of that shape.
+fn values(shape: (usize, usize, usize)) -> Tensor {
+    let count = shape.0 * shape.1 * shape.2;
+    let values: Vec<f32> = (0..count).map(|i| 0.5 + 0.5 * (i as f32 * 0.37).sin()).collect();
+    Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+}
+
+fn prediction(c: &mut Criterion) {
+    let spec = ModelSpec::default();
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let model = Model::detached(spec.clone(), &parameters).unwrap();
+    for windows in [1, WINDOWS] {
+        let frames = values((windows, spec.context, spec.pixels()));
+        c.bench_function(&format!("prediction of {windows} windows"), |b| {
+            b.iter(|| model.predict_frames(&frames, &Condition::none()).unwrap());
+        });
+    }
+}
+
+/// Forward, backward and Adam from pixels to pixels, or with the codec frozen from features to features.
+fn training(c: &mut Criterion) {
+    let spec = ModelSpec::default();
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let model = Model::new(spec.clone(), &parameters).unwrap();
+    let (context, horizon, pixels, features) = (spec.context, spec.horizon, spec.pixels(), spec.features);
+    let (seen, ahead) = (values((WINDOWS, context, pixels)), values((WINDOWS, horizon, pixels)));
+    let mut adam = Adam::new(AdamConfig::default());
+    let mut update = |loss: &Tensor| {
+        let gradients = Gradients::of(loss, &parameters, &[]).unwrap();
+        adam.update(&parameters, &gradients, 1e-4).unwrap()
+    };
+    c.bench_function("training step of 64 windows", |b| {
+        b.iter(|| {
+            let predicted = model.predict_frames(&seen, &Condition::none()).unwrap();
+            update(&Loss::Mse.between(&predicted, &ahead).unwrap())
+        });
+    });
+    let frozen = Model::with_frozen(spec, &parameters, &["frame_"]).unwrap();
+    let (seen, ahead) = (
+        values((WINDOWS, context, features)),
+        values((WINDOWS, horizon, features)),
+    );
+    c.bench_function("training step of 64 windows, features only", |b| {
+        b.iter(|| {
+            let predicted = frozen.predict(&seen, &Condition::none(), Feedback::Prediction).unwrap();
+            update(&Loss::Mse.between(&predicted, &ahead).unwrap())
+        });
+    });
+    c.bench_function("training step of 64 windows, features only, both decoders", |b| {
+        b.iter(|| {
+            let predicted = frozen.predict(&seen, &Condition::none(), Feedback::Prediction).unwrap();
+            let again = frozen.reconstruct(&seen).unwrap();
+            let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
+            update(&(loss + Loss::Mse.between(&again, &seen).unwrap()).unwrap())
+        });
+    });
+}
+
+criterion_group! {
+    name = model;
+    config = Criterion::default().sample_size(20).measurement_time(std::time::Duration::from_secs(3));
+    targets = prediction, training
+}
+criterion_main!(model);

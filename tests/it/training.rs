@@ -1,0 +1,254 @@
+//! Training: both stages on a small moving scene, stopped and gone on with, refused and diverging.
+
+use std::cell::Cell;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::registry;
+use foreframe::training::{Event, Outcome, TrainConfig, TrainError, Training, run};
+use foreframe::types::Channel;
+
+const SIDE: u32 = 12;
+
+/// Episodes in which a bright square goes right or left by what the action says.
+pub(crate) fn moving_square(episodes: usize) -> Dataset {
+    let data = (0..episodes).map(|episode| {
+        let direction = if episode % 2 == 0 { 1.0 } else { -1.0 };
+        let column = |frame: usize| (5.0 + direction * frame as f32).rem_euclid(SIDE as f32) as u32;
+        EpisodeData {
+            pixels: (0..12).flat_map(|frame| square(column(frame))).collect(),
+            actions: vec![direction; 12],
+            states: (0..12).map(|frame| column(frame) as f32).collect(),
+            timestamps_s: (0..12).map(|frame| f64::from(frame) * 0.2).collect(),
+            ..EpisodeData::default()
+        }
+    });
+    let info = DatasetInfo {
+        name: "square".to_owned(),
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        frame_period_s: 0.2,
+        action_channels: vec![Channel::new("direction", "px/frame")],
+        state_channels: vec![Channel::new("column", "px")],
+        content_hash: String::new(),
+        scenario: None,
+        seed: None,
+        frame_count: 0,
+        episode_count: 0,
+        has_masks: false,
+    };
+    Dataset::from_episodes(info, data.collect()).unwrap()
+}
+
+fn square(column: u32) -> Vec<u8> {
+    let pixel = |x: u32, y: u32| {
+        if (4..8).contains(&y) && (x + SIDE - column) % SIDE < 3 {
+            30
+        } else {
+            220
+        }
+    };
+    (0..SIDE * SIDE).map(|i| pixel(i % SIDE, i / SIDE)).collect()
+}
+
+pub(crate) fn small_config(extra: &[&str]) -> TrainConfig {
+    let small = [
+        "name=square",
+        "model.features=8",
+        "model.hidden=12",
+        "model.conditioning=state-action",
+        "data.windows=40",
+        "data.validation_windows=4",
+        "pretrain.steps=30",
+        "pretrain.batch_size=8",
+        "fit.steps=30",
+        "fit.batch_size=4",
+        "run.validate_every_steps=10",
+        "run.checkpoint_every_steps=7",
+        "run.warmup_steps=5",
+    ];
+    let settings: Vec<String> = small.iter().chain(extra).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::layered("paper", None, &settings).unwrap()
+}
+
+fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<Outcome, TrainError> {
+    train_until(config, dataset, dir, usize::MAX)
+}
+
+/// Trains until so many updates were made in this call.
+fn train_until(config: &TrainConfig, dataset: &Dataset, dir: &Path, updates: usize) -> Result<Outcome, TrainError> {
+    let cancelled = AtomicBool::new(false);
+    let made = Cell::new(0);
+    let training = Training {
+        config,
+        dataset,
+        run_dir: dir,
+        command: "test",
+    };
+    let mut observer = |event: Event| {
+        if let Event::Step { .. } = event {
+            made.set(made.get() + 1);
+            cancelled.store(made.get() >= updates, Ordering::Relaxed);
+        }
+    };
+    run(&training, &mut observer, &cancelled)
+}
+
+fn weights(dir: &Path) -> Vec<u8> {
+    std::fs::read(dir.join("checkpoint.safetensors")).unwrap()
+}
+
+#[test]
+fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
+    let (dataset, config) = (moving_square(20), small_config(&[]));
+    let dir = tempfile::tempdir().unwrap();
+    let unbroken = dir.path().join("unbroken");
+    train(&config, &dataset, &unbroken).unwrap();
+    for (name, stops) in [
+        ("early", vec![1, 12]),
+        ("codec", vec![30]),
+        ("late", vec![25, 20, 14]),
+        ("often", vec![9; 5]),
+    ] {
+        let broken = dir.path().join(name);
+        for updates in stops {
+            let outcome = train_until(&config, &dataset, &broken, updates).unwrap();
+            assert!(matches!(outcome, Outcome::Interrupted { .. }), "{name}: {outcome:?}");
+        }
+        train(&config, &dataset, &broken).unwrap();
+        assert_eq!(
+            weights(&broken),
+            weights(&unbroken),
+            "{name}: the last checkpoints differ"
+        );
+        let model = |run: &Path| std::fs::read(run.join("model").join(registry::WEIGHTS_FILE)).unwrap();
+        assert_eq!(model(&broken), model(&unbroken), "{name}: the published weights differ");
+    }
+}
+
+#[test]
+fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_manifest() {
+    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    let config = small_config(&[
+        "pretrain.steps=300",
+        "fit.steps=300",
+        "model.features=16",
+        "model.hidden=24",
+    ]);
+    let first = Cell::new(None);
+    let last = Cell::new(0.0);
+    let training = Training {
+        config: &config,
+        dataset: &dataset,
+        run_dir: dir.path(),
+        command: "test",
+    };
+    let mut observer = |event: Event| {
+        if let Event::Step { loss, .. } = event {
+            first.set(first.get().or(Some(loss)));
+            last.set(loss);
+        }
+    };
+    let outcome = run(&training, &mut observer, &AtomicBool::new(false)).unwrap();
+    assert!(
+        last.get() < 0.2 * first.get().unwrap(),
+        "loss went from {:?} to {}",
+        first.get(),
+        last.get()
+    );
+    let Outcome::Finished { model_dir, manifest } = outcome else {
+        panic!("{outcome:?}")
+    };
+    let loaded = registry::load(&model_dir).unwrap();
+    assert_eq!(loaded.manifest.weights_sha256, manifest.weights_sha256);
+    assert_eq!(loaded.manifest.spec.actions[0].name, "direction");
+}
+
+#[test]
+fn a_finished_run_is_answered_without_training_again() {
+    let (dataset, config, dir) = (moving_square(20), small_config(&[]), tempfile::tempdir().unwrap());
+    train(&config, &dataset, dir.path()).unwrap();
+    let outcome = train_until(&config, &dataset, dir.path(), 1).unwrap();
+    assert!(matches!(outcome, Outcome::Finished { .. }));
+}
+
+#[test]
+fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
+    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    let config = small_config(&[
+        "fit.learning_rate=1",
+        "run.clip_norm=1e6",
+        "run.warmup_steps=0",
+        "fit.steps=500",
+    ]);
+    let error = train(&config, &dataset, dir.path()).unwrap_err();
+    let TrainError::Diverged { stage, step, kept, .. } = &error else {
+        panic!("{error}")
+    };
+    assert_eq!(stage.to_string(), "fit");
+    assert!(kept < step && step - kept <= 7, "{error}");
+    assert!(dir.path().join("checkpoint.safetensors").is_file());
+    assert!(!dir.path().join("model").exists());
+    let again = train(&config, &dataset, dir.path()).unwrap_err();
+    assert_eq!(
+        again.to_string(),
+        error.to_string(),
+        "the kept checkpoint leads to the same end"
+    );
+}
+
+#[test]
+fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
+    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
+    let error = train(&small_config(&["seed=2"]), &dataset, dir.path())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("holds a run with another configuration"), "{error}");
+    let error = train(&small_config(&[]), &moving_square(22), dir.path())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("holds a run with another data set"), "{error}");
+}
+
+#[test]
+fn a_directory_of_something_else_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("thesis.tex"), "precious").unwrap();
+    let error = train(&small_config(&[]), &moving_square(20), dir.path()).unwrap_err();
+    assert!(matches!(error, TrainError::NotARun(_)), "{error}");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+}
+
+#[test]
+fn a_damaged_checkpoint_is_refused_with_what_to_do() {
+    let (dataset, config, dir) = (moving_square(20), small_config(&[]), tempfile::tempdir().unwrap());
+    train_until(&config, &dataset, dir.path(), 10).unwrap();
+    let path = dir.path().join("checkpoint.safetensors");
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let error = train(&config, &dataset, dir.path()).unwrap_err().to_string();
+    assert!(
+        error.contains("cannot be gone on from") && error.contains("delete it to start anew"),
+        "{error}"
+    );
+}
+
+#[test]
+fn more_windows_than_there_are_is_refused_with_their_number() {
+    let dir = tempfile::tempdir().unwrap();
+    let error = train(&small_config(&["data.windows=100000"]), &moving_square(20), dir.path())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("100000"), "{error}");
+}
+
+#[test]
+fn a_window_longer_than_every_episode_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let error = train(&small_config(&["model.context=9"]), &moving_square(20), dir.path())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("14") && error.contains("12"), "{error}");
+}
