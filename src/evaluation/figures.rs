@@ -10,11 +10,11 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use self::animation::Animation;
-use self::montage::{Row, Style, montage};
+use self::montage::{Row, Style};
 use super::EvaluationError;
 use super::baselines::Method;
 use super::output::save;
-use crate::frame::{Frame, codec};
+use crate::frame::{Frame, FrameError, codec};
 
 /// A file that was written, and what it shows.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -92,34 +92,17 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
 }
 
 /// The paper's figure 8: predicted frames above the true ones (where known), the inputs below.
-pub fn prediction_panel(sample: &Sample) -> Result<Frame, EvaluationError> {
-    let rows: Vec<Row> = [
-        ("predicted", &sample.predicted, 1),
-        ("ground truth", &sample.truth, 1),
-        ("inputs", &sample.inputs, first_input(sample)),
-    ]
-    .into_iter()
-    .filter(|(_, frames, _)| !frames.is_empty())
-    .map(|(label, frames, first)| Row::in_time(label, frames, first))
-    .collect();
-    Ok(montage(&sample.note, &rows, &style(sample))?)
+pub fn prediction_panel(sample: &Sample) -> Result<Frame, FrameError> {
+    montage::prediction_panel(&sample.note, &sample.inputs, &sample.predicted, &sample.truth)
 }
 
 /// The paper's figures 6 and 7: the frames seen above their reconstruction.
-pub fn reconstruction_panel(sample: &Sample) -> Result<Frame, EvaluationError> {
-    let first = first_input(sample);
+pub fn reconstruction_panel(sample: &Sample) -> Result<Frame, FrameError> {
+    let first = 1 - sample.inputs.len() as i64;
     let rows = [
         Row::in_time("ground truth of the inputs", &sample.inputs, first),
         Row::in_time("reconstructed by the LSTM", &sample.reconstructed, first),
     ];
-    Ok(montage(&sample.note, &rows, &style(sample))?)
-}
-
-fn first_input(sample: &Sample) -> i64 {
-    1 - sample.inputs.len() as i64
-}
-
-fn style(sample: &Sample) -> Style {
-    let frame = sample.inputs.first().or(sample.predicted.first());
-    Style::for_frames_of(frame.map_or(1, Frame::width))
+    let width = sample.inputs.first().map_or(1, Frame::width);
+    montage::montage(&sample.note, &rows, &Style::for_frames_of(width))
 }

@@ -55,6 +55,32 @@ impl Style {
     }
 }
 
+/// What a model predicted, on one sheet like the paper's figure 8: predicted frames, the true ones where they are known
+/// (empty otherwise), the frames seen. Errors: as [`montage`].
+pub fn prediction_sheet(seen: &[Frame], predicted: &[Frame], truth: &[Frame]) -> Result<Frame, FrameError> {
+    prediction_panel("", seen, predicted, truth)
+}
+
+/// As [`prediction_sheet`], below a title.
+pub(super) fn prediction_panel(
+    title: &str,
+    seen: &[Frame],
+    predicted: &[Frame],
+    truth: &[Frame],
+) -> Result<Frame, FrameError> {
+    let rows: Vec<Row> = [
+        ("predicted", predicted, 1),
+        ("ground truth", truth, 1),
+        ("inputs", seen, 1 - seen.len() as i64),
+    ]
+    .into_iter()
+    .filter(|(_, frames, _)| !frames.is_empty())
+    .map(|(label, frames, first)| Row::in_time(label, frames, first))
+    .collect();
+    let width = seen.first().or(predicted.first()).map_or(1, Frame::width);
+    montage(title, &rows, &Style::for_frames_of(width))
+}
+
 /// Puts the rows under each other below a title (none if empty). Frames may differ in size.
 /// Errors: `Size` if there is no frame at all or the image gets too large.
 pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameError> {
