@@ -145,7 +145,11 @@ pub fn table(errors: &[(Variant, Vec<Vec<f64>>)], trial_of: &[usize], bootstrap:
     };
     let trials = Trials::group(trial_of, (0..trial_of.len()).map(of_window));
     let reduction = |means: &[f64], row: usize| {
-        if means[row] > 0.0 { 1.0 - means[0] / means[row] } else { 0.0 }
+        if means[row] > 0.0 {
+            1.0 - means[0] / means[row]
+        } else {
+            0.0
+        }
     };
     let intervals = trials.intervals(bootstrap, |means| {
         let reductions = (0..means.len()).map(|row| reduction(means, row));
@@ -191,7 +195,12 @@ fn judge(rows: &[ActionRow]) -> (bool, String) {
         (Some(truth), Some(other)) => truth.is_below(other),
         _ => false,
     };
-    let labels = |rows: &[&ActionRow]| rows.iter().map(|row| row.variant.label()).collect::<Vec<_>>().join(", ");
+    let labels = |rows: &[&ActionRow]| {
+        rows.iter()
+            .map(|row| row.variant.label())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
     let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others.iter().partition(apart);
     if !unbeaten.is_empty() {
         let finding = format!(
@@ -236,7 +245,10 @@ mod tests {
     fn table_of(levels: &[(Variant, f64)]) -> ActionTable {
         let trial_of: Vec<usize> = (0..60).map(|i| i / 3).collect();
         let noisy = |level: f64| -> Vec<Vec<f64>> {
-            trial_of.iter().map(|&trial| vec![level * (1.0 + 0.1 * (trial as f64).sin()); 2]).collect()
+            trial_of
+                .iter()
+                .map(|&trial| vec![level * (1.0 + 0.1 * (trial as f64).sin()); 2])
+                .collect()
         };
         let errors: Vec<_> = levels.iter().map(|&(variant, level)| (variant, noisy(level))).collect();
         let bootstrap = Bootstrap {
@@ -259,6 +271,10 @@ mod tests {
         assert!((good.rows[1].reduction - 0.5).abs() < 1e-9);
         assert!(!table_of(&all[..3]).conditioning_works);
         let close = table_of(&[all[0], all[1], (Variant::Zeroed, 1.01), all[3]]);
-        assert!(!close.conditioning_works && close.finding.contains("zeroed"), "{}", close.finding);
+        assert!(
+            !close.conditioning_works && close.finding.contains("zeroed"),
+            "{}",
+            close.finding
+        );
     }
 }

@@ -189,7 +189,11 @@ mod tests {
     fn a_panning_scene_is_moved_on() {
         let mut rng = Seed(2).rng();
         let texture: Vec<f32> = (0..96 * 64).map(|_| rng.random()).collect();
-        let at = |time: usize| -> Vec<f32> { (0..64 * 64).map(|i| texture[i / 64 * 96 + 32 - 2 * time + i % 64]).collect() };
+        let at = |time: usize| -> Vec<f32> {
+            (0..64 * 64)
+                .map(|i| texture[i / 64 * 96 + 32 - 2 * time + i % 64])
+                .collect()
+        };
         let inputs: Vec<Vec<f32>> = (0..5).map(at).collect();
         let moved = predict(Method::ConstantShift, &seen(&inputs, &[], 64), 2);
         let copied = predict(Method::CopyLast, &seen(&inputs, &[], 64), 2);

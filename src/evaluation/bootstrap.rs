@@ -52,7 +52,9 @@ impl Trials {
             sums: vec![Vec::new(); known.len()],
         };
         for (trial, row) in trial_of.iter().zip(values) {
-            let Ok(group) = known.binary_search(trial) else { continue };
+            let Ok(group) = known.binary_search(trial) else {
+                continue;
+            };
             let sums = &mut trials.sums[group];
             sums.resize(row.as_ref().len(), 0.0);
             trials.windows[group] += 1.0;
@@ -91,11 +93,7 @@ impl Trials {
     }
 
     /// The interval of each value of `statistic`, a function of the means; none with fewer than two trials.
-    pub fn intervals(
-        &self,
-        bootstrap: &Bootstrap,
-        statistic: impl Fn(&[f64]) -> Vec<f64>,
-    ) -> Option<Vec<Interval>> {
+    pub fn intervals(&self, bootstrap: &Bootstrap, statistic: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Interval>> {
         let count = self.count();
         if count < 2 || bootstrap.samples == 0 {
             return None;

@@ -61,7 +61,11 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
 }
 
 fn described(name: &str, unit: &str) -> String {
-    if unit.is_empty() { name.to_owned() } else { format!("{name} {unit}") }
+    if unit.is_empty() {
+        name.to_owned()
+    } else {
+        format!("{name} {unit}")
+    }
 }
 
 /// The seed of the split to test with: that of the model's training unless another is asked for.

@@ -54,7 +54,9 @@ pub enum EvaluationError {
         wanted: String,
     },
     /// Another split would test on what the model was trained on.
-    #[error("model \"{model}\" was trained on this data set with split seed {trained}; split seed {given} would test it on frames it was trained on")]
+    #[error(
+        "model \"{model}\" was trained on this data set with split seed {trained}; split seed {given} would test it on frames it was trained on"
+    )]
     SplitSeed {
         /// The model's name.
         model: String,
@@ -94,7 +96,9 @@ pub enum EvaluationError {
         split_seed: u64,
     },
     /// A prediction was NaN or infinite.
-    #[error("model \"{model}\" predicted a value that is not a finite number for the window at frame {frame}; its weights are not usable")]
+    #[error(
+        "model \"{model}\" predicted a value that is not a finite number for the window at frame {frame}; its weights are not usable"
+    )]
     NotFinite {
         /// The model's name.
         model: String,

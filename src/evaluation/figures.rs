@@ -74,18 +74,32 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
     };
     for sample in &inputs.samples {
         let panel = codec::encode_png(&prediction_panel(sample)?)?;
-        let caption = format!("Prediction, truth and inputs (the paper's figure 8), {} window", sample.name);
+        let caption = format!(
+            "Prediction, truth and inputs (the paper's figure 8), {} window",
+            sample.name
+        );
         put(format!("prediction-{}.png", sample.name), caption, &panel)?;
     }
     for sample in inputs.samples.iter().filter(|sample| !sample.reconstructed.is_empty()) {
         let panel = codec::encode_png(&reconstruction_panel(sample)?)?;
-        let caption = format!("Reconstruction of the inputs (the paper's figures 6 and 7), {} window", sample.name);
+        let caption = format!(
+            "Reconstruction of the inputs (the paper's figures 6 and 7), {} window",
+            sample.name
+        );
         put(format!("reconstruction-{}.png", sample.name), caption, &panel)?;
     }
     for chart in &inputs.charts {
-        put(chart.file.clone(), chart.caption.clone(), chart::draw(chart)?.as_bytes())?;
+        put(
+            chart.file.clone(),
+            chart.caption.clone(),
+            chart::draw(chart)?.as_bytes(),
+        )?;
     }
-    if let Some(animation) = inputs.animation.as_ref().filter(|animation| !animation.moments.is_empty()) {
+    if let Some(animation) = inputs
+        .animation
+        .as_ref()
+        .filter(|animation| !animation.moments.is_empty())
+    {
         put("prediction.gif".to_owned(), animation.caption(), &animation.encode()?)?;
     }
     Ok(files)

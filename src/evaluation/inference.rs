@@ -49,7 +49,9 @@ pub fn predict(
     match predicted.iter().position(|value| !value.is_finite()) {
         Some(place) => Err(EvaluationError::NotFinite {
             model: loaded.manifest.name.clone(),
-            frame: windows.get(place / window_values).map_or(0, |window| window.first_frame),
+            frame: windows
+                .get(place / window_values)
+                .map_or(0, |window| window.first_frame),
         }),
         None => Ok(predicted),
     }
@@ -63,24 +65,27 @@ pub fn predict_with_ceiling(
 ) -> Result<Predicted, EvaluationError> {
     let spec = loaded.model.spec();
     let frames = predict(loaded, dataset, windows, Told::Truth)?;
-    let truth = model_space(dataset, spec.preprocess, windows, spec.context..spec.context + spec.horizon)?;
+    let truth = model_space(
+        dataset,
+        spec.preprocess,
+        windows,
+        spec.context..spec.context + spec.horizon,
+    )?;
     let targets = Tensor::from_slice(&truth, (windows.len() * spec.horizon, spec.pixels()), &Device::Cpu)?;
     let codec = values(&loaded.model.decode_frames(&loaded.model.encode_frames(&targets)?)?)?;
     Ok(Predicted { frames, truth, codec })
 }
 
 /// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space.
-pub fn reconstruct(
-    loaded: &LoadedModel,
-    dataset: &Dataset,
-    windows: &[Window],
-) -> Result<Vec<f32>, EvaluationError> {
+pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
     let (model, spec) = (&loaded.model, loaded.model.spec());
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
     let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
     let features = model.encode_frames(&frames)?.reshape((batch, context, spec.features))?;
-    let features = model.reconstruct(&features)?.reshape((batch * context, spec.features))?;
+    let features = model
+        .reconstruct(&features)?
+        .reshape((batch * context, spec.features))?;
     values(&model.decode_frames(&features)?)
 }
 

@@ -19,7 +19,11 @@ pub(super) fn render(report: &Report) -> String {
 }
 
 fn write_report(out: &mut String, report: &Report) -> std::fmt::Result {
-    writeln!(out, "# Model `{}` on data set `{}`\n", report.stamp.model, report.stamp.dataset)?;
+    writeln!(
+        out,
+        "# Model `{}` on data set `{}`\n",
+        report.stamp.model, report.stamp.dataset
+    )?;
     headline(out, report)?;
     for set in &report.sets {
         if let Some(scores) = set.outcome.scores() {
@@ -45,7 +49,11 @@ fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
         out,
         "Skill is 1 − MSE / MSE of the best trivial baseline at each step: 1 is perfect, 0 no better than the best of them.\n"
     )?;
-    writeln!(out, "| Test set | Windows | Trials | Skill, mean t+1…t+{} | 95 % interval |", report.model.horizon)?;
+    writeln!(
+        out,
+        "| Test set | Windows | Trials | Skill, mean t+1…t+{} | 95 % interval |",
+        report.model.horizon
+    )?;
     writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
     for SetReport { split, outcome } in &report.sets {
         match outcome {
@@ -58,7 +66,9 @@ fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
                 scores.skill.skill.mean,
                 interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}")),
             )?,
-            Outcome::Skipped { reason } => writeln!(out, "| {} (`{split}`) | – | – | skipped: {reason} | – |", title(split))?,
+            Outcome::Skipped { reason } => {
+                writeln!(out, "| {} (`{split}`) | – | – | skipped: {reason} | – |", title(split))?
+            }
         }
     }
     Ok(())
@@ -92,13 +102,28 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
     skill_table(out, scores)?;
     let methods = &scores.methods;
     table(out, "MSE per pixel, ×10⁻⁴", methods, |row| Some(&row.mse), in_mse_units)?;
-    table(out, "PSNR, dB", methods, |row| Some(&row.psnr_db), |value| format!("{value:.2}"))?;
-    table(out, "SSIM", methods, |row| Some(&row.ssim), |value| format!("{value:.4}"))?;
+    table(
+        out,
+        "PSNR, dB",
+        methods,
+        |row| Some(&row.psnr_db),
+        |value| format!("{value:.2}"),
+    )?;
+    table(
+        out,
+        "SSIM",
+        methods,
+        |row| Some(&row.ssim),
+        |value| format!("{value:.4}"),
+    )?;
     if methods.iter().any(|row| row.mover_mse.is_some()) {
         let name = "MSE on the pixels of moving robots, ×10⁻⁴";
         table(out, name, methods, |row| row.mover_mse.as_ref(), in_mse_units)?;
     } else {
-        writeln!(out, "No error inside a mask: the data has no masks, or nobody moves in view.\n")?;
+        writeln!(
+            out,
+            "No error inside a mask: the data has no masks, or nobody moves in view.\n"
+        )?;
     }
     writeln!(
         out,
@@ -169,7 +194,10 @@ fn row(out: &mut String, label: &str, curve: &Curve, format: impl Fn(f64) -> Str
 fn action_table(out: &mut String, table: &ActionTable) -> std::fmt::Result {
     writeln!(out, "\n### Does the action matter?\n")?;
     writeln!(out, "{}\n", table.finding)?;
-    writeln!(out, "| Told | MSE, ×10⁻⁴ | 95 % interval | True actions lower it by | 95 % interval |")?;
+    writeln!(
+        out,
+        "| Told | MSE, ×10⁻⁴ | 95 % interval | True actions lower it by | 95 % interval |"
+    )?;
     writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
     let percent = |value: f64| format!("{:.1} %", 100.0 * value);
     for (place, row) in table.rows.iter().enumerate() {
@@ -178,9 +206,16 @@ fn action_table(out: &mut String, table: &ActionTable) -> std::fmt::Result {
         let (reduction, reduction_interval) = if place == 0 {
             ("–".to_owned(), "–".to_owned())
         } else {
-            (percent(row.reduction), interval(row.reduction_interval.as_ref(), percent))
+            (
+                percent(row.reduction),
+                interval(row.reduction_interval.as_ref(), percent),
+            )
         };
-        writeln!(out, "| {} | {mse} | {mse_interval} | {reduction} | {reduction_interval} |", row.variant.label())?;
+        writeln!(
+            out,
+            "| {} | {mse} | {mse_interval} | {reduction} | {reduction_interval} |",
+            row.variant.label()
+        )?;
     }
     Ok(())
 }
@@ -190,7 +225,10 @@ fn figures(out: &mut String, report: &Report) -> std::fmt::Result {
         return Ok(());
     }
     writeln!(out, "\n## Pictures\n")?;
-    writeln!(out, "Windows are chosen by the model's error alone: the median, the best and the worst.")?;
+    writeln!(
+        out,
+        "Windows are chosen by the model's error alone: the median, the best and the worst."
+    )?;
     for figure in &report.figures {
         writeln!(out, "\n![{0}]({1})\n\n{0}.", figure.caption, figure.file)?;
     }
@@ -220,9 +258,17 @@ fn model(out: &mut String, model: &ModelSummary) -> std::fmt::Result {
         model.frame_width_px, model.frame_height_px, model.frame_period_s, model.context, model.horizon
     )?;
     writeln!(out, "| conditioning | {} |", model.conditioning)?;
-    writeln!(out, "| intensities | {} |", if model.inverted { "inverted" } else { "as they are" })?;
+    writeln!(
+        out,
+        "| intensities | {} |",
+        if model.inverted { "inverted" } else { "as they are" }
+    )?;
     writeln!(out, "| parameters | {} |", grouped(model.parameters))?;
-    writeln!(out, "| multiply–adds per predicted frame | {} |", grouped(model.multiply_adds_per_frame))?;
+    writeln!(
+        out,
+        "| multiply–adds per predicted frame | {} |",
+        grouped(model.multiply_adds_per_frame)
+    )?;
     writeln!(
         out,
         "| trained on | {} windows of `{}` (`{}`) |",
@@ -247,13 +293,21 @@ fn stamp(out: &mut String, stamp: &Stamp) -> std::fmt::Result {
     let commit = stamp.program.git_commit.as_deref().unwrap_or("unknown");
     writeln!(out, "\n## Stamp\n")?;
     writeln!(out, "| | |\n| --- | --- |")?;
-    writeln!(out, "| data set | `{}`, content `{}` |", stamp.dataset, stamp.dataset_content_hash)?;
+    writeln!(
+        out,
+        "| data set | `{}`, content `{}` |",
+        stamp.dataset, stamp.dataset_content_hash
+    )?;
     writeln!(out, "| split seed | {} |", stamp.split_seed.0)?;
     writeln!(out, "| model | `{}`, weights `{}` |", stamp.model, stamp.model_sha256)?;
     if let Some((name, hash)) = &stamp.twin {
         writeln!(out, "| unconditioned twin | `{name}`, weights `{hash}` |")?;
     }
-    writeln!(out, "| program | foreframe {}, commit {commit} |", stamp.program.version)?;
+    writeln!(
+        out,
+        "| program | foreframe {}, commit {commit} |",
+        stamp.program.version
+    )?;
     writeln!(out, "| command | `{}` |", stamp.command)?;
     writeln!(
         out,
@@ -265,5 +319,9 @@ fn stamp(out: &mut String, stamp: &Stamp) -> std::fmt::Result {
         stamp.bootstrap_samples,
         stamp.seed.0
     )?;
-    writeln!(out, "| took | {:.1} s on {}, {} threads |", stamp.wall_time_s, stamp.cpu, stamp.threads)
+    writeln!(
+        out,
+        "| took | {:.1} s on {}, {} threads |",
+        stamp.wall_time_s, stamp.cpu, stamp.threads
+    )
 }

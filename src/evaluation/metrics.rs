@@ -132,8 +132,7 @@ fn steps(windows: &[WindowScores], row: usize) -> usize {
 }
 
 fn mean_curve(windows: &[WindowScores], row: usize, value: impl Fn(&FrameScore) -> f64) -> Curve {
-    let mean_at =
-        |step: usize| windows.iter().map(|w| value(&w.frames[row][step])).sum::<f64>() / windows.len() as f64;
+    let mean_at = |step: usize| windows.iter().map(|w| value(&w.frames[row][step])).sum::<f64>() / windows.len() as f64;
     Curve::new((0..steps(windows, row)).map(mean_at).collect())
 }
 

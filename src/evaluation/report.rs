@@ -219,7 +219,10 @@ impl SetScores {
         bootstrap: &Bootstrap,
     ) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
-        let own_space = Trials::group(&trial_of, windows.iter().map(|window| window.model_space_mse.as_slice()));
+        let own_space = Trials::group(
+            &trial_of,
+            windows.iter().map(|window| window.model_space_mse.as_slice()),
+        );
         Self {
             windows: windows.len(),
             windows_available,
@@ -250,7 +253,11 @@ impl SampleWindow {
     fn choose(windows: &[WindowScores]) -> Vec<Self> {
         let mut ranked: Vec<&WindowScores> = windows.iter().collect();
         ranked.sort_by(|a, b| a.model_mse().total_cmp(&b.model_mse()));
-        let places = [("median", ranked.len() / 2), ("best", 0), ("worst", ranked.len().saturating_sub(1))];
+        let places = [
+            ("median", ranked.len() / 2),
+            ("best", 0),
+            ("worst", ranked.len().saturating_sub(1)),
+        ];
         places
             .into_iter()
             .filter_map(|(rank, place)| {

@@ -23,7 +23,9 @@ pub fn figure_inputs(
 ) -> Result<FigureInputs, EvaluationError> {
     let mut inputs = FigureInputs::default();
     for split in [Split::Test, Split::TestUnseen] {
-        let Some(scores) = report.scores(split.name()) else { continue };
+        let Some(scores) = report.scores(split.name()) else {
+            continue;
+        };
         if inputs.charts.is_empty() {
             for sample in &scores.samples {
                 inputs.samples.push(show(loaded, dataset, sample)?);
@@ -59,14 +61,23 @@ fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Resul
 
 fn frames(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, EvaluationError> {
     let spec = loaded.model.spec();
-    let frame = |values| spec.preprocess.frame_from(values, spec.frame_width_px, spec.frame_height_px);
+    let frame = |values| {
+        spec.preprocess
+            .frame_from(values, spec.frame_width_px, spec.frame_height_px)
+    };
     let frames = values.chunks_exact(spec.pixels()).map(frame);
     Ok(frames.collect::<Result<_, _>>()?)
 }
 
 fn camera_frames(dataset: &Dataset, frames: std::ops::Range<usize>) -> Result<Vec<Frame>, EvaluationError> {
     let info = dataset.info();
-    let frame = |frame| Frame::new(info.frame_width_px, info.frame_height_px, dataset.pixels(frame).to_vec());
+    let frame = |frame| {
+        Frame::new(
+            info.frame_width_px,
+            info.frame_height_px,
+            dataset.pixels(frame).to_vec(),
+        )
+    };
     Ok(frames.map(frame).collect::<Result<_, _>>()?)
 }
 
@@ -91,7 +102,9 @@ fn animate(
     scores: &SetScores,
 ) -> Result<Option<Animation>, EvaluationError> {
     let spec = loaded.model.spec();
-    let Some(median) = scores.samples.first() else { return Ok(None) };
+    let Some(median) = scores.samples.first() else {
+        return Ok(None);
+    };
     let shape = WindowShape {
         context: spec.context,
         horizon: spec.horizon,

@@ -91,11 +91,23 @@ mod tests {
         (0..30)
             .map(|i| {
                 let difficulty = 1.0 + (i % 7) as f64;
-                let errors = [model(difficulty)].into_iter().chain((1..7).map(|row| 0.1 * f64::from(row) * difficulty));
+                let errors = [model(difficulty)]
+                    .into_iter()
+                    .chain((1..7).map(|row| 0.1 * f64::from(row) * difficulty));
                 WindowScores {
                     episode: i / 3,
                     first_frame: i,
-                    frames: errors.map(|mse| vec![FrameScore { mse, ..FrameScore::default() }; 2]).collect(),
+                    frames: errors
+                        .map(|mse| {
+                            vec![
+                                FrameScore {
+                                    mse,
+                                    ..FrameScore::default()
+                                };
+                                2
+                            ]
+                        })
+                        .collect(),
                     model_space_mse: vec![0.0; 2],
                 }
             })
@@ -112,7 +124,13 @@ mod tests {
 
     #[test]
     fn a_model_that_copies_the_last_frame_has_none() {
-        assert!(skill(&windows(|difficulty| 0.1 * difficulty), &BOOTSTRAP).skill.mean.abs() < 1e-12);
+        assert!(
+            skill(&windows(|difficulty| 0.1 * difficulty), &BOOTSTRAP)
+                .skill
+                .mean
+                .abs()
+                < 1e-12
+        );
         assert!(skill(&windows(|difficulty| 0.2 * difficulty), &BOOTSTRAP).skill.mean < 0.0);
     }
 

@@ -17,9 +17,17 @@ fn scene(episodes: usize, side: u32, period_s: f64) -> Dataset {
     let data = (0..episodes).map(|episode| {
         let speed = (episode % 3) as u32;
         let inside = |frame: u32, i: u32| (i / side) / 4 == 1 && (i % side + side - (speed * frame) % side) % side < 4;
-        let pixel = |frame: u32, i: u32| if inside(frame, i) { 20 } else { (120 + 4 * (i % side)) as u8 };
+        let pixel = |frame: u32, i: u32| {
+            if inside(frame, i) {
+                20
+            } else {
+                (120 + 4 * (i % side)) as u8
+            }
+        };
         let each = |value: &dyn Fn(u32, u32) -> u8| -> Vec<u8> {
-            (0..FRAMES).flat_map(|frame| (0..side * side).map(move |i| value(frame, i))).collect()
+            (0..FRAMES)
+                .flat_map(|frame| (0..side * side).map(move |i| value(frame, i)))
+                .collect()
         };
         EpisodeData {
             pixels: each(&pixel),
@@ -180,9 +188,15 @@ fn report_and_figures_are_written_and_read_back() {
     ];
     assert_eq!(written, expected.map(str::to_owned).into());
     let read: Report = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
-    assert_eq!(read.to_markdown(), std::fs::read_to_string(out.join("report.md")).unwrap());
+    assert_eq!(
+        read.to_markdown(),
+        std::fs::read_to_string(out.join("report.md")).unwrap()
+    );
     let again = evaluation::prepare(&out).unwrap_err().to_string();
-    assert!(again.ends_with("exists and is not empty; name a new directory"), "{again}");
+    assert!(
+        again.ends_with("exists and is not empty; name a new directory"),
+        "{again}"
+    );
 }
 
 #[test]
@@ -217,7 +231,10 @@ fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
         max_windows: 0,
         ..config()
     };
-    assert_eq!(refusal(&model, &dataset, &none), "the number of windows is 0; it must be at least 1");
+    assert_eq!(
+        refusal(&model, &dataset, &none),
+        "the number of windows is 0; it must be at least 1"
+    );
 }
 
 #[test]

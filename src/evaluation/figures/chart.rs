@@ -64,14 +64,18 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
         .draw()
         .map_err(told)?;
     for (method, values) in &chart.series {
-        let points: Vec<(f64, f64)> = (1..).zip(values).map(|(step, value)| (f64::from(step), shown(*value, low))).collect();
+        let points: Vec<(f64, f64)> = (1..)
+            .zip(values)
+            .map(|(step, value)| (f64::from(step), shown(*value, low)))
+            .collect();
         let color = color(*method);
         let style = color.stroke_width(if *method == Method::Model { 4 } else { 2 });
         if *method == Method::CodecOnly {
             plot.draw_series(DashedLineSeries::new(points.iter().copied(), 6, 5, style))
                 .map_err(told)?;
         } else {
-            plot.draw_series(LineSeries::new(points.iter().copied(), style)).map_err(told)?;
+            plot.draw_series(LineSeries::new(points.iter().copied(), style))
+                .map_err(told)?;
         }
         plot.draw_series(points.iter().map(|&point| Circle::new(point, 4, color.filled())))
             .map_err(told)?;
@@ -84,9 +88,11 @@ fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
         let y = 40 + place * LEGEND_LINE_PX;
         let color = color(*method);
         let style = color.stroke_width(if *method == Method::Model { 4 } else { 2 });
-        area.draw(&PathElement::new(vec![(8, y), (40, y)], style)).map_err(told)?;
+        area.draw(&PathElement::new(vec![(8, y), (40, y)], style))
+            .map_err(told)?;
         area.draw(&Circle::new((24, y), 4, color.filled())).map_err(told)?;
-        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 16))).map_err(told)?;
+        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 16)))
+            .map_err(told)?;
     }
     Ok(())
 }
@@ -102,10 +108,21 @@ fn shown(value: f64, low: f64) -> f64 {
 
 /// Bounds of the axis, with some room; a perfect or still scene gives 0 everywhere.
 fn bounds(chart: &Chart) -> (f64, f64) {
-    let values = || chart.series.iter().flat_map(|(_, values)| values).map(|value| value / UNIT).filter(|v| *v > 0.0);
+    let values = || {
+        chart
+            .series
+            .iter()
+            .flat_map(|(_, values)| values)
+            .map(|value| value / UNIT)
+            .filter(|v| *v > 0.0)
+    };
     let low = values().fold(f64::INFINITY, f64::min);
     let high = values().fold(0.0, f64::max);
-    if high > 0.0 { (low / 1.5, high * 1.5) } else { (0.1, 1.0) }
+    if high > 0.0 {
+        (low / 1.5, high * 1.5)
+    } else {
+        (0.1, 1.0)
+    }
 }
 
 /// Colours that stay apart for most kinds of colour blindness (Okabe & Ito 2008).

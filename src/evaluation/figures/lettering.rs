@@ -51,7 +51,10 @@ impl Canvas {
     /// Writes a line of text from its top left corner. Letters that the font lacks stay blank.
     pub fn write(&mut self, (left, top): (usize, usize), text: &str, scale: usize, ink: u8) {
         for (place, letter) in text.chars().enumerate() {
-            let glyph = BASIC_FONTS.get(letter).or_else(|| LATIN_FONTS.get(letter)).unwrap_or_default();
+            let glyph = BASIC_FONTS
+                .get(letter)
+                .or_else(|| LATIN_FONTS.get(letter))
+                .unwrap_or_default();
             for (row, bits) in glyph.into_iter().enumerate() {
                 for column in (0..LETTER_PX).filter(|column| bits >> column & 1 == 1) {
                     let (x, y) = (left + (place * LETTER_PX + column) * scale, top + row * scale);

@@ -26,8 +26,17 @@ impl Row {
     /// Consecutive frames captioned `t-1`, `t`, `t+1`, …; `first` is the first one's distance from t.
     #[must_use]
     pub fn in_time(label: &str, frames: &[Frame], first: i64) -> Self {
-        let caption = |step: i64| if step == 0 { "t".to_owned() } else { format!("t{step:+}") };
-        let cells = frames.iter().zip(first..).map(|(frame, step)| (caption(step), frame.clone()));
+        let caption = |step: i64| {
+            if step == 0 {
+                "t".to_owned()
+            } else {
+                format!("t{step:+}")
+            }
+        };
+        let cells = frames
+            .iter()
+            .zip(first..)
+            .map(|(frame, step)| (caption(step), frame.clone()));
         Self {
             label: label.to_owned(),
             cells: cells.collect(),
@@ -86,7 +95,10 @@ pub(super) fn prediction_panel(
 pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameError> {
     let cells = || rows.iter().flat_map(|row| &row.cells);
     let cell_width = cells().map(|(_, frame)| frame.width() as usize).max().unwrap_or(0) * style.scale;
-    let widest_caption = cells().map(|(caption, _)| width_px(caption, LETTER_SCALE)).max().unwrap_or(0);
+    let widest_caption = cells()
+        .map(|(caption, _)| width_px(caption, LETTER_SCALE))
+        .max()
+        .unwrap_or(0);
     let column = cell_width.max(widest_caption) + GAP_PX;
     let columns = rows.iter().map(|row| row.cells.len()).max().unwrap_or(0);
     let headings = rows.iter().map(|row| row.label.as_str()).chain([title]);
@@ -116,8 +128,18 @@ pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameE
 
 fn row_height(row: &Row, style: &Style, line: usize) -> usize {
     let heading = if row.label.is_empty() { 0 } else { line };
-    let frames = row.cells.iter().map(|(_, frame)| frame.height() as usize).max().unwrap_or(0) * style.scale;
-    let captions = if row.cells.iter().all(|(caption, _)| caption.is_empty()) { 0 } else { line };
+    let frames = row
+        .cells
+        .iter()
+        .map(|(_, frame)| frame.height() as usize)
+        .max()
+        .unwrap_or(0)
+        * style.scale;
+    let captions = if row.cells.iter().all(|(caption, _)| caption.is_empty()) {
+        0
+    } else {
+        line
+    };
     heading + frames + captions + GAP_PX
 }
 
@@ -126,7 +148,13 @@ fn draw_row(canvas: &mut Canvas, row: &Row, style: &Style, (mut top, column): (u
         canvas.write((MARGIN_PX, top), &row.label, LETTER_SCALE, INK);
         top += height_px(LETTER_SCALE) + GAP_PX;
     }
-    let frames = row.cells.iter().map(|(_, frame)| frame.height() as usize).max().unwrap_or(0) * style.scale;
+    let frames = row
+        .cells
+        .iter()
+        .map(|(_, frame)| frame.height() as usize)
+        .max()
+        .unwrap_or(0)
+        * style.scale;
     for (place, (caption, frame)) in row.cells.iter().enumerate() {
         let left = MARGIN_PX + place * column;
         draw_frame(canvas, frame, style, (left, top));
@@ -136,12 +164,21 @@ fn draw_row(canvas: &mut Canvas, row: &Row, style: &Style, (mut top, column): (u
 }
 
 fn draw_frame(canvas: &mut Canvas, frame: &Frame, style: &Style, (left, top): (usize, usize)) {
-    let (width, height) = (frame.width() as usize * style.scale, frame.height() as usize * style.scale);
-    let lines: Vec<usize> = (1..=style.grid_lines).map(|line| line * width / (style.grid_lines + 1)).collect();
+    let (width, height) = (
+        frame.width() as usize * style.scale,
+        frame.height() as usize * style.scale,
+    );
+    let lines: Vec<usize> = (1..=style.grid_lines)
+        .map(|line| line * width / (style.grid_lines + 1))
+        .collect();
     for y in 0..height {
         for x in 0..width {
             let value = frame.pixels()[y / style.scale * frame.width() as usize + x / style.scale];
-            let drawn = if lines.contains(&x) { toward_contrast(value) } else { value };
+            let drawn = if lines.contains(&x) {
+                toward_contrast(value)
+            } else {
+                value
+            };
             canvas.set(left + x, top + y, drawn);
         }
     }
