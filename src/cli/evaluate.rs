@@ -1,0 +1,112 @@
+//! `foreframe evaluate`
+
+use std::path::PathBuf;
+
+use serde_json::{Map, Value, json};
+
+use super::{CliError, command_line, load_model, progress::Progress, say};
+use crate::dataset::Dataset;
+use crate::evaluation::{self, EvaluateConfig, EvaluationError, Report, Stage};
+use crate::registry;
+use crate::types::Seed;
+
+/// Measure a model on held-out trials: report, figures, GIF.
+///
+/// Two test sets: trials that training never saw, and start/goal pairs and controller gains that it never saw. The skill is
+/// the share of the best trivial baseline's error that the model takes away.
+#[derive(clap::Args)]
+#[command(after_help = "Example: foreframe evaluate --model paper --dataset data/static-observer --out reports/paper")]
+pub(super) struct Args {
+    /// A model's name or directory
+    #[arg(long)]
+    model: String,
+    /// The data set's directory
+    #[arg(long, value_name = "DIR")]
+    dataset: PathBuf,
+    /// The directory to write report.md, report.json and figures into [default: reports/MODEL]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// An unconditioned model of the same budget, for the table that tells whether the action matters
+    #[arg(long, value_name = "MODEL")]
+    twin: Option<String>,
+    /// Windows of each test set at most, spread evenly over its trials
+    #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
+    windows: usize,
+    /// Resamples of the trials for the intervals
+    #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples)]
+    resamples: usize,
+    /// Seed of the resamples and the shuffled actions
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Write the scores into the model's manifest too
+    #[arg(long)]
+    record: bool,
+    /// Where models are looked for by name
+    #[arg(long, value_name = "DIR", default_value = "models")]
+    models: PathBuf,
+}
+
+pub(super) fn run(args: &Args) -> Result<(), CliError> {
+    let (model_dir, loaded) = load_model(&args.model, &args.models)?;
+    let twin = args.twin.as_deref().map(|twin| load_model(twin, &args.models)).transpose()?;
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
+    evaluation::prepare(&out)?;
+    let dataset = Dataset::open(&args.dataset).map_err(CliError::failed)?;
+    let config = EvaluateConfig {
+        max_windows: args.windows,
+        bootstrap_samples: args.resamples,
+        seed: Seed(args.seed),
+        twin: twin.as_ref().map(|(_, twin)| twin),
+        command: command_line(),
+        ..EvaluateConfig::default()
+    };
+    let progress = Progress::new("windows");
+    let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
+        let what = match now.stage {
+            Stage::Scores => "scores",
+            Stage::Actions => "actions",
+        };
+        progress.update(now.done as u64, now.total as u64, || format!("{} {what}", now.split));
+    })?;
+    progress.finish();
+    let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
+    let [markdown, _] = evaluation::write(&out, &mut report, &inputs)?;
+    if args.record {
+        registry::record_metrics(&model_dir, metrics(&report))?;
+    }
+    for (split, score) in metrics(&report).as_object().into_iter().flatten() {
+        say(format!("{split}: {score}"))?;
+    }
+    say(markdown.display())
+}
+
+/// The report's headline, for the manifest.
+fn metrics(report: &Report) -> Value {
+    let mut metrics = Map::new();
+    for set in &report.sets {
+        let Some(scores) = set.outcome.scores() else { continue };
+        let Some(model) = scores.methods.first() else { continue };
+        let interval = scores.skill.mean_interval.as_ref();
+        let summary = json!({
+            "skill": scores.skill.skill.mean,
+            "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
+            "mse": model.mse.mean,
+            "psnr_db": model.psnr_db.mean,
+            "ssim": model.ssim.mean,
+            "windows": scores.windows,
+            "trials": scores.trials,
+            "dataset_content_hash": report.stamp.dataset_content_hash,
+        });
+        metrics.insert(set.split.clone(), summary);
+    }
+    Value::Object(metrics)
+}
+
+impl From<EvaluationError> for CliError {
+    fn from(error: EvaluationError) -> Self {
+        match error {
+            EvaluationError::Setting { .. } | EvaluationError::OutputExists(_) => Self::Usage(error.to_string()),
+            other => Self::failed(other),
+        }
+    }
+}

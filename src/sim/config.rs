@@ -1,0 +1,97 @@
+//! Settings of a world and their ranges.
+
+use serde::{Deserialize, Serialize};
+
+use super::{SimError, arena};
+use crate::frame::MAX_SIDE_PX;
+
+/// Tb1's camera.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct CameraConfig {
+    /// Height of the pinhole above the floor, in metres.
+    pub height_m: f64,
+    /// How far the camera looks down from the horizontal, in radians.
+    pub tilt_down_rad: f64,
+    /// Angle between the left and the right edge of the image, in radians.
+    pub horizontal_fov_rad: f64,
+    /// Standard deviation of the sensor's Gaussian noise; 1 is the step from black to white.
+    pub noise_std: f64,
+}
+
+impl Default for CameraConfig {
+    fn default() -> Self {
+        Self {
+            height_m: 0.6,
+            tilt_down_rad: 0.2,
+            horizontal_fov_rad: std::f64::consts::FRAC_PI_3,
+            noise_std: 1.0 / 255.0,
+        }
+    }
+}
+
+/// How a world is run and seen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct WorldConfig {
+    /// Width of a frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of a frame in pixels.
+    pub frame_height_px: u32,
+    /// From one frame to the next, in seconds.
+    pub frame_period_s: f64,
+    /// Tb1's camera.
+    pub camera: CameraConfig,
+    /// A trial has the frames from 0 up to, but without, this many seconds.
+    pub max_duration_s: f64,
+}
+
+impl Default for WorldConfig {
+    fn default() -> Self {
+        Self {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            frame_period_s: 0.2,
+            camera: CameraConfig::default(),
+            max_duration_s: 8.0,
+        }
+    }
+}
+
+impl WorldConfig {
+    /// Errors: `FrameSize` or `Setting` at the first field that is out of range, with its range.
+    pub fn validate(&self) -> Result<(), SimError> {
+        let sides = 1..=MAX_SIDE_PX;
+        if !sides.contains(&self.frame_width_px) || !sides.contains(&self.frame_height_px) {
+            return Err(SimError::FrameSize {
+                width: self.frame_width_px,
+                height: self.frame_height_px,
+            });
+        }
+        let camera = &self.camera;
+        let ceiling = f64::from(arena::HEIGHT_M) - 0.1;
+        in_range("frame_period_s", self.frame_period_s, 0.01, 2.0)?;
+        in_range("camera.height_m", camera.height_m, 0.45, ceiling)?;
+        in_range("camera.tilt_down_rad", camera.tilt_down_rad, -1.2, 1.2)?;
+        in_range("camera.horizontal_fov_rad", camera.horizontal_fov_rad, 0.1, 2.8)?;
+        in_range("camera.noise_std", camera.noise_std, 0.0, 1.0)?;
+        in_range("max_duration_s", self.max_duration_s, 2.0 * self.frame_period_s, 3600.0)
+    }
+
+    /// Frames of a trial that is not ended before its time, the first included.
+    #[must_use]
+    pub fn frame_limit(&self) -> u64 {
+        (self.max_duration_s / self.frame_period_s + 1e-6).floor() as u64
+    }
+}
+
+fn in_range(name: &'static str, value: f64, least: f64, most: f64) -> Result<(), SimError> {
+    if value.is_finite() && (least..=most).contains(&value) {
+        return Ok(());
+    }
+    Err(SimError::Setting {
+        name,
+        value,
+        rule: format!("a finite number from {least} to {most}"),
+    })
+}

@@ -1,0 +1,92 @@
+//! What the robots look like: a few upright cylinders and boxes each.
+
+use super::cast::{Block, UprightCylinder};
+
+/// A simple solid.
+pub(super) enum Solid {
+    Cylinder(UprightCylinder),
+    Block(Block),
+}
+
+/// A solid with its gray, 0…1.
+pub(super) struct Part {
+    pub(super) solid: Solid,
+    pub(super) albedo: f32,
+}
+
+/// A robot's body.
+pub(super) struct Look {
+    /// Of its round base, which is what bumps into things.
+    pub(super) radius_m: f32,
+    pub(super) height_m: f32,
+    pub(super) parts: &'static [Part],
+}
+
+const fn cylinder(radius: f32, bottom: f32, top: f32, albedo: f32) -> Part {
+    Part {
+        solid: Solid::Cylinder(UprightCylinder { radius, bottom, top }),
+        albedo,
+    }
+}
+
+const fn block(middle: [f32; 3], half: [f32; 3], albedo: f32) -> Part {
+    Part {
+        solid: Solid::Block(Block { middle, half }),
+        albedo,
+    }
+}
+
+/// Dark base and mast, a light plate on top, a light sensor at the front.
+pub(super) static TURTLEBOT: Look = Look {
+    radius_m: 0.177,
+    height_m: 0.42,
+    parts: &[
+        cylinder(0.177, 0.015, 0.13, 0.10),
+        cylinder(0.13, 0.13, 0.36, 0.20),
+        cylinder(0.17, 0.36, 0.42, 0.95),
+        block([0.14, 0.0, 0.27], [0.03, 0.09, 0.035], 0.85),
+    ],
+};
+
+/// A light one with a dark plate.
+static PALE: Look = Look {
+    radius_m: 0.177,
+    height_m: 0.42,
+    parts: &[
+        cylinder(0.177, 0.015, 0.13, 0.80),
+        cylinder(0.13, 0.13, 0.36, 0.65),
+        cylinder(0.17, 0.36, 0.42, 0.12),
+        block([0.14, 0.0, 0.27], [0.03, 0.09, 0.035], 0.15),
+    ],
+};
+
+/// A low cart with a box on it.
+static CART: Look = Look {
+    radius_m: 0.2,
+    height_m: 0.36,
+    parts: &[
+        cylinder(0.2, 0.015, 0.12, 0.15),
+        block([0.0, 0.0, 0.24], [0.13, 0.11, 0.12], 0.75),
+    ],
+};
+
+/// A tall dark column on wheels.
+static TALL: Look = Look {
+    radius_m: 0.18,
+    height_m: 0.8,
+    parts: &[
+        cylinder(0.18, 0.015, 0.12, 0.5),
+        cylinder(0.1, 0.12, 0.62, 0.12),
+        cylinder(0.14, 0.62, 0.8, 0.6),
+    ],
+};
+
+/// Tb2 is a TurtleBot; those after it differ.
+pub(super) fn of_mover(index: usize) -> &'static Look {
+    match index {
+        0 => &TURTLEBOT,
+        1 => &PALE,
+        2 => &CART,
+        _ => &TALL,
+    }
+}

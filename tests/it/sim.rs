@@ -1,0 +1,394 @@
+//! The simulated world against closed forms, and its promises: seeds, bounds, collisions, refusals.
+
+use foreframe::sim::camera::Camera;
+use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
+use foreframe::sim::{
+    Environment, Observation, PlanarPose, Scenario, SimError, TrialParameters, World, WorldConfig, action_channels,
+    arena, robot, state_channels,
+};
+use foreframe::types::{Action, Seed};
+
+fn action(linear: f32, angular: f32) -> Action {
+    Action::try_from(vec![linear, angular]).unwrap()
+}
+
+fn small() -> WorldConfig {
+    WorldConfig {
+        frame_width_px: 16,
+        frame_height_px: 16,
+        ..WorldConfig::default()
+    }
+}
+
+/// A moving-observer trial in which Tb1 begins at that pose.
+fn world_from(x_m: f32, y_m: f32, heading_rad: f32, config: &WorldConfig) -> World {
+    let mut parameters = TrialParameters::draw(Scenario::MovingObserver, Seed(3), 0);
+    parameters.observer = PlanarPose { x_m, y_m, heading_rad };
+    World::from_parameters(parameters, config).unwrap()
+}
+
+fn whole_trial(scenario: Scenario, seed: Seed, trial: u64, config: &WorldConfig) -> (Vec<Observation>, World) {
+    let mut world = World::new(scenario, config, seed, trial).unwrap();
+    let mut seen = vec![world.observe()];
+    loop {
+        let step = world.step(&world.policy_action()).unwrap();
+        seen.push(step.observation);
+        if step.terminated || step.truncated {
+            return (seen, world);
+        }
+    }
+}
+
+#[test]
+fn constant_wheel_speeds_follow_the_exact_arc() {
+    let mut world = world_from(1.2, -0.9, 0.3, &small());
+    let (linear, angular) = (0.4f64, 0.7f64);
+    // Half a second is enough to reach the speeds; the arc is measured from there.
+    for _ in 0..5 {
+        world.step(&action(linear as f32, angular as f32)).unwrap();
+    }
+    let from = world.observer_pose();
+    for _ in 0..10 {
+        world.step(&action(linear as f32, angular as f32)).unwrap();
+    }
+    let to = world.observer_pose();
+    // A unicycle at constant speeds, by hand: circle of radius v/ω.
+    let turned = angular * 2.0;
+    let heading = f64::from(from.heading_rad);
+    let radius = linear / angular;
+    let x = f64::from(from.x_m) + radius * ((heading + turned).sin() - heading.sin());
+    let y = f64::from(from.y_m) - radius * ((heading + turned).cos() - heading.cos());
+    assert!((f64::from(to.x_m) - x).abs() < 1e-3, "{} {x}", to.x_m);
+    assert!((f64::from(to.y_m) - y).abs() < 1e-3, "{} {y}", to.y_m);
+    assert!(f64::from(robot::wrap(to.heading_rad - (heading + turned) as f32)).abs() < 1e-3);
+}
+
+#[test]
+fn wheels_reach_their_speed_at_their_acceleration_limit() {
+    let mut world = world_from(1.0, 0.0, 0.0, &small());
+    world.step(&action(0.6, 0.0)).unwrap();
+    let speed = world.observe().state.as_slice()[4];
+    assert!((speed - robot::MAX_RIM_ACCELERATION_M_S2 * 0.2).abs() < 1e-3, "{speed}");
+}
+
+#[test]
+fn odometry_agrees_with_the_truth_until_wheels_slip() {
+    let mut world = world_from(1.0, 0.0, 0.2, &small());
+    for _ in 0..10 {
+        world.step(&action(0.3, -0.4)).unwrap();
+    }
+    let (state, truth) = (world.observe().state, world.observer_pose());
+    let [x, y, cos, sin, linear, angular] = state.as_slice() else {
+        panic!("six components")
+    };
+    assert!((x - truth.x_m).abs() < 1e-3 && (y - truth.y_m).abs() < 1e-3);
+    assert!((sin.atan2(*cos) - truth.heading_rad).abs() < 1e-3);
+    assert!((linear - 0.3).abs() < 1e-4 && (angular + 0.4).abs() < 1e-4);
+}
+
+#[test]
+fn a_wall_stops_the_robot_while_its_wheels_go_on() {
+    let mut world = world_from(4.3, 1.2, 0.0, &small());
+    let mut least = 1.0f32;
+    for _ in 0..15 {
+        least = least.min(world.step(&action(0.5, 0.0)).unwrap().reward);
+    }
+    let truth = world.observer_pose();
+    let reach = arena::LENGTH_M - 0.177;
+    assert!((truth.x_m - reach).abs() < 0.02, "{} {reach}", truth.x_m);
+    assert!(world.observe().state.as_slice()[0] > truth.x_m + 0.3);
+    assert!(least < 0.0, "bumping costs: {least}");
+}
+
+#[test]
+fn a_pillar_stops_the_robot() {
+    let pillar = arena::PILLARS[1];
+    let [x, y] = pillar.position_m;
+    let mut world = world_from(x - 0.9, y, 0.0, &small());
+    for _ in 0..15 {
+        world.step(&action(0.5, 0.0)).unwrap();
+        let apart = arena::distance(arena::position(world.observer_pose()), [x, y]);
+        assert!(apart > pillar.radius_m + 0.177 - 0.02, "{apart}");
+    }
+}
+
+#[test]
+fn robots_never_drive_through_each_other() {
+    for trial in 0..10 {
+        let config = WorldConfig {
+            max_duration_s: 20.0,
+            ..small()
+        };
+        let mut world = World::new(Scenario::Crowded, &config, Seed(5), trial).unwrap();
+        while !world.step(&world.policy_action()).unwrap().truncated {
+            let mut places: Vec<[f32; 2]> = world.mover_poses().into_iter().map(arena::position).collect();
+            places.push(arena::position(world.observer_pose()));
+            for (index, &one) in places.iter().enumerate() {
+                for &other in &places[..index] {
+                    assert!(arena::distance(one, other) > 0.33, "trial {trial}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn commands_beyond_the_limits_are_clamped_to_them() {
+    let mut world = world_from(1.0, 0.0, 0.0, &small());
+    for _ in 0..5 {
+        world.step(&action(9.0, 50.0)).unwrap();
+    }
+    let state = world.observe().state;
+    assert!((state.as_slice()[4] - robot::MAX_LINEAR_M_S).abs() < 1e-3);
+    assert!((state.as_slice()[5] - robot::MAX_ANGULAR_RAD_S).abs() < 1e-3);
+}
+
+#[test]
+fn one_seed_gives_the_same_bytes_and_another_gives_others() {
+    for scenario in Scenario::ALL {
+        let config = WorldConfig::default();
+        let (first, _) = whole_trial(scenario, Seed(11), 4, &config);
+        let (again, _) = whole_trial(scenario, Seed(11), 4, &config);
+        let (other, _) = whole_trial(scenario, Seed(12), 4, &config);
+        assert!(first == again, "{scenario}");
+        assert!(first != other, "{scenario}");
+    }
+}
+
+#[test]
+fn a_world_from_its_written_parameters_is_the_same() {
+    let config = WorldConfig::default();
+    let world = World::new(Scenario::Crowded, &config, Seed(2), 7).unwrap();
+    let written = serde_json::to_string(world.parameters()).unwrap();
+    let again = World::from_parameters(serde_json::from_str(&written).unwrap(), &config).unwrap();
+    assert_eq!(world.observe(), again.observe());
+    assert_eq!(world.photograph().unwrap().0, world.observe().frame);
+}
+
+#[test]
+fn every_static_trial_has_twelve_frames_and_shows_tb2_whole_in_all() {
+    let config = small();
+    let mut lengths = Vec::new();
+    for trial in 0..400 {
+        let mut world = World::new(Scenario::StaticObserver, &config, Seed(1), trial).unwrap();
+        let mut frames = 1;
+        loop {
+            assert!(
+                is_whole(&world.camera(), world.mover_poses()[0]),
+                "trial {trial}, frame {frames}"
+            );
+            let step = world.step(&world.policy_action()).unwrap();
+            frames += 1;
+            if step.terminated || step.truncated {
+                break;
+            }
+        }
+        lengths.push(frames);
+    }
+    lengths.sort_unstable();
+    println!(
+        "shortest {}, median {}, longest {}",
+        lengths[0], lengths[200], lengths[399]
+    );
+    assert!(lengths[0] >= 12, "{lengths:?}");
+    assert!(lengths[399] <= 40);
+}
+
+/// Whether the middle axis of a TurtleBot and its sides are in the picture of 16×16.
+fn is_whole(camera: &Camera, pose: PlanarPose) -> bool {
+    [(0.0, -0.17), (0.0, 0.17), (0.42, -0.17), (0.42, 0.17)]
+        .into_iter()
+        .all(|(z, aside)| {
+            let at = camera.project([pose.x_m, pose.y_m + aside, z]);
+            at.is_some_and(|[column, row]| (0.0..16.0).contains(&column) && (0.0..16.0).contains(&row))
+        })
+}
+
+#[test]
+fn a_moving_observer_trial_has_all_its_frames() {
+    let (seen, _) = whole_trial(Scenario::MovingObserver, Seed(1), 0, &small());
+    assert_eq!(seen.len(), 40);
+    assert!((seen[39].time_s - 7.8).abs() < 1e-9);
+}
+
+#[test]
+fn tb1s_own_driver_sees_tb2_often_and_seldom_bumps() {
+    let (mut frames, mut shown, mut bumps) = (0, 0, 0);
+    for trial in 0..40 {
+        let mut world = World::new(Scenario::MovingObserver, &small(), Seed(9), trial).unwrap();
+        loop {
+            let wish = world.policy_action();
+            assert!((0.0..=0.5).contains(&wish.as_slice()[0]) && wish.as_slice()[1].abs() <= 0.8);
+            let step = world.step(&wish).unwrap();
+            frames += 1;
+            shown += usize::from(step.observation.mask.contains(&1));
+            bumps += usize::from(step.reward < 0.0);
+            if step.truncated {
+                break;
+            }
+        }
+    }
+    println!("Tb2 in {shown} of {frames} frames, {bumps} with a bump");
+    assert!(shown * 2 > frames, "{shown} of {frames}");
+    assert!(bumps * 10 < frames, "{bumps} of {frames}");
+}
+
+#[test]
+fn held_out_trials_are_those_pairs_and_a_tenth_of_the_gains() {
+    let trials: Vec<TrialParameters> = (0..4000)
+        .map(|trial| TrialParameters::draw(Scenario::StaticObserver, Seed(1), trial))
+        .collect();
+    let by_pair = trials.iter().filter(|trial| trial.has_held_out_pair()).count();
+    let by_gain = trials
+        .iter()
+        .filter(|trial| HELD_OUT_HEADING_GAIN.contains(&trial.gains.heading.proportional))
+        .count();
+    assert!((550..780).contains(&by_pair), "2 of 12 pairs: {by_pair} of 4000");
+    assert!((320..480).contains(&by_gain), "a tenth: {by_gain} of 4000");
+    for trial in trials {
+        let held = HELD_OUT_PAIRS.contains(&(trial.start, trial.goal))
+            || HELD_OUT_HEADING_GAIN.contains(&trial.gains.heading.proportional);
+        assert_eq!(trial.is_held_out(), held);
+    }
+}
+
+#[test]
+fn known_points_appear_where_a_pinhole_puts_them() {
+    let mut config = WorldConfig::default();
+    config.camera.tilt_down_rad = 0.0;
+    let pose = PlanarPose {
+        x_m: 1.0,
+        y_m: 0.5,
+        heading_rad: std::f32::consts::FRAC_PI_2,
+    };
+    let camera = Camera::new(&config, pose);
+    // Two metres ahead (along y), at the camera's height: the image's middle.
+    let height = config.camera.height_m as f32;
+    let [column, row] = camera.project([1.0, 2.5, height]).unwrap();
+    assert!((column - 32.0).abs() < 1e-4 && (row - 32.0).abs() < 1e-4);
+    // Half the field of view of 60° to the right: the right edge; as far down: the lower edge.
+    let half = 2.0 * 30f32.to_radians().tan();
+    let [column, row] = camera.project([1.0 + half, 2.5, height - half]).unwrap();
+    assert!((column - 64.0).abs() < 1e-3 && (row - 64.0).abs() < 1e-3);
+    assert_eq!(camera.project([1.0, 0.0, height]), None);
+}
+
+#[test]
+fn tb2s_pixels_are_where_its_body_projects_to() {
+    let config = WorldConfig {
+        frame_width_px: 128,
+        frame_height_px: 128,
+        ..WorldConfig::default()
+    };
+    for trial in 0..40 {
+        let mut world = World::new(Scenario::StaticObserver, &config, Seed(6), trial).unwrap();
+        for _ in 0..5 {
+            world.step(&action(0.0, 0.0)).unwrap();
+        }
+        let (mask, pose) = (world.observe().mask, world.mover_poses()[0]);
+        assert!(mask.iter().all(|&owner| owner <= 1));
+        let pixels: Vec<usize> = (0..mask.len()).filter(|&index| mask[index] == 1).collect();
+        let mean = pixels.iter().map(|index| (index % 128) as f32 + 0.5).sum::<f32>() / pixels.len() as f32;
+        let [column, foot] = world.camera().project([pose.x_m - 0.17, pose.y_m, 0.015]).unwrap();
+        assert!((mean - column).abs() < 1.5, "trial {trial}: {mean} {column}");
+        let lowest = (pixels.iter().max().unwrap() / 128) as f32 + 0.5;
+        assert!((lowest - foot).abs() < 2.0, "trial {trial}: {lowest} {foot}");
+        let [_, top] = world.camera().project([pose.x_m + 0.17, pose.y_m, 0.42]).unwrap();
+        let highest = (pixels.iter().min().unwrap() / 128) as f32 + 0.5;
+        assert!((highest - top).abs() < 2.0, "trial {trial}: {highest} {top}");
+    }
+}
+
+#[test]
+fn crowded_masks_name_each_mover() {
+    let mut seen = [false; 5];
+    for trial in 0..30 {
+        let world = World::new(Scenario::Crowded, &WorldConfig::default(), Seed(4), trial).unwrap();
+        for owner in world.observe().mask {
+            seen[usize::from(owner)] = true;
+        }
+    }
+    assert_eq!(seen, [true; 5]);
+}
+
+#[test]
+fn only_the_movers_pixels_and_shadow_change_before_a_still_camera() {
+    let mut config = WorldConfig::default();
+    config.camera.noise_std = 0.0;
+    let (seen, _) = whole_trial(Scenario::StaticObserver, Seed(1), 0, &config);
+    let (first, last) = (&seen[0], &seen[seen.len() - 1]);
+    // The topmost rows show wall only.
+    assert_eq!(first.frame.pixels()[..64 * 4], last.frame.pixels()[..64 * 4]);
+    assert!(first.frame != last.frame);
+}
+
+#[test]
+fn channels_name_what_actions_and_states_hold() {
+    let world = World::new(Scenario::StaticObserver, &small(), Seed(1), 0).unwrap();
+    assert_eq!(world.policy_action().as_slice(), [0.0, 0.0]);
+    assert_eq!(action_channels().len(), 2);
+    assert_eq!(state_channels().len(), world.observe().state.as_slice().len());
+}
+
+#[test]
+fn an_unknown_scenario_is_answered_with_those_there_are() {
+    let error = "static".parse::<Scenario>().unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "there is no scenario \"static\"; there are static-observer, moving-observer, crowded"
+    );
+    for scenario in Scenario::ALL {
+        assert_eq!(scenario.to_string().parse::<Scenario>().unwrap(), scenario);
+        assert_eq!(serde_json::to_value(scenario).unwrap(), scenario.name());
+    }
+}
+
+#[test]
+fn settings_out_of_range_are_refused_with_their_range() {
+    let refusal = |change: fn(&mut WorldConfig)| {
+        let mut config = WorldConfig::default();
+        change(&mut config);
+        World::new(Scenario::StaticObserver, &config, Seed(1), 0)
+            .err()
+            .unwrap()
+            .to_string()
+    };
+    assert_eq!(
+        refusal(|config| config.frame_width_px = 0),
+        "a frame of 0×64 px is out of range; each side must be 1 to 4096 px"
+    );
+    assert_eq!(
+        refusal(|config| config.camera.noise_std = f64::NAN),
+        "camera.noise_std is NaN; it must be a finite number from 0 to 1"
+    );
+    assert!(refusal(|config| config.frame_period_s = 0.0).starts_with("frame_period_s is 0; it must be"));
+    assert!(refusal(|config| config.camera.horizontal_fov_rad = 4.0).contains("from 0.1 to 2.8"));
+    assert!(refusal(|config| config.camera.height_m = f64::INFINITY).starts_with("camera.height_m is inf"));
+    assert!(refusal(|config| config.max_duration_s = 0.1).contains("from 0.4 to 3600"));
+    assert!(serde_json::from_str::<WorldConfig>(r#"{"frame_widht_px": 64}"#).is_err());
+}
+
+#[test]
+fn an_action_of_another_length_is_refused() {
+    let mut world = World::new(Scenario::MovingObserver, &small(), Seed(1), 0).unwrap();
+    let error = world.step(&Action::try_from(vec![0.0; 3]).unwrap()).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "an action of 3 components was given; it takes 2: linear (m/s) and angular (rad/s)"
+    );
+    assert!(Action::try_from(vec![0.0, f32::NAN]).is_err());
+}
+
+#[test]
+fn an_environment_is_reset_before_and_after_an_episode() {
+    let mut environment = Environment::new(Scenario::StaticObserver, small()).unwrap();
+    let still = action(0.0, 0.0);
+    assert!(matches!(environment.step(&still), Err(SimError::NotReset)));
+    let (first, drawn) = environment.reset(Some(Seed(8))).unwrap();
+    assert_eq!((drawn.seed, drawn.trial), (Seed(8), 0));
+    while !matches!(environment.step(&still), Err(SimError::Ended)) {}
+    let (next, drawn) = environment.reset(None).unwrap();
+    assert_eq!(drawn.trial, 1);
+    assert!(next != first);
+    assert_eq!(environment.reset(Some(Seed(8))).unwrap().0, first);
+}
