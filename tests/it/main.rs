@@ -13,3 +13,6 @@ mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
 mod sim_refusals;
+mod evaluation;
+mod sim;
+mod training;
