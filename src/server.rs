@@ -1,1 +1,225 @@
-//! HTTP and WebSocket.
+//! The service over HTTP and WebSocket: [`serve`] answers until told to stop, then ends what it began. [`App`] is what
+//! the handlers share, [`protocol`] the stream's messages, [`openapi`] the contract.
+
+mod config;
+mod dashboard;
+mod error;
+mod extract;
+mod health;
+mod images;
+mod jobs;
+mod listener;
+mod middleware;
+mod models;
+mod picture;
+mod predict;
+mod preview;
+mod session;
+mod stream;
+mod streams;
+
+pub mod openapi;
+pub mod protocol;
+pub mod shutdown;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::routing::{get, post};
+use tokio::net::TcpListener;
+use tracing::{info, warn};
+
+pub use config::ServerConfig;
+use error::ApiError;
+pub use error::Problem;
+pub use images::ImageFormat;
+use listener::BoundedListener;
+use middleware::RequestIds;
+use streams::Streams;
+
+use crate::jobs::pipeline::Pipeline;
+use crate::jobs::{JobError, Jobs};
+use crate::registry::LoadedModel;
+use crate::serving::{Predictor, ServingError};
+
+/// Why the server could not start or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// A setting is out of range.
+    #[error("{field} is {value}; it must be {least} to {most}")]
+    Config {
+        /// The setting.
+        field: &'static str,
+        /// Its value.
+        value: u64,
+        /// The least it may be.
+        least: u64,
+        /// The most it may be.
+        most: u64,
+    },
+    /// The predictor could not start.
+    #[error(transparent)]
+    Serving(#[from] ServingError),
+    /// The job runner could not start.
+    #[error(transparent)]
+    Jobs(#[from] JobError),
+    /// The listener failed.
+    #[error("could not listen for connections")]
+    Listen(#[source] std::io::Error),
+}
+
+/// What the handlers share; clones are the same.
+#[derive(Clone)]
+pub struct App {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    config: ServerConfig,
+    predictor: Predictor,
+    jobs: Jobs,
+    streams: Streams,
+    request_ids: RequestIds,
+    contract: String,
+}
+
+impl App {
+    /// Starts the threads that predict with these models and that run jobs. Errors: `Config`, `Serving`, `Jobs`.
+    pub fn start(config: ServerConfig, models: Vec<LoadedModel>) -> Result<Self, ServerError> {
+        config.validate()?;
+        let predictor = Predictor::start(models, config.predictor())?;
+        let pipeline = Pipeline {
+            data_dir: config.data_dir.clone(),
+            predictor: predictor.clone(),
+        };
+        let jobs = Jobs::start(config.jobs(), Box::new(pipeline))?;
+        Ok(Self::with_parts(config, predictor, jobs))
+    }
+
+    /// From parts that have been started, for example a job runner with other work. The configuration is not checked.
+    #[must_use]
+    pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs) -> Self {
+        let streams = Streams::new(config.max_streams);
+        Self {
+            shared: Arc::new(Shared {
+                config,
+                predictor,
+                jobs,
+                streams,
+                request_ids: RequestIds::new(),
+                contract: openapi::document(),
+            }),
+        }
+    }
+
+    /// The predictor.
+    #[must_use]
+    pub fn predictor(&self) -> &Predictor {
+        &self.shared.predictor
+    }
+
+    /// The jobs.
+    #[must_use]
+    pub fn jobs(&self) -> &Jobs {
+        &self.shared.jobs
+    }
+
+    /// The settings.
+    #[must_use]
+    pub fn config(&self) -> &ServerConfig {
+        &self.shared.config
+    }
+
+    fn streams(&self) -> &Streams {
+        &self.shared.streams
+    }
+
+    fn request_ids(&self) -> &RequestIds {
+        &self.shared.request_ids
+    }
+
+    fn contract(&self) -> &str {
+        &self.shared.contract
+    }
+}
+
+/// Every route of the service.
+pub fn router(app: App) -> Router {
+    Router::new()
+        .route("/", get(dashboard::page))
+        .route("/livez", get(health::livez))
+        .route("/readyz", get(health::readyz))
+        .route("/openapi.json", get(openapi::openapi_json))
+        .route("/v1/models", get(models::list))
+        .route("/v1/models/{model}", get(models::get))
+        .route("/v1/models/{model}/predict", post(predict::predict))
+        .route("/v1/models/{model}/preview.png", get(preview::preview))
+        .route("/v1/models/{model}/stream", get(stream::stream))
+        .route("/v1/jobs", post(jobs::create).get(jobs::list))
+        .route("/v1/jobs/{id}", get(jobs::get))
+        .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
+        .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
+        .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
+        .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), middleware::trace))
+        .with_state(app)
+}
+
+/// Answers on the listener until `shutdown` completes; then takes no more connections, answers the requests it has,
+/// closes every stream with 1001, cancels the jobs, and returns when all have ended or the deadline has passed.
+/// Errors: `Listen`.
+pub async fn serve(
+    listener: TcpListener,
+    app: App,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> Result<(), ServerError> {
+    let mut stopping = app.streams().stopping();
+    let listener = BoundedListener::new(listener, app.config().max_connections);
+    let of_signal = app.clone();
+    let signal = async move {
+        shutdown.await;
+        info!("stopping");
+        of_signal.streams().stop();
+        of_signal.jobs().begin_stop();
+    };
+    let server = axum::serve(listener, router(app.clone())).with_graceful_shutdown(signal);
+    let limit = Duration::from_millis(app.config().shutdown_deadline_ms);
+    let over = async {
+        streams::told(&mut stopping).await;
+        tokio::time::sleep(limit).await;
+    };
+    tokio::select! {
+        result = async { server.await.map_err(ServerError::Listen) } => {
+            result?;
+            finish(app, Instant::now() + limit).await;
+        }
+        () = over => warn!("some requests were not answered within the deadline"),
+    }
+    Ok(())
+}
+
+/// Waits for the streams, the running job and the predictor to end.
+async fn finish(app: App, deadline: Instant) {
+    let streams = tokio::time::timeout_at(deadline.into(), app.streams().ended());
+    if streams.await.is_err() {
+        warn!("some streams did not end within the deadline");
+    }
+    let ended = blocking(move || {
+        if app.jobs().finish_stop(deadline) {
+            app.predictor().stop();
+        }
+    });
+    if ended.await.is_ok() {
+        info!("stopped");
+    }
+}
+
+/// Runs what would hold up the other requests on a thread for such work. Errors: `Internal` if it panicked.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, ApiError> {
+    let span = tracing::Span::current();
+    tokio::task::spawn_blocking(move || span.in_scope(work))
+        .await
+        .map_err(|error| ApiError::Internal(error.to_string()))
+}

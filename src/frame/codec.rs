@@ -22,6 +22,15 @@ pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
     gray_from_image(&reader.decode().map_err(FrameError::Decode)?)
 }
 
+/// Width and height that a PNG or JPEG image states, without decoding its pixels. Errors: `Decode` if the bytes are neither.
+pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
+    ImageReader::new(Cursor::new(bytes))
+        .with_guessed_format()
+        .map_err(|error| FrameError::Decode(error.into()))?
+        .into_dimensions()
+        .map_err(FrameError::Decode)
+}
+
 fn gray_from_image(image: &DynamicImage) -> Result<Frame, FrameError> {
     let (width, height) = (image.width(), image.height());
     let pixels = match image {
@@ -92,12 +101,15 @@ mod tests {
         fn a_png_gives_back_every_pixel(width in 1u32..40, height in 1u32..40, seed in any::<u8>()) {
             let pixels = (0..width * height).map(|i| (i * 31 + u32::from(seed)) as u8).collect();
             let frame = Frame::new(width, height, pixels).unwrap();
-            prop_assert_eq!(decode(&encode_png(&frame).unwrap()).unwrap(), frame);
+            let png = encode_png(&frame).unwrap();
+            prop_assert_eq!(dimensions(&png).unwrap(), (width, height));
+            prop_assert_eq!(decode(&png).unwrap(), frame);
         }
 
         #[test]
         fn no_bytes_make_the_decoder_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
             let _ = decode(&bytes);
+            let _ = dimensions(&bytes);
         }
     }
 

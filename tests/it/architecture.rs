@@ -13,12 +13,31 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("dataset", &["types", "files", "frame", "sim"]),
     ("registry", &["types", "files", "nn"]),
     ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
-    ("evaluation", &["types", "files", "frame", "nn", "sim", "dataset", "registry"]),
+    (
+        "evaluation",
+        &["types", "files", "frame", "nn", "sim", "dataset", "registry"],
+    ),
     ("serving", &["types", "frame", "nn", "registry"]),
-    ("jobs", &["types", "files", "frame", "nn", "sim", "dataset", "registry", "training", "serving"]),
+    (
+        "jobs",
+        &[
+            "types", "files", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
+        ],
+    ),
     (
         "server",
-        &["types", "frame", "nn", "dataset", "registry", "training", "evaluation", "serving", "jobs"],
+        &[
+            "types",
+            "frame",
+            "nn",
+            "sim",
+            "dataset",
+            "registry",
+            "training",
+            "evaluation",
+            "serving",
+            "jobs",
+        ],
     ),
     ("telemetry", &[]),
 ];
@@ -58,13 +77,17 @@ fn module(file: &str) -> &str {
 
 /// The code above the unit tests.
 fn code(text: &str) -> impl Iterator<Item = &str> {
-    text.lines().take_while(|line| line.trim() != "#[cfg(test)]").filter(|line| !line.trim_start().starts_with("//"))
+    text.lines()
+        .take_while(|line| line.trim() != "#[cfg(test)]")
+        .filter(|line| !line.trim_start().starts_with("//"))
 }
 
 #[test]
 fn a_module_uses_only_those_before_it() {
     for (file, text) in sources() {
-        let Some((_, allowed)) = MAY_USE.iter().find(|(name, _)| *name == module(&file)) else { continue };
+        let Some((_, allowed)) = MAY_USE.iter().find(|(name, _)| *name == module(&file)) else {
+            continue;
+        };
         for line in code(&text) {
             for used in line.split("crate::").skip(1) {
                 let used: String = used.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();

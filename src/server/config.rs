@@ -1,0 +1,139 @@
+//! The server's bounds. Every one is checked before the server starts and has a test that is refused by it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::ServerError;
+use crate::jobs::TableLimits;
+use crate::serving::PredictorConfig;
+
+/// All settings of the server, with their defaults.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ServerConfig {
+    /// Where jobs write: `datasets`, `runs` and `models` below it.
+    pub data_dir: PathBuf,
+    /// Bytes of a request's body, and of a message on a socket, at most.
+    pub max_body_bytes: usize,
+    /// Images in one request at most.
+    pub max_frames: usize,
+    /// Predictions that may wait; more are answered 503.
+    pub max_queued_predictions: usize,
+    /// Predictions computed together at most.
+    pub max_batch: usize,
+    /// Connections at a time; more are answered 503 and closed.
+    pub max_connections: usize,
+    /// Streams at a time; more are answered 503.
+    pub max_streams: usize,
+    /// Jobs that may wait; more are answered 503.
+    pub max_queued_jobs: usize,
+    /// Ended jobs that are remembered.
+    pub max_ended_jobs: usize,
+    /// How long a prediction may take, queue and all, in milliseconds.
+    pub prediction_deadline_ms: u64,
+    /// How long a request may take to arrive and be answered, in milliseconds.
+    pub request_deadline_ms: u64,
+    /// How long a stream may be silent, in milliseconds.
+    pub stream_idle_ms: u64,
+    /// How long a client may take to read a message of its stream, in milliseconds.
+    pub stream_send_ms: u64,
+    /// How long stopping may take, in milliseconds.
+    pub shutdown_deadline_ms: u64,
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        Self {
+            data_dir: PathBuf::from("data"),
+            max_body_bytes: 8 << 20,
+            max_frames: 64,
+            max_queued_predictions: 64,
+            max_batch: 16,
+            max_connections: 512,
+            max_streams: 128,
+            max_queued_jobs: 16,
+            max_ended_jobs: 100,
+            prediction_deadline_ms: 10_000,
+            request_deadline_ms: 30_000,
+            stream_idle_ms: 60_000,
+            stream_send_ms: 10_000,
+            shutdown_deadline_ms: 10_000,
+        }
+    }
+}
+
+/// A day: no deadline is longer.
+const MAX_DEADLINE_MS: u64 = 86_400_000;
+
+impl ServerConfig {
+    /// Errors: `Config`, which names the field and its range.
+    pub fn validate(&self) -> Result<(), ServerError> {
+        let deadlines = 1..=MAX_DEADLINE_MS;
+        for (field, value, range) in [
+            ("max_body_bytes", self.max_body_bytes as u64, 1024..=1 << 30),
+            ("max_frames", self.max_frames as u64, 1..=4096),
+            (
+                "max_queued_predictions",
+                self.max_queued_predictions as u64,
+                1..=1_000_000,
+            ),
+            ("max_batch", self.max_batch as u64, 1..=4096),
+            ("max_connections", self.max_connections as u64, 1..=1_000_000),
+            ("max_streams", self.max_streams as u64, 1..=1_000_000),
+            ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
+            ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
+            ("prediction_deadline_ms", self.prediction_deadline_ms, deadlines.clone()),
+            ("request_deadline_ms", self.request_deadline_ms, deadlines.clone()),
+            ("stream_idle_ms", self.stream_idle_ms, deadlines.clone()),
+            ("stream_send_ms", self.stream_send_ms, deadlines.clone()),
+            ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadlines),
+        ] {
+            if !range.contains(&value) {
+                return Err(ServerError::Config {
+                    field,
+                    value,
+                    least: *range.start(),
+                    most: *range.end(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn predictor(&self) -> PredictorConfig {
+        PredictorConfig {
+            queue_capacity: self.max_queued_predictions,
+            batch_limit: self.max_batch,
+            deadline: Duration::from_millis(self.prediction_deadline_ms),
+        }
+    }
+
+    pub(super) fn jobs(&self) -> TableLimits {
+        TableLimits {
+            queued: self.max_queued_jobs,
+            ended: self.max_ended_jobs,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_defaults_are_valid() {
+        ServerConfig::default().validate().unwrap();
+    }
+
+    #[test]
+    fn a_bound_of_zero_is_refused_with_its_name_and_range() {
+        let config = ServerConfig {
+            max_streams: 0,
+            ..ServerConfig::default()
+        };
+        let error = config.validate().unwrap_err().to_string();
+        assert_eq!(error, "max_streams is 0; it must be 1 to 1000000");
+    }
+}

@@ -1,0 +1,85 @@
+//! What handlers take from a request, refused in the one shape that errors have.
+
+use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::header;
+use axum::http::request::Parts;
+use serde::de::DeserializeOwned;
+
+use super::error::ApiError;
+
+/// A JSON body.
+pub(super) struct Json<T>(pub(super) T);
+
+impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Json<T> {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
+        let axum::Json(value) = axum::Json::from_request(request, state).await?;
+        Ok(Self(value))
+    }
+}
+
+/// The path's parameters.
+pub(super) struct Path<T>(pub(super) T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Path<T> {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        let axum::extract::Path(value) = axum::extract::Path::from_request_parts(parts, state).await?;
+        Ok(Self(value))
+    }
+}
+
+/// In which form the client wants a prediction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Wanted {
+    Json,
+    Png,
+    Gif,
+}
+
+impl Wanted {
+    /// The first form named in an `Accept` header that can be had; JSON where there is none.
+    fn from_accept(accept: &str) -> Result<Self, ApiError> {
+        let named = accept
+            .split(',')
+            .map(|part| part.split(';').next().unwrap_or("").trim());
+        for media_type in named {
+            match media_type {
+                "application/json" | "application/*" | "*/*" | "" => return Ok(Self::Json),
+                "image/png" | "image/*" => return Ok(Self::Png),
+                "image/gif" => return Ok(Self::Gif),
+                _ => {}
+            }
+        }
+        Err(ApiError::NotAcceptable(format!(
+            "no prediction can be had as {accept}; there are application/json, image/png and image/gif"
+        )))
+    }
+}
+
+impl<S: Send + Sync> FromRequestParts<S> for Wanted {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
+        let accept = parts.headers.get(header::ACCEPT).map_or(Ok("*/*"), |accept| {
+            accept
+                .to_str()
+                .map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))
+        })?;
+        Self::from_accept(accept)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_form_named_that_there_is_is_taken() {
+        assert_eq!(Wanted::from_accept("text/html, image/gif;q=0.8, */*"), Ok(Wanted::Gif));
+        assert_eq!(Wanted::from_accept("*/*"), Ok(Wanted::Json));
+        assert!(Wanted::from_accept("text/html").is_err());
+    }
+}

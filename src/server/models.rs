@@ -1,0 +1,112 @@
+//! What models there are.
+
+use axum::extract::State;
+use serde::Serialize;
+
+use super::App;
+use super::error::{ApiError, Problem};
+use super::extract::Path;
+use crate::nn::ModelSpec;
+use crate::registry::Manifest;
+
+/// The loaded models.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct ModelList {
+    /// In the order of their names.
+    models: Vec<ModelDescription>,
+}
+
+/// What a model takes and gives, how good it is and where it comes from.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct ModelDescription {
+    /// Its name.
+    name: String,
+    /// The versions there are.
+    versions: Vec<u32>,
+    /// The version that answers.
+    active_version: u32,
+    /// Frame size, context, horizon, conditioning, units and order of action and state.
+    spec: ModelSpec,
+    /// Measured on data it was not trained on.
+    #[schema(value_type = Object)]
+    metrics: serde_json::Value,
+    /// Where it comes from.
+    lineage: Lineage,
+}
+
+/// Where a model comes from.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct Lineage {
+    /// Name of the data set it was trained on.
+    dataset: String,
+    /// Hash of that data set's content.
+    dataset_hash: String,
+    /// The scenario that was simulated for it, if one was.
+    scenario: Option<String>,
+    /// The seed of the training.
+    seed: u64,
+    /// The command that made it.
+    command: String,
+    /// Hash of the weights.
+    weights_sha256: String,
+    /// Trained values.
+    parameters: u64,
+    /// Multiplications and additions to predict a frame.
+    multiply_adds_per_frame: u64,
+    /// The program's version that made it.
+    program_version: String,
+    /// The program's commit that made it, where known.
+    git_commit: Option<String>,
+}
+
+impl From<&Manifest> for ModelDescription {
+    fn from(manifest: &Manifest) -> Self {
+        Self {
+            name: manifest.name.clone(),
+            versions: vec![manifest.version],
+            active_version: manifest.version,
+            spec: manifest.spec.clone(),
+            metrics: manifest.metrics.clone(),
+            lineage: Lineage {
+                dataset: manifest.dataset.name.clone(),
+                dataset_hash: manifest.dataset.content_hash.clone(),
+                scenario: manifest.dataset.scenario.clone(),
+                seed: manifest.seed.0,
+                command: manifest.command.clone(),
+                weights_sha256: manifest.weights_sha256.clone(),
+                parameters: manifest.parameters,
+                multiply_adds_per_frame: manifest.multiply_adds_per_frame,
+                program_version: manifest.program.version.clone(),
+                git_commit: manifest.program.git_commit.clone(),
+            },
+        }
+    }
+}
+
+/// Lists the loaded models.
+#[utoipa::path(get, path = "/v1/models", tag = "models", responses((status = 200, body = ModelList)))]
+pub(super) async fn list(State(app): State<App>) -> axum::Json<ModelList> {
+    let manifests = app.predictor().models();
+    axum::Json(ModelList {
+        models: manifests
+            .iter()
+            .map(|manifest| ModelDescription::from(&**manifest))
+            .collect(),
+    })
+}
+
+/// Describes one model.
+#[utoipa::path(
+    get, path = "/v1/models/{model}", tag = "models",
+    params(("model" = String, Path, description = "The model's name")),
+    responses(
+        (status = 200, body = ModelDescription),
+        (status = 404, description = "No such model; the answer names those there are", body = Problem),
+    )
+)]
+pub(super) async fn get(
+    State(app): State<App>,
+    Path(model): Path<String>,
+) -> Result<axum::Json<ModelDescription>, ApiError> {
+    Ok(axum::Json(ModelDescription::from(&*app.predictor().model(&model)?)))
+}

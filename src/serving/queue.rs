@@ -1,0 +1,199 @@
+//! The bounded queue between the handles and the thread that owns the models.
+
+use std::collections::VecDeque;
+use std::sync::mpsc::SyncSender;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use tokio::sync::oneshot;
+
+use super::batch::{self, Candidate};
+use super::{Prediction, PredictionInput, ServingError};
+use crate::registry::LoadedModel;
+
+/// A full queue of the reference model's predictions is worked off well within this.
+const RETRY_AFTER_S: u64 = 1;
+
+/// A request that waits.
+pub(super) struct Waiting {
+    pub(super) model: String,
+    pub(super) input: PredictionInput,
+    pub(super) accepted: Instant,
+    pub(super) deadline: Instant,
+    pub(super) reply: oneshot::Sender<Result<Prediction, ServingError>>,
+}
+
+/// A model to take in.
+pub(super) struct Load {
+    pub(super) model: LoadedModel,
+    pub(super) reply: SyncSender<Result<(), ServingError>>,
+}
+
+/// What the worker does next.
+pub(super) enum Work {
+    Load(Box<Load>),
+    Batch(Vec<Waiting>),
+    Stop,
+}
+
+#[derive(Default)]
+struct State {
+    waiting: VecDeque<Waiting>,
+    loads: VecDeque<Load>,
+    closed: bool,
+}
+
+pub(super) struct Queue {
+    state: Mutex<State>,
+    arrived: Condvar,
+    capacity: usize,
+    batch_limit: usize,
+}
+
+impl Queue {
+    pub(super) fn new(capacity: usize, batch_limit: usize) -> Self {
+        Self {
+            state: Mutex::default(),
+            arrived: Condvar::new(),
+            capacity,
+            batch_limit,
+        }
+    }
+
+    pub(super) fn push(&self, request: Waiting) -> Result<(), ServingError> {
+        let mut state = self.state();
+        if state.closed {
+            return Err(ServingError::Stopped);
+        }
+        if state.waiting.len() >= self.capacity {
+            // Those whose clients have gone hold no place.
+            state.waiting.retain(|waiting| !waiting.reply.is_closed());
+        }
+        if state.waiting.len() >= self.capacity {
+            return Err(ServingError::QueueFull {
+                capacity: self.capacity,
+                retry_after_s: RETRY_AFTER_S,
+            });
+        }
+        state.waiting.push_back(request);
+        self.arrived.notify_one();
+        Ok(())
+    }
+
+    pub(super) fn load(&self, load: Load) -> Result<(), ServingError> {
+        let mut state = self.state();
+        if state.closed {
+            return Err(ServingError::Stopped);
+        }
+        state.loads.push_back(load);
+        self.arrived.notify_one();
+        Ok(())
+    }
+
+    /// Takes no more; what waits is still worked off.
+    pub(super) fn close(&self) {
+        self.state().closed = true;
+        self.arrived.notify_all();
+    }
+
+    /// Blocks until there is something to do.
+    pub(super) fn take(&self) -> Work {
+        let mut state = self.state();
+        loop {
+            if let Some(load) = state.loads.pop_front() {
+                return Work::Load(Box::new(load));
+            }
+            let batch = state.next_batch(Instant::now(), self.batch_limit);
+            if !batch.is_empty() {
+                return Work::Batch(batch);
+            }
+            if state.closed {
+                return Work::Stop;
+            }
+            state = self.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn next_batch(&mut self, now: Instant, limit: usize) -> Vec<Waiting> {
+        let candidates: Vec<Candidate<'_>> = self
+            .waiting
+            .iter()
+            .map(|waiting| Candidate {
+                model: &waiting.model,
+                abandoned: waiting.reply.is_closed(),
+                deadline: waiting.deadline,
+            })
+            .collect();
+        let plan = batch::plan(&candidates, now, limit);
+        let mut batch = Vec::with_capacity(plan.batch.len());
+        let mut kept = VecDeque::with_capacity(self.waiting.len());
+        for (position, waiting) in self.waiting.drain(..).enumerate() {
+            if plan.batch.binary_search(&position).is_ok() {
+                batch.push(waiting);
+            } else if plan.discard.binary_search(&position).is_err() {
+                kept.push_back(waiting);
+            }
+        }
+        self.waiting = kept;
+        batch
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn request(model: &str) -> (Waiting, oneshot::Receiver<Result<Prediction, ServingError>>) {
+        let (reply, answer) = oneshot::channel();
+        let accepted = Instant::now();
+        let waiting = Waiting {
+            model: model.to_owned(),
+            input: PredictionInput::default(),
+            accepted,
+            deadline: accepted + Duration::from_secs(60),
+            reply,
+        };
+        (waiting, answer)
+    }
+
+    #[test]
+    fn a_full_queue_refuses_with_an_error_and_gives_its_size() {
+        let queue = Queue::new(2, 8);
+        let (requests, _answers): (Vec<_>, Vec<_>) = (0..3).map(|_| request("a")).unzip();
+        let results: Vec<_> = requests.into_iter().map(|request| queue.push(request)).collect();
+        assert!(results[0].is_ok() && results[1].is_ok());
+        assert!(matches!(results[2], Err(ServingError::QueueFull { capacity: 2, .. })));
+    }
+
+    #[test]
+    fn an_abandoned_request_holds_no_place_and_is_never_computed() {
+        let queue = Queue::new(1, 8);
+        let (first, answer) = request("a");
+        queue.push(first).unwrap();
+        drop(answer);
+        let (second, _answer) = request("b");
+        queue.push(second).unwrap();
+        let Work::Batch(batch) = queue.take() else { panic!() };
+        assert_eq!(batch.len(), 1);
+        assert_eq!(batch[0].model, "b");
+    }
+
+    #[test]
+    fn a_closed_queue_is_worked_off_and_then_stops() {
+        let queue = Queue::new(4, 1);
+        let (first, _answer) = request("a");
+        queue.push(first).unwrap();
+        queue.close();
+        assert!(matches!(queue.push(request("a").0), Err(ServingError::Stopped)));
+        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 1));
+        assert!(matches!(queue.take(), Work::Stop));
+    }
+}

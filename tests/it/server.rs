@@ -1,0 +1,441 @@
+//! The service's answers over HTTP.
+
+use axum::body::Body;
+use axum::http::{Request, header};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use foreframe::frame::{Frame, codec};
+use foreframe::nn::Conditioning;
+use foreframe::server::{App, ServerConfig, openapi};
+use foreframe::serving::{self, PredictionInput};
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+
+use crate::service::{
+    CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, send, slow_spec, spec,
+    until, with_data,
+};
+
+const PLAIN: &str = "/v1/models/plain/predict";
+const MOVING: &str = "/v1/models/moving/predict";
+
+#[tokio::test]
+async fn a_prediction_over_http_is_the_librarys() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let loaded = model(dir.path(), "plain", spec(Conditioning::None));
+    let input = PredictionInput {
+        frames: (0..CONTEXT as u8).map(|i| frame(i * 10)).collect(),
+        ..PredictionInput::default()
+    };
+    let expected = serving::predict(&loaded, &[&input]).unwrap().remove(0);
+
+    let answer = post(&app, PLAIN, &json!({"frames": context()})).await.json();
+    assert_eq!((&answer["model"], &answer["version"]), (&json!("plain"), &json!(1)));
+    let predicted: Vec<Frame> = answer["frames"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|image| codec::decode(&STANDARD.decode(image.as_str().unwrap()).unwrap()).unwrap())
+        .collect();
+    assert_eq!(predicted, expected);
+    assert!(answer["timing"]["compute_us"].as_u64().unwrap() > 0);
+}
+
+#[tokio::test]
+async fn raw_images_are_answered_by_raw_images() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let raw: Vec<String> = (0..CONTEXT as u8)
+        .map(|i| STANDARD.encode(frame(i * 10).pixels()))
+        .collect();
+    let as_raw = post(&app, PLAIN, &json!({"frames": raw, "format": "raw"})).await.json();
+    let as_png = post(&app, PLAIN, &json!({"frames": context()})).await.json();
+    let decoded = codec::decode(&STANDARD.decode(as_png["frames"][0].as_str().unwrap()).unwrap()).unwrap();
+    assert_eq!(as_raw["format"], "raw");
+    assert_eq!(
+        STANDARD.decode(as_raw["frames"][0].as_str().unwrap()).unwrap(),
+        decoded.pixels()
+    );
+}
+
+#[tokio::test]
+async fn the_last_action_is_held_where_no_future_actions_are_given() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let ask = async |actions: Value, future: Value, state: Value| {
+        let mut body = json!({"frames": context(), "actions": actions, "future_actions": future});
+        body.as_object_mut().unwrap().extend(state.as_object().unwrap().clone());
+        post(&app, MOVING, &body).await.json()["frames"].clone()
+    };
+    let state = json!({"state": [0.5]});
+    let held = ask(json!([[0.0, 0.0], [3.0, -2.0]]), Value::Null, state.clone()).await;
+    let said = ask(json!([]), json!([[3.0, -2.0], [3.0, -2.0]]), state).await;
+    let states = ask(
+        json!([[3.0, -2.0]]),
+        Value::Null,
+        json!({"states": [[9.0], [9.0], [0.5]]}),
+    )
+    .await;
+    let other = ask(json!([[-3.0, 2.0]]), Value::Null, json!({"state": [0.5]})).await;
+    assert_eq!(held, said);
+    assert_eq!(held, states);
+    assert_ne!(held, other);
+}
+
+#[tokio::test]
+async fn pictures_are_given_where_asked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let body = json!({"frames": context()}).to_string();
+    let sheet = post_text(&app, PLAIN, body.clone(), "image/png").await;
+    assert_eq!(sheet.headers[header::CONTENT_TYPE], "image/png");
+    let sheet = codec::decode(&sheet.body).unwrap();
+    assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 2 * HEIGHT);
+    let film = post_text(&app, PLAIN, body.clone(), "image/gif").await;
+    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(film.body.starts_with(b"GIF89a"));
+    let refused = post_text(&app, PLAIN, body, "text/csv").await.detail(406);
+    assert!(
+        refused.contains("application/json, image/png and image/gif"),
+        "{refused}"
+    );
+}
+
+#[tokio::test]
+async fn what_does_not_fit_the_model_is_refused_by_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let large = png(&Frame::new(80, 60, vec![0; 4800]).unwrap());
+    let with_large = vec![context()[0].clone(), context()[1].clone(), large];
+    let moving = |more: Value| {
+        let mut body = json!({"frames": context(), "state": [0.0], "actions": [[0.0, 0.0]]});
+        body.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        body
+    };
+    for (path, body, expected) in [
+        (
+            PLAIN,
+            json!({"frames": with_large}),
+            "frames[2] is 80×60 px; model \"plain\" takes 16×12",
+        ),
+        (
+            PLAIN,
+            json!({"frames": &context()[1..]}),
+            "frames holds 2 images; model \"plain\" takes 3",
+        ),
+        (
+            PLAIN,
+            json!({"frames": ["%"]}),
+            "frames[0] is not base64: Invalid symbol 37, offset 0.",
+        ),
+        (
+            PLAIN,
+            json!({"frames": ["AAAA"]}),
+            "frames[0] is not a readable PNG or JPEG image",
+        ),
+        (
+            PLAIN,
+            json!({"frames": ["AAAA"], "format": "raw"}),
+            "frames[0] holds 3 raw bytes; model \"plain\" takes 16×12 px, 192 bytes",
+        ),
+        (
+            MOVING,
+            moving(json!({"actions": []})),
+            "future_actions is missing; model \"moving\" takes linear m/s, angular rad/s",
+        ),
+        (
+            MOVING,
+            moving(json!({"actions": [[1.0]]})),
+            "actions[0] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
+        ),
+        (
+            MOVING,
+            moving(json!({"future_actions": [[1.0, 2.0]]})),
+            "future_actions holds 1 actions; model \"moving\" takes 2",
+        ),
+        (
+            MOVING,
+            moving(json!({"state": [1.0, 2.0]})),
+            "state holds 2 numbers; model \"moving\" takes 1: x m",
+        ),
+        (
+            MOVING,
+            moving(json!({"state": null})),
+            "state is missing; model \"moving\" takes x m",
+        ),
+        (
+            MOVING,
+            moving(json!({"state": [1e39]})),
+            "state: state component 0 is inf; every component must be a finite number",
+        ),
+        (
+            MOVING,
+            moving(json!({"states": [[1.0]]})),
+            "states holds 1 states; there are 3 frames, and each has one",
+        ),
+        (
+            MOVING,
+            moving(json!({"actions": [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]})),
+            "actions holds 4 actions; there are 3 frames, and each has at most one",
+        ),
+    ] {
+        assert_eq!(post(&app, path, &body).await.detail(422), expected);
+    }
+}
+
+#[tokio::test]
+async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let json = "*/*";
+    assert!(
+        post_text(&app, PLAIN, "{\"frames\":".to_owned(), json)
+            .await
+            .detail(400)
+            .contains("JSON")
+    );
+    let unknown = post(&app, PLAIN, &json!({"frames": [], "colour": 1})).await.detail(422);
+    assert!(unknown.contains("unknown field `colour`"), "{unknown}");
+    let untyped = Request::post(PLAIN).body(Body::from("{}")).unwrap();
+    assert!(send(&app, untyped).await.detail(415).contains("application/json"));
+    assert!(get(&app, PLAIN).await.detail(405).contains("openapi.json"));
+    assert!(get(&app, "/nothing").await.detail(404).contains("openapi.json"));
+    let none = get(&app, "/v1/models/movin").await.detail(404);
+    assert_eq!(none, "no model is named \"movin\"; there are: moving, plain");
+    assert!(
+        get(&app, "/v1/models/plain/stream")
+            .await
+            .detail(426)
+            .contains("WebSocket")
+    );
+}
+
+#[tokio::test]
+async fn every_answer_carries_the_requests_id() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let request = |id: &str| {
+        Request::get("/nothing")
+            .header("x-request-id", id)
+            .body(Body::empty())
+            .unwrap()
+    };
+    let own = send(&app, request("robot-7")).await;
+    assert_eq!(
+        (own.detail(404), own.headers["x-request-id"].to_str().unwrap()),
+        (own.detail(404), "robot-7")
+    );
+    let odd = send(&app, request("a b\"c")).await;
+    assert_ne!(odd.headers["x-request-id"], "a b\"c");
+    assert_ne!(
+        get(&app, "/livez").await.headers["x-request-id"],
+        odd.headers["x-request-id"]
+    );
+}
+
+#[tokio::test]
+async fn the_server_is_ready_once_its_models_are_warm() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    assert_eq!(get(&app, "/livez").await.status, 200);
+    until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
+    let models = get(&app, "/v1/models").await.json();
+    let names: Vec<&Value> = models["models"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|model| &model["name"])
+        .collect();
+    assert_eq!(names, ["moving", "plain"]);
+    let moving = get(&app, "/v1/models/moving").await.json();
+    assert_eq!(moving["spec"]["conditioning"], "state-action");
+    assert_eq!(moving["spec"]["actions"][1]["unit"], "rad/s");
+    let page = get(&app, "/").await;
+    assert!(
+        String::from_utf8(page.body)
+            .unwrap()
+            .contains("/v1/models/{model}/predict")
+    );
+}
+
+#[tokio::test]
+async fn a_body_or_a_list_over_its_limit_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_body_bytes: 4096,
+        max_frames: 4,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let long = post(&app, PLAIN, &json!({"frames": ["A".repeat(5000)]}))
+        .await
+        .detail(413);
+    assert_eq!(long, "the body is longer than this server takes");
+    let many = post(&app, PLAIN, &json!({"frames": vec!["AAAA"; 5]})).await.detail(413);
+    assert_eq!(many, "frames holds 5 images; this server takes at most 4 in a request");
+}
+
+#[tokio::test]
+async fn a_full_queue_is_answered_with_when_to_try_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_queued_predictions: 1,
+        max_batch: 1,
+        ..with_data(dir.path(), ServerConfig::default())
+    };
+    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let body = json!({"frames": context()});
+    let asked = (0..40).map(|_| post(&app, "/v1/models/slow/predict", &body));
+    let answers = futures_util::future::join_all(asked).await;
+    let refused: Vec<_> = answers.iter().filter(|answer| answer.status != 200).collect();
+    assert!(!refused.is_empty() && refused.len() < answers.len());
+    for answer in refused {
+        assert_eq!(answer.detail(503), "1 predictions wait already; try again in 1 s");
+        assert_eq!(answer.headers[header::RETRY_AFTER], "1");
+    }
+}
+
+#[tokio::test]
+async fn a_prediction_past_its_deadline_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        prediction_deadline_ms: 1,
+        ..with_data(dir.path(), ServerConfig::default())
+    };
+    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let body = json!({"frames": context()});
+    let asked = (0..20).map(|_| post(&app, "/v1/models/slow/predict", &body));
+    let answers = futures_util::future::join_all(asked).await;
+    let late = answers.iter().find(|answer| answer.status != 200).unwrap();
+    assert_eq!(late.detail(503), "no prediction within 1 ms; the server is overloaded");
+    assert_eq!(late.headers[header::RETRY_AFTER], "1");
+}
+
+#[tokio::test]
+async fn a_connection_over_the_limit_is_told_so_and_closed() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_connections: 1,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    let ask = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
+    let mut first = TcpStream::connect(server.address).await.unwrap();
+    first.write_all(ask).await.unwrap();
+    let mut beginning = [0; 12];
+    first.read_exact(&mut beginning).await.unwrap();
+    assert_eq!(&beginning, b"HTTP/1.1 200");
+    let mut second = TcpStream::connect(server.address).await.unwrap();
+    second.write_all(ask).await.unwrap();
+    let mut answer = String::new();
+    second.read_to_string(&mut answer).await.unwrap();
+    assert!(
+        answer.starts_with("HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1"),
+        "{answer}"
+    );
+    let (_, problem) = answer.split_once("\r\n\r\n").unwrap();
+    assert_eq!(serde_json::from_str::<Value>(problem).unwrap()["status"], 503);
+    drop((first, second));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn half_a_body_is_not_waited_for_for_ever() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        request_deadline_ms: 50,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    let mut client = TcpStream::connect(server.address).await.unwrap();
+    let head =
+        format!("POST {PLAIN} HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\ncontent-length: 99\r\n\r\n{{");
+    client.write_all(head.as_bytes()).await.unwrap();
+    let mut beginning = [0; 12];
+    client.read_exact(&mut beginning).await.unwrap();
+    assert_eq!(&beginning, b"HTTP/1.1 408");
+    drop(client);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_accepted_request_is_answered_while_the_server_stops() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = with_data(dir.path(), ServerConfig::default());
+    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let server = run(app).await;
+    let body = json!({"frames": context()}).to_string();
+    let head = format!(
+        "POST /v1/models/slow/predict HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
+        body.len()
+    );
+    let mut client = TcpStream::connect(server.address).await.unwrap();
+    client.write_all(head.as_bytes()).await.unwrap();
+    client.write_all(&body.as_bytes()[..10]).await.unwrap();
+    // Answered on this connection, so the request's head has been taken.
+    let _ = server.shutdown.send(());
+    client.write_all(&body.as_bytes()[10..]).await.unwrap();
+    let mut answer = String::new();
+    client.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    tokio::time::timeout(crate::service::PATIENCE, server.task)
+        .await
+        .unwrap()
+        .unwrap()
+        .unwrap();
+    assert!(TcpStream::connect(server.address).await.is_err());
+}
+
+#[tokio::test]
+async fn the_context_of_a_simulated_trial_and_its_prediction_can_be_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let preview = get(&app, "/v1/models/plain/preview.png").await;
+    assert_eq!(preview.status, 200, "{}", String::from_utf8_lossy(&preview.body));
+    assert!(codec::decode(&preview.body).unwrap().height() > 3 * HEIGHT);
+    let misfit = get(&app, "/v1/models/moving/preview.png").await.detail(422);
+    assert_eq!(misfit, "state holds 6 numbers; model \"moving\" takes 1: x m");
+    assert_eq!(HORIZON, 2);
+}
+
+#[test]
+fn the_committed_contract_is_the_codes() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
+    let document = openapi::document();
+    if std::env::var_os("UPDATE_OPENAPI").is_some() {
+        std::fs::write(path, &document).unwrap();
+    }
+    let committed = std::fs::read_to_string(path).unwrap_or_default();
+    assert!(
+        committed == document,
+        "openapi/openapi.json differs from the code; write it anew by\n  \
+         UPDATE_OPENAPI=1 cargo test --release --test it the_committed_contract_is_the_codes"
+    );
+}
+
+#[tokio::test]
+async fn every_path_of_the_contract_is_answered() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let contract = get(&app, "/openapi.json").await.json();
+    assert!(contract["openapi"].as_str().unwrap().starts_with("3.1"));
+    for (path, methods) in contract["paths"].as_object().unwrap() {
+        for method in methods.as_object().unwrap().keys() {
+            let path = path.replace("{model}", "plain").replace("{id}", "job-9");
+            let method = method.to_uppercase();
+            let request = Request::builder()
+                .method(method.as_str())
+                .uri(&path)
+                .body(Body::empty())
+                .unwrap();
+            let answer = send(&app, request).await;
+            let text = String::from_utf8_lossy(&answer.body).into_owned();
+            assert!(
+                answer.status != 405 && !text.contains("nothing at this path"),
+                "{method} {path}: {text}"
+            );
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! What the tests of the service share: small models with random weights, requests, and a running server.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use axum::body::Body;
+use axum::http::{HeaderMap, Method, Request, StatusCode, header};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use foreframe::frame::{Frame, codec};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
+use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe::server::{self, App, ServerConfig, ServerError};
+use foreframe::types::Seed;
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+use tower::ServiceExt as _;
+
+pub const WIDTH: u32 = 16;
+pub const HEIGHT: u32 = 12;
+pub const CONTEXT: usize = 3;
+pub const HORIZON: usize = 2;
+/// Longer than anything here takes.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+pub fn spec(conditioning: Conditioning) -> ModelSpec {
+    let channel = |name: &str, unit: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 0.0,
+        std: 1.0,
+    };
+    ModelSpec {
+        frame_width_px: WIDTH,
+        frame_height_px: HEIGHT,
+        context: CONTEXT,
+        horizon: HORIZON,
+        features: 8,
+        hidden: 8,
+        conditioning,
+        actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
+        states: vec![channel("x", "m")],
+        ..ModelSpec::default()
+    }
+}
+
+/// A model that takes long enough to compute that others queue behind it.
+pub fn slow_spec() -> ModelSpec {
+    ModelSpec {
+        features: 64,
+        hidden: 1024,
+        ..spec(Conditioning::None)
+    }
+}
+
+/// Publishes a model with random weights below `dir` and loads it.
+pub fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let manifest = Manifest {
+        name: name.to_owned(),
+        version: 1,
+        weights_sha256: String::new(),
+        dataset: DatasetStamp {
+            name: "none".to_owned(),
+            content_hash: String::new(),
+            scenario: None,
+            windows: 1,
+            split_seed: Seed(0),
+        },
+        seed: Seed(1),
+        command: "a test".to_owned(),
+        training: json!({}),
+        metrics: json!({}),
+        parameters: spec.parameter_count(),
+        multiply_adds_per_frame: spec.multiply_adds_per_frame(),
+        program: ProgramStamp::current(),
+        spec,
+    };
+    let model_dir = dir.join(name);
+    registry::publish(&model_dir, &parameters, &manifest).unwrap();
+    registry::load(&model_dir).unwrap()
+}
+
+/// An unconditioned model `plain` and a conditioned one `moving`.
+pub fn app(dir: &Path, config: ServerConfig) -> App {
+    let models = vec![
+        model(&dir.join("models"), "plain", spec(Conditioning::None)),
+        model(&dir.join("models"), "moving", spec(Conditioning::StateAction)),
+    ];
+    App::start(with_data(dir, config), models).unwrap()
+}
+
+pub fn with_data(dir: &Path, config: ServerConfig) -> ServerConfig {
+    ServerConfig {
+        data_dir: dir.to_owned(),
+        ..config
+    }
+}
+
+pub fn frame(value: u8) -> Frame {
+    let pixels = (0..WIDTH * HEIGHT).map(|i| value.wrapping_add((i * 3) as u8)).collect();
+    Frame::new(WIDTH, HEIGHT, pixels).unwrap()
+}
+
+pub fn png(frame: &Frame) -> String {
+    STANDARD.encode(codec::encode_png(frame).unwrap())
+}
+
+pub fn context() -> Vec<String> {
+    (0..CONTEXT as u8).map(|i| png(&frame(i * 10))).collect()
+}
+
+pub struct Answer {
+    pub status: StatusCode,
+    pub headers: HeaderMap,
+    pub body: Vec<u8>,
+}
+
+impl Answer {
+    pub fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&self.body)))
+    }
+
+    /// The detail of a problem, whose shape is checked.
+    pub fn detail(&self, status: u16) -> String {
+        assert_eq!(self.status, status, "{}", String::from_utf8_lossy(&self.body));
+        assert_eq!(self.headers[header::CONTENT_TYPE], "application/problem+json");
+        let problem = self.json();
+        assert_eq!(problem["status"], status);
+        assert_eq!(problem["instance"], self.headers["x-request-id"].to_str().unwrap());
+        for field in ["type", "title", "detail"] {
+            assert!(problem[field].as_str().is_some_and(|text| !text.is_empty()), "{field}");
+        }
+        problem["detail"].as_str().unwrap().to_owned()
+    }
+}
+
+pub async fn send(app: &App, request: Request<Body>) -> Answer {
+    let response = server::router(app.clone()).oneshot(request).await.unwrap();
+    let (status, headers) = (response.status(), response.headers().clone());
+    let body = axum::body::to_bytes(response.into_body(), 1 << 24)
+        .await
+        .unwrap()
+        .to_vec();
+    Answer { status, headers, body }
+}
+
+pub async fn get(app: &App, path: &str) -> Answer {
+    send(app, Request::get(path).body(Body::empty()).unwrap()).await
+}
+
+pub async fn post(app: &App, path: &str, body: &Value) -> Answer {
+    post_text(app, path, body.to_string(), "*/*").await
+}
+
+pub async fn post_text(app: &App, path: &str, body: String, accept: &str) -> Answer {
+    let request = Request::builder()
+        .method(Method::POST)
+        .uri(path)
+        .header(header::CONTENT_TYPE, "application/json")
+        .header(header::ACCEPT, accept)
+        .body(Body::from(body))
+        .unwrap();
+    send(app, request).await
+}
+
+/// A server on a port of its own.
+pub struct Running {
+    pub address: std::net::SocketAddr,
+    pub shutdown: oneshot::Sender<()>,
+    pub task: JoinHandle<Result<(), ServerError>>,
+}
+
+pub async fn run(app: App) -> Running {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let (shutdown, asked) = oneshot::channel();
+    let task = tokio::spawn(server::serve(listener, app, async move {
+        let _ = asked.await;
+    }));
+    Running {
+        address,
+        shutdown,
+        task,
+    }
+}
+
+impl Running {
+    pub async fn stop(self) {
+        let _ = self.shutdown.send(());
+        tokio::time::timeout(PATIENCE, self.task)
+            .await
+            .unwrap()
+            .unwrap()
+            .unwrap();
+    }
+}
+
+/// Asks again and again until the answer is `Some`.
+pub async fn until<T, F: Future<Output = Option<T>>>(mut ask: impl FnMut() -> F) -> T {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        if let Some(answer) = ask().await {
+            return answer;
+        }
+        assert!(Instant::now() < deadline, "nothing within {PATIENCE:?}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}

@@ -1,0 +1,325 @@
+//! The stream over a real socket.
+
+use std::time::Duration;
+
+use foreframe::nn::Conditioning;
+use foreframe::server::{App, ServerConfig};
+use futures_util::{SinkExt as _, StreamExt as _};
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::tungstenite::http::HeaderValue;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+
+use crate::service::{
+    CONTEXT, PATIENCE, Running, app, context, frame, get, model, png, post, run, spec, until, with_data,
+};
+
+type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+
+async fn connect(server: &Running, model: &str, subprotocol: &str) -> Result<Socket, Box<Error>> {
+    let mut request = format!("ws://{}/v1/models/{model}/stream", server.address)
+        .into_client_request()
+        .unwrap();
+    request
+        .headers_mut()
+        .insert("sec-websocket-protocol", HeaderValue::from_str(subprotocol).unwrap());
+    let (socket, _) = tokio_tungstenite::connect_async(request).await.map_err(Box::new)?;
+    Ok(socket)
+}
+
+async fn open(server: &Running, model: &str) -> Socket {
+    let mut socket = connect(server, model, "foreframe.v1.json").await.unwrap();
+    let ready = receive(&mut socket).await;
+    assert_eq!((&ready["type"], &ready["next_seq"]), (&json!("ready"), &json!(0)));
+    socket
+}
+
+async fn receive(socket: &mut Socket) -> Value {
+    let message = tokio::time::timeout(PATIENCE, socket.next())
+        .await
+        .unwrap()
+        .unwrap()
+        .unwrap();
+    serde_json::from_str(message.to_text().unwrap()).unwrap()
+}
+
+async fn ask(socket: &mut Socket, message: Value) -> Value {
+    socket.send(Message::text(message.to_string())).await.unwrap();
+    receive(socket).await
+}
+
+fn frame_message(seq: u64) -> Value {
+    json!({"type": "frame", "seq": seq, "timestamp_us": seq * 1000, "image": png(&frame(seq as u8 * 10))})
+}
+
+fn status(error: &Error) -> u16 {
+    match error {
+        Error::Http(response) => response.status().as_u16(),
+        other => panic!("{other}"),
+    }
+}
+
+#[tokio::test]
+async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let mut socket = open(&server, "plain").await;
+    for seq in 0..CONTEXT as u64 - 1 {
+        let warming = ask(&mut socket, frame_message(seq)).await;
+        assert_eq!(
+            (&warming["type"], &warming["have"]),
+            (&json!("warming"), &json!(seq + 1))
+        );
+        assert_eq!(warming["need"], CONTEXT);
+    }
+    let prediction = ask(&mut socket, frame_message(CONTEXT as u64 - 1)).await;
+    assert_eq!(prediction["timestamp_us"], (CONTEXT as u64 - 1) * 1000);
+    let stateless = post(&app, "/v1/models/plain/predict", &json!({"frames": context()}))
+        .await
+        .json();
+    assert_eq!(prediction["frames"], stateless["frames"]);
+    assert_eq!(
+        (&prediction["format"], &prediction["dropped"]),
+        (&json!("png"), &json!(0))
+    );
+
+    let next = ask(&mut socket, frame_message(CONTEXT as u64)).await;
+    let later: Vec<String> = (1..=CONTEXT as u8).map(|i| png(&frame(i * 10))).collect();
+    let stateless = post(&app, "/v1/models/plain/predict", &json!({"frames": later}))
+        .await
+        .json();
+    assert_eq!(next["frames"], stateless["frames"]);
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_plan_is_predicted_under_and_without_one_the_action_is_held() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    let mut answers = Vec::new();
+    for extra in [
+        json!({}),
+        json!({"plan": [[3.0, -2.0], [3.0, -2.0]]}),
+        json!({"plan": [[-3.0, 2.0], [-3.0, 2.0]]}),
+    ] {
+        let mut socket = open(&server, "moving").await;
+        let mut last = Value::Null;
+        for seq in 0..CONTEXT as u64 {
+            let mut message = frame_message(seq);
+            let fields = message.as_object_mut().unwrap();
+            fields.extend(
+                json!({"action": [3.0, -2.0], "state": [0.5]})
+                    .as_object()
+                    .unwrap()
+                    .clone(),
+            );
+            fields.extend(extra.as_object().unwrap().clone());
+            last = ask(&mut socket, message).await;
+        }
+        answers.push(last["frames"].clone());
+    }
+    assert!(answers[0].is_array());
+    assert_eq!(answers[0], answers[1]);
+    assert_ne!(answers[0], answers[2]);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_number_that_is_next() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    let mut socket = open(&server, "plain").await;
+    let gap = ask(&mut socket, frame_message(5)).await;
+    assert_eq!(
+        (&gap["code"], &gap["detail"]),
+        (&json!("gap"), &json!("seq is 5; seq 0 is next"))
+    );
+    assert_eq!(gap["next_seq"], 0);
+    let mut answers = Vec::new();
+    for seq in 0..CONTEXT as u64 {
+        answers.push(ask(&mut socket, frame_message(seq)).await);
+    }
+    assert_eq!(
+        &ask(&mut socket, frame_message(CONTEXT as u64 - 1)).await,
+        answers.last().unwrap()
+    );
+    assert_eq!(&ask(&mut socket, frame_message(0)).await, answers.last().unwrap());
+    assert_eq!(ask(&mut socket, frame_message(9)).await["next_seq"], CONTEXT);
+    let next = ask(&mut socket, frame_message(CONTEXT as u64)).await;
+    assert_eq!((&next["type"], &next["seq"]), (&json!("prediction"), &json!(CONTEXT)));
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn what_is_refused_leaves_the_stream_where_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    let mut socket = open(&server, "moving").await;
+    let with = |more: Value| {
+        let mut message = frame_message(0);
+        let fields = message.as_object_mut().unwrap();
+        fields.extend(
+            json!({"action": [0.0, 0.0], "state": [0.0]})
+                .as_object()
+                .unwrap()
+                .clone(),
+        );
+        fields.extend(more.as_object().unwrap().clone());
+        message
+    };
+    let small = png(&foreframe::frame::Frame::new(8, 8, vec![0; 64]).unwrap());
+    for (message, code, detail) in [
+        (json!({"type": "configure"}), "malformed", "unknown variant `configure`"),
+        (with(json!({"colour": 1})), "malformed", "unknown field `colour`"),
+        (
+            with(json!({"image": small})),
+            "invalid",
+            "image is 8×8 px; model \"moving\" takes 16×12",
+        ),
+        (with(json!({"action": [0.0]})), "invalid", "actions[0] holds 1 numbers"),
+        (with(json!({"state": null})), "invalid", "state is missing"),
+        (
+            with(json!({"action": [1e39, 0.0]})),
+            "invalid",
+            "action component 0 is inf",
+        ),
+        (
+            with(json!({"plan": [[0.0, 0.0]]})),
+            "invalid",
+            "future_actions holds 1 actions",
+        ),
+    ] {
+        let answer = ask(&mut socket, message).await;
+        assert_eq!(
+            (&answer["type"], &answer["code"]),
+            (&json!("error"), &json!(code)),
+            "{answer}"
+        );
+        assert!(answer["detail"].as_str().unwrap().contains(detail), "{answer}");
+        assert_eq!(answer["next_seq"], 0);
+    }
+    socket.send(Message::binary(vec![1, 2, 3])).await.unwrap();
+    assert_eq!(receive(&mut socket).await["code"], "malformed");
+    assert_eq!(ask(&mut socket, with(json!({}))).await["type"], "warming");
+    let pong = ask(&mut socket, json!({"type": "ping", "timestamp_us": 7})).await;
+    assert_eq!(pong, json!({"type": "pong", "timestamp_us": 7}));
+    let closing = ask(&mut socket, json!({"type": "close"})).await;
+    assert_eq!(closing, json!({"type": "closing", "reason": "asked"}));
+    let Message::Close(Some(close)) = socket.next().await.unwrap().unwrap() else {
+        panic!()
+    };
+    assert_eq!(close.code, CloseCode::Normal);
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_stream_that_cannot_be_opened_is_refused_before_the_upgrade() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_streams: 1,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    assert_eq!(
+        status(&connect(&server, "none", "foreframe.v1.json").await.unwrap_err()),
+        404
+    );
+    assert_eq!(status(&connect(&server, "plain", "chat").await.unwrap_err()), 400);
+    let socket = open(&server, "plain").await;
+    assert_eq!(
+        status(&connect(&server, "plain", "foreframe.v1.json").await.unwrap_err()),
+        503
+    );
+    drop(socket);
+    until(async || connect(&server, "plain", "foreframe.v1.json").await.ok()).await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_message_over_the_limit_ends_its_stream_only() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_body_bytes: 4096,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    let (mut greedy, mut other) = (open(&server, "plain").await, open(&server, "plain").await);
+    // The server may hang up before all is sent.
+    let _ = greedy.send(Message::text("x".repeat(100_000))).await;
+    let end = until(async || match greedy.next().await {
+        None | Some(Err(_) | Ok(Message::Close(_))) => Some(()),
+        Some(Ok(_)) => None,
+    });
+    end.await;
+    assert_eq!(ask(&mut other, frame_message(0)).await["type"], "warming");
+    drop((greedy, other));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_silent_stream_is_ended_with_a_word() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        stream_idle_ms: 20,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    let mut socket = open(&server, "plain").await;
+    assert_eq!(receive(&mut socket).await, json!({"type": "closing", "reason": "idle"}));
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_client_that_never_reads_loses_its_stream() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_streams: 1,
+        stream_send_ms: 50,
+        ..with_data(dir.path(), ServerConfig::default())
+    };
+    let large = foreframe::nn::ModelSpec {
+        frame_width_px: 128,
+        frame_height_px: 128,
+        context: 1,
+        horizon: 8,
+        ..spec(Conditioning::None)
+    };
+    let server = run(App::start(config, vec![model(dir.path(), "large", large)]).unwrap()).await;
+    let mut socket = open(&server, "large").await;
+    let image = base64::Engine::encode(&base64::engine::general_purpose::STANDARD, vec![0; 128 * 128]);
+    let message = json!({"type": "frame", "seq": 0, "timestamp_us": 0, "image": image, "format": "raw"}).to_string();
+    // Each small message is answered by a large one, the kept answer; nothing is read.
+    let flood = async { while socket.send(Message::text(message.clone())).await.is_ok() {} };
+    let _ = tokio::time::timeout(Duration::from_secs(20), flood).await;
+    until(async || connect(&server, "large", "foreframe.v1.json").await.ok()).await;
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn stopping_ends_streams_with_1001_and_is_not_ready() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let mut socket = open(&server, "plain").await;
+    let Running { shutdown, task, .. } = server;
+    shutdown.send(()).unwrap();
+    assert_eq!(
+        receive(&mut socket).await,
+        json!({"type": "closing", "reason": "shutdown"})
+    );
+    let Message::Close(Some(close)) = socket.next().await.unwrap().unwrap() else {
+        panic!()
+    };
+    assert_eq!(close.code, CloseCode::Away);
+    assert_eq!(get(&app, "/readyz").await.detail(503), "the server is stopping");
+    tokio::time::timeout(PATIENCE, task).await.unwrap().unwrap().unwrap();
+}
