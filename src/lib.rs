@@ -27,3 +27,5 @@ pub mod jobs;
 pub mod server;
 
 pub mod telemetry;
+
+pub mod cli;

@@ -6,17 +6,22 @@
 //! on the CPU. Frames are in the model's space ([`crate::frame::preprocess`]).
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
-//! → [`lstm`] (over time) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`].
+//! → [`lstm`] (over time; `recurrence` and `gates` are its
+//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`].
 
+mod activation;
 pub mod autoencoder;
 pub mod conditioned;
 pub mod dense;
+mod gates;
 pub mod init;
 pub mod loss;
 pub mod lstm;
 pub mod lstm_cell;
 pub mod parameters;
+mod recurrence;
 pub mod spec;
+pub(crate) mod tensors;
 
 pub use autoencoder::{Feedback, Model};
 pub use conditioned::Condition;

@@ -6,8 +6,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{Frame, FrameError, MAX_SIDE_PX};
-use crate::types::{Action, Channel, RobotState, Seed, ValueError};
+use crate::frame::Frame;
+use crate::types::{Action, Channel, RobotState, Seed};
 
 pub mod arena;
 pub mod camera;
@@ -15,7 +15,9 @@ mod cast;
 pub mod config;
 mod driver;
 pub mod environment;
+mod error;
 mod look;
+mod mover;
 mod navigator;
 mod physics;
 pub mod pid;
@@ -24,11 +26,13 @@ pub mod scenario;
 
 pub use config::{CameraConfig, WorldConfig};
 pub use environment::Environment;
+pub use error::SimError;
 pub use scenario::{PidGains, Scenario, TrialParameters};
 
-use camera::{Camera, Mover};
+use camera::Camera;
 use driver::Driver;
 use look::Look;
+use mover::Mover;
 use navigator::Navigator;
 use physics::Stage;
 
@@ -36,53 +40,6 @@ use physics::Stage;
 const PHYSICS_STEP_S: f32 = 0.02;
 /// A mover that drives in a scenario without an end takes another goal after touching something for this long.
 const BLOCKED_LIMIT_S: f32 = 1.0;
-
-/// Why a world was not made or a step not taken.
-#[derive(Debug, thiserror::Error)]
-pub enum SimError {
-    /// No scenario has that name.
-    #[error("there is no scenario \"{name}\"; there are {}", scenario::names())]
-    UnknownScenario {
-        /// The name given.
-        name: String,
-    },
-    /// A frame side is zero or too large.
-    #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]
-    FrameSize {
-        /// Width in pixels.
-        width: u32,
-        /// Height in pixels.
-        height: u32,
-    },
-    /// A setting is out of range.
-    #[error("{name} is {value}; it must be {rule}")]
-    Setting {
-        /// The field of [`WorldConfig`].
-        name: &'static str,
-        /// The value found.
-        value: f64,
-        /// What would be right.
-        rule: String,
-    },
-    /// An action has the wrong number of components.
-    #[error("an action of {found} components was given; it takes 2: linear (m/s) and angular (rad/s)")]
-    ActionLength {
-        /// Components given.
-        found: usize,
-    },
-    /// The trial has ended.
-    #[error("the trial has ended; reset to begin another")]
-    Ended,
-    /// A step was asked of an environment that was never reset.
-    #[error("the environment was never reset; reset it before the first step")]
-    NotReset,
-    /// A number that is not finite reached an action or a state.
-    #[error(transparent)]
-    Value(#[from] ValueError),
-    /// The camera's picture is no frame.
-    #[error(transparent)]
-    Frame(#[from] FrameError),
-}
 
 /// Where something stands on the floor.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -168,9 +125,11 @@ impl World {
         Self::from_parameters(TrialParameters::draw(scenario, seed, trial), config)
     }
 
-    /// Begins a trial with those parameters, so that one can be looked at again or set up by hand.
+    /// Begins a trial with those parameters, so that one can be looked at again or set up by hand. Errors: as
+    /// [`WorldConfig::validate`] and [`TrialParameters::validate`].
     pub fn from_parameters(parameters: TrialParameters, config: &WorldConfig) -> Result<Self, SimError> {
         config.validate()?;
+        parameters.validate()?;
         let mut stage = Stage::new();
         stage.add_robot(parameters.observer, look::TURTLEBOT.radius_m);
         let mut actors = Vec::new();

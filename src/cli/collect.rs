@@ -36,7 +36,7 @@ pub(super) struct Args {
     frame_size: u32,
     /// Standard deviation of the camera's noise, where 1 is white
     #[arg(long, value_name = "STD", default_value_t = WorldConfig::default().camera.noise_std)]
-    noise: f32,
+    noise: f64,
 }
 
 pub(super) fn run(args: Args) -> Result<(), CliError> {
@@ -44,7 +44,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
         return Err(CliError::Usage("--trials is 0; a data set takes at least 1".to_owned()));
     }
     let out = args.out.unwrap_or_else(|| PathBuf::from("data").join(args.scenario.to_string()));
-    let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), out.clone());
+    let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), &out);
     config.world.frame_width_px = args.frame_size;
     config.world.frame_height_px = args.frame_size;
     config.world.camera.noise_std = args.noise;

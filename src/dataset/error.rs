@@ -142,7 +142,7 @@ pub enum DatasetError {
         /// The file.
         path: PathBuf,
         /// The column of images.
-        column: String,
+        column: &'static str,
         /// Row in it.
         row: usize,
         /// What is wrong with the image.

@@ -16,9 +16,10 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 use serde::{Deserialize, Serialize};
 
+use super::check::check_episode;
 use super::layout::{ACTION, COUNTERS, IMAGE, MASK, STATE, TIMESTAMP, huggingface_features};
 use super::stats::FeatureStats;
-use super::{DatasetError, DatasetInfo, EpisodeData, check_episode};
+use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::frame::{Frame, codec};
 
 /// Key of the episodes' records in a shard's footer.

@@ -17,13 +17,13 @@ use crate::frame::codec;
 pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let metadata =
-        ArrowReaderMetadata::load(&file, ArrowReaderOptions::default()).map_err(|error| corrupt(path, error))?;
+        ArrowReaderMetadata::load(&file, ArrowReaderOptions::default()).map_err(|error| corrupt(path, &error))?;
     let pairs = metadata.metadata().file_metadata().key_value_metadata();
     let text = pairs
         .and_then(|pairs| pairs.iter().find(|pair| pair.key == RECORDS_KEY))
         .and_then(|pair| pair.value.as_deref())
-        .ok_or_else(|| corrupt(path, format!("its footer has no \"{RECORDS_KEY}\"")))?;
-    serde_json::from_str(text).map_err(|error| corrupt(path, error))
+        .ok_or_else(|| corrupt(path, &format!("its footer has no \"{RECORDS_KEY}\"")))?;
+    serde_json::from_str(text).map_err(|error| corrupt(path, &error))
 }
 
 /// The batches of a Parquet file, read whole.
@@ -31,11 +31,11 @@ pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = ParquetRecordBatchReaderBuilder::try_new(file)
         .and_then(ParquetRecordBatchReaderBuilder::build)
-        .map_err(|error| corrupt(path, error))?;
-    reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, error))
+        .map_err(|error| corrupt(path, &error))?;
+    reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, &error))
 }
 
-fn corrupt(path: &Path, reason: impl ToString) -> DatasetError {
+fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
     DatasetError::Corrupt {
         path: path.to_owned(),
         reason: reason.to_string().trim().to_owned(),
@@ -80,7 +80,7 @@ pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
 fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
     corrupt(
         &slot.path,
-        format!("it has {found} rows or more where {} are recorded", slot.frames),
+        &format!("it has {found} rows or more where {} are recorded", slot.frames),
     )
 }
 
@@ -114,7 +114,7 @@ fn read_batch(
     let first = (slot.first_frame + row) as i64;
     let indexes = column.numbers::<Int64Type>("index")?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(corrupt(&slot.path, "its index column does not count the frames"));
+        return Err(corrupt(&slot.path, &"its index column does not count the frames"));
     }
     Ok(())
 }
@@ -127,14 +127,14 @@ struct ImageTarget<'a> {
 }
 
 impl ImageTarget<'_> {
-    fn decode(&self, batch: &RecordBatch, key: &str, pixels: &mut [u8]) -> Result<(), DatasetError> {
+    fn decode(&self, batch: &RecordBatch, key: &'static str, pixels: &mut [u8]) -> Result<(), DatasetError> {
         let images = image_bytes(batch, key)
-            .ok_or_else(|| corrupt(self.path, format!("it has no column \"{key}\" of images")))?;
+            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
         for (row, target) in pixels.chunks_mut(self.info.frame_pixels()).enumerate() {
             let frame = codec::decode(images.value(row)).map_err(|source| DatasetError::CorruptFrame {
                 path: self.path.to_owned(),
                 row: self.row + row,
-                column: key.to_owned(),
+                column: key,
                 source,
             })?;
             let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
@@ -145,7 +145,7 @@ impl ImageTarget<'_> {
                     frame.width(),
                     frame.height()
                 );
-                return Err(corrupt(self.path, reason));
+                return Err(corrupt(self.path, &reason));
             }
             target.copy_from_slice(frame.pixels());
         }
@@ -173,7 +173,7 @@ impl<'a> Column<'a> {
             .and_then(|column| column.as_primitive_opt::<T>())
             .filter(|column| column.null_count() == 0)
             .map(|column| &column.values()[..])
-            .ok_or_else(|| corrupt(self.path, format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
+            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
     }
 
     /// The vectors of `size` numbers of a column, one after another; none where `size` is 0.
@@ -188,19 +188,19 @@ impl<'a> Column<'a> {
             .column_by_name(key)
             .and_then(|column| column.as_fixed_size_list_opt())
             .filter(|list| list.null_count() == 0)
-            .ok_or_else(|| corrupt(self.path, format!("it has no column \"{key}\" of vectors")))?;
+            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
         if list.value_length() as usize != size {
             let reason = format!("\"{key}\" has {} components; {size} are described", list.value_length());
-            return Err(corrupt(self.path, reason));
+            return Err(corrupt(self.path, &reason));
         }
         let values = list.values().as_primitive_opt::<Float32Type>();
         // A slice of a list array keeps all values: take those of its rows.
-        let first = list.value_offset_at(0) as usize;
+        let first = list.value_offset_at(0);
         let rows = first..first + list.len() * size;
         values
             .filter(|values| values.null_count() == 0)
             .and_then(|values| values.values().get(rows))
-            .ok_or_else(|| corrupt(self.path, format!("\"{key}\" does not hold 32-bit numbers")))
+            .ok_or_else(|| corrupt(self.path, &format!("\"{key}\" does not hold 32-bit numbers")))
     }
 
     /// The texts of a column, empty places as none.
@@ -209,6 +209,6 @@ impl<'a> Column<'a> {
             .column_by_name(key)
             .and_then(|column| column.as_string_opt::<i32>())
             .map(|column| column.iter().collect())
-            .ok_or_else(|| corrupt(self.path, format!("it has no column \"{key}\" of text")))
+            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of text")))
     }
 }

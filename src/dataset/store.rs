@@ -5,12 +5,13 @@ use std::path::Path;
 use arrow_array::types::Int64Type;
 use rayon::prelude::*;
 
+use super::check::{Numbers, check_numbers};
 use super::files::{verify, write_atomically};
 use super::layout::{self, EPISODES, INFO, STAMP, STATS, ShardEntry, Stamp, TASKS};
 use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};
-use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters, check_numbers};
+use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
 
 impl Dataset {
     /// Reads a data set whole, after checking that every file is the one that was written.
@@ -52,7 +53,7 @@ impl Dataset {
             check_numbers(
                 &dataset.info,
                 episode.index,
-                &super::Numbers {
+                &Numbers {
                     actions: &dataset.actions[frames.start * actions..frames.end * actions],
                     states: &dataset.states[frames.start * states..frames.end * states],
                     timestamps_s: &dataset.timestamps_s[frames],

@@ -4,7 +4,7 @@ use candle_core::Tensor;
 
 use super::conditioned::Condition;
 use super::dense::{Activation, Dense};
-use super::lstm::unroll;
+use super::lstm::{Decoder, unroll};
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::{ModelSpec, NnError, Parameters, Reconstruction};
 
@@ -64,12 +64,12 @@ impl Model {
         };
         let cell = |name: &str| {
             let peephole = |gate: &str| tensor(format!("{name}.peephole_{gate}"));
-            Ok::<_, NnError>(PeepholeCell {
-                w_x: tensor(format!("{name}.w_x"))?,
-                w_h: tensor(format!("{name}.w_h"))?,
-                bias: tensor(format!("{name}.bias"))?,
-                peepholes: [peephole("i")?, peephole("f")?, peephole("o")?],
-            })
+            Ok::<_, NnError>(PeepholeCell::new(
+                tensor(format!("{name}.w_x"))?,
+                tensor(format!("{name}.w_h"))?,
+                tensor(format!("{name}.bias"))?,
+                [peephole("i")?, peephole("f")?, peephole("o")?],
+            ))
         };
         Ok(Self {
             frame_encoder: dense("frame_encoder", Activation::Tanh)?,
@@ -113,52 +113,52 @@ impl Model {
                 &[Some(batch), Some(self.spec.horizon), Some(self.spec.features)],
             )?;
         }
-        let condition = condition.inputs(&self.spec, batch)?;
-        let (_, mut state) = self.encode(features)?;
-        let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
-        let mut predicted = Vec::with_capacity(self.spec.horizon);
-        for k in 0..self.spec.horizon {
-            let input = match &condition {
-                Some(condition) => Tensor::cat(&[&last, &condition.get_on_dim(1, k)?], 1)?,
-                None => last.clone(),
-            };
-            state = self.predictor.step(&input, &state)?;
-            let next = (&last + self.predictor_output.forward(&state.h)?)?;
-            last = match feedback {
-                Feedback::Prediction => next.clone(),
-                Feedback::Truth(truth) => truth.get_on_dim(1, k)?.contiguous()?,
-            };
-            predicted.push(next);
-        }
-        Ok(Tensor::stack(&predicted, 1)?)
+        let conditions = condition.inputs(&self.spec, batch)?;
+        let (_, state) = self.encode(features)?;
+        let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
+        let truth = match feedback {
+            Feedback::Truth(truth) => truth,
+            Feedback::Prediction => {
+                let decoder = Decoder {
+                    cell: &self.predictor,
+                    output: &self.predictor_output,
+                    adds: true,
+                };
+                return decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state);
+            }
+        };
+        let before = Tensor::cat(&[&last.unsqueeze(1)?, &truth.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
+        let inputs = match &conditions {
+            Some(conditions) => Tensor::cat(&[&before, conditions], 2)?,
+            None => before.clone(),
+        };
+        let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
+        let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
+        Ok((before + changes.reshape(truth.dims())?)?)
     }
 
-    /// The features [B, context, F] again, from what the encoder kept of them. Errors: `Shape`.
+    /// The features [B, context, F] again, from what the encoder kept of them. Approach 1 (sequence): from the encoder's
+    /// last state, the first input zeros, then the decoder's own output. Approach 2 (stepwise): after each frame, from
+    /// the encoder's output there. Errors: `Shape`.
     pub fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
         let (outputs, state) = self.encode(features)?;
         match self.spec.reconstruction {
-            Reconstruction::Sequence => self.reconstruct_sequence(features, state),
+            Reconstruction::Sequence => {
+                let decoder = Decoder {
+                    cell: &self.reconstructor,
+                    output: &self.reconstructor_output,
+                    adds: false,
+                };
+                let first = features.get_on_dim(1, 0)?.zeros_like()?.contiguous()?;
+                decoder.run(self.spec.context, &first, None, &state)
+            }
             Reconstruction::Stepwise => {
-                let (outputs, _) = unroll(&self.reconstructor, &outputs, self.reconstructor.zero_state(batch)?)?;
+                let (outputs, _) = unroll(&self.reconstructor, &outputs, &self.reconstructor.zero_state(batch)?)?;
                 let flat = self.reconstructor_output.forward(&outputs.flatten(0, 1)?)?;
                 Ok(flat.reshape(features.dims())?)
             }
         }
-    }
-
-    /// Approach 1: decodes the whole sequence from the encoder's last state; the first input is zeros, then the decoder's
-    /// own output.
-    fn reconstruct_sequence(&self, features: &Tensor, state: LstmState) -> Result<Tensor, NnError> {
-        let mut state = state;
-        let mut last = features.get_on_dim(1, 0)?.zeros_like()?;
-        let mut outputs = Vec::with_capacity(self.spec.context);
-        for _ in 0..self.spec.context {
-            state = self.reconstructor.step(&last, &state)?;
-            last = self.reconstructor_output.forward(&state.h)?;
-            outputs.push(last.clone());
-        }
-        Ok(Tensor::stack(&outputs, 1)?)
     }
 
     /// Frames [B, horizon, P] that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
@@ -174,7 +174,7 @@ impl Model {
 
     /// The encoder's outputs [B, context, H] and its last state.
     fn encode(&self, features: &Tensor) -> Result<(Tensor, LstmState), NnError> {
-        unroll(&self.encoder, features, self.encoder.zero_state(features.dim(0)?)?)
+        unroll(&self.encoder, features, &self.encoder.zero_state(features.dim(0)?)?)
     }
 
     fn check_windows(&self, features: &Tensor) -> Result<usize, NnError> {

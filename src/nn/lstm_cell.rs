@@ -27,6 +27,17 @@ pub struct PeepholeCell {
 }
 
 impl PeepholeCell {
+    /// A cell of those weights: `w_x` [D, 4H], `w_h` [H, 4H], bias [4H], and the diagonals of `W_ci`, `W_cf`, `W_co` [H].
+    #[must_use]
+    pub fn new(w_x: Tensor, w_h: Tensor, bias: Tensor, peepholes: [Tensor; 3]) -> Self {
+        Self {
+            w_x,
+            w_h,
+            bias,
+            peepholes,
+        }
+    }
+
     /// Hidden units, H.
     pub(super) fn hidden(&self) -> usize {
         self.bias.elem_count() / 4
@@ -42,6 +53,7 @@ impl PeepholeCell {
     }
 
     /// Advances the cell one step (paper, eqs. 1–5). x is [B, D], state [B, H].
+    /// Sequences of f32 go through [`super::lstm`], which does the same in fewer passes.
     pub fn step(&self, x: &Tensor, state: &LstmState) -> Result<LstmState, NnError> {
         let sums = (x.matmul(&self.w_x)?.broadcast_add(&self.bias)? + state.h.matmul(&self.w_h)?)?;
         let hidden = self.hidden();

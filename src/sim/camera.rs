@@ -5,12 +5,12 @@ use std::sync::LazyLock;
 
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
-use rapier3d::parry::shape::{Cuboid, FeatureId};
+use rapier3d::parry::query::{Ray, RayCast};
+use rapier3d::parry::shape::Cuboid;
 use rapier3d::prelude::Vector;
 
 use super::cast::UprightCylinder;
-use super::look::{Look, Solid};
+use super::mover::{Hit, Mover, Seen, face};
 use super::{PlanarPose, SimError, WorldConfig, arena};
 use crate::frame::Frame;
 
@@ -23,70 +23,11 @@ const AMBIENT: f32 = 0.6;
 /// Towards the lamp.
 static LIGHT: LazyLock<Vector> = LazyLock::new(|| Vector::new(-0.45, 0.35, 0.82).normalize());
 
-/// A robot as the camera sees it.
-pub struct Mover {
-    look: &'static Look,
-    position: Vector,
-    cos: f32,
-    sin: f32,
-    id: u8,
-}
-
-impl Mover {
-    pub(super) fn new(look: &'static Look, pose: PlanarPose, id: u8) -> Self {
-        let (sin, cos) = pose.heading_rad.sin_cos();
-        Self {
-            look,
-            position: Vector::new(pose.x_m, pose.y_m, 0.0),
-            cos,
-            sin,
-            id,
-        }
-    }
-
-    /// From the room's axes to the robot's own.
-    fn inward(&self, v: Vector) -> Vector {
-        Vector::new(self.cos * v.x + self.sin * v.y, self.cos * v.y - self.sin * v.x, v.z)
-    }
-
-    fn outward(&self, v: Vector) -> Vector {
-        Vector::new(self.cos * v.x - self.sin * v.y, self.sin * v.x + self.cos * v.y, v.z)
-    }
-
-    /// How much of the light its body leaves to a point of the floor.
-    fn shade(&self, x: f32, y: f32) -> f32 {
-        let reach = 1.7 * self.look.radius_m;
-        let away = ((x - self.position.x).powi(2) + (y - self.position.y).powi(2)) / (reach * reach);
-        let dark = (1.0 - away).max(0.0);
-        1.0 - 0.45 * dark * dark
-    }
-}
-
-/// A mover with what is the same for all rays of a picture.
-struct Seen<'a> {
-    mover: &'a Mover,
-    /// Camera in the mover's own axes.
-    origin: Vector,
-    /// From the camera to the middle of the ball about the mover.
-    to_middle: Vector,
-    /// Squared distance to that middle less the squared radius.
-    outside: f32,
-}
-
 /// What one ray brings back.
 #[derive(Clone, Copy)]
 struct Sample {
     gray: f32,
     /// Which face of which solid; differs between any two.
-    surface: u16,
-    owner: u8,
-}
-
-/// What a ray hits first, so far.
-struct Hit {
-    time: f32,
-    normal: Vector,
-    albedo: f32,
     surface: u16,
     owner: u8,
 }
@@ -139,7 +80,7 @@ impl Camera {
     }
 
     /// The picture and whose pixel is whose. Errors: `Frame` if the size is out of range.
-    pub fn take(&self, movers: &[Mover], mut noise: ChaCha8Rng) -> Result<(Frame, Vec<u8>), SimError> {
+    pub(super) fn take(&self, movers: &[Mover], mut noise: ChaCha8Rng) -> Result<(Frame, Vec<u8>), SimError> {
         let samples = self.render(movers);
         let pixels = samples
             .iter()
@@ -158,7 +99,7 @@ impl Camera {
 
     /// One ray through each pixel's middle, then more where they disagree.
     fn render(&self, movers: &[Mover]) -> Vec<Sample> {
-        let seen: Vec<Seen> = movers.iter().map(|mover| self.see(mover)).collect();
+        let seen: Vec<Seen> = movers.iter().map(|mover| Seen::new(mover, self.position)).collect();
         let mut middles = Vec::with_capacity(self.width * self.height);
         for row in 0..self.height {
             for column in 0..self.width {
@@ -174,18 +115,6 @@ impl Camera {
                 }
             })
             .collect()
-    }
-
-    fn see<'a>(&self, mover: &'a Mover) -> Seen<'a> {
-        let half = mover.look.height_m / 2.0;
-        let to_middle = mover.position + Vector::new(0.0, 0.0, half) - self.position;
-        let reach_squared = mover.look.radius_m.powi(2) + half * half;
-        Seen {
-            mover,
-            origin: mover.inward(self.position - mover.position),
-            to_middle,
-            outside: to_middle.length_squared() - reach_squared,
-        }
     }
 
     fn is_edge(&self, samples: &[Sample], index: usize) -> bool {
@@ -293,39 +222,6 @@ impl Camera {
 
 /// The room's side that is the floor.
 const FLOOR: u16 = 4;
-
-impl Seen<'_> {
-    /// Puts the mover's nearest part into `hit` if it is before what was there.
-    fn cast(&self, direction: Vector, hit: &mut Hit) {
-        let along = self.to_middle.dot(direction);
-        if along * along < direction.length_squared() * self.outside {
-            return;
-        }
-        let ray = Ray::new(self.origin, self.mover.inward(direction));
-        for (part, index) in self.mover.look.parts.iter().zip(0u16..) {
-            let found = match &part.solid {
-                Solid::Cylinder(shape) => shape.cast_local_ray_and_get_normal(&ray, hit.time, true),
-                Solid::Block(shape) => shape.cast_local_ray_and_get_normal(&ray, hit.time, true),
-            };
-            if let Some(found) = found {
-                *hit = Hit {
-                    time: found.time_of_impact,
-                    normal: self.mover.outward(found.normal),
-                    albedo: part.albedo,
-                    surface: 256 * u16::from(self.mover.id) + 8 * index + face(&found) as u16,
-                    owner: self.mover.id,
-                };
-            }
-        }
-    }
-}
-
-fn face(found: &RayIntersection) -> usize {
-    match found.feature {
-        FeatureId::Face(index) => index as usize,
-        _ => 0,
-    }
-}
 
 /// The value that occurs most often in a sorted list, the smallest where several do.
 fn most_frequent(sorted: &[u8]) -> u8 {

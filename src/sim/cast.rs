@@ -17,13 +17,15 @@ type Span = [(f32, u32); 2];
 
 impl UprightCylinder {
     /// When the ray is inside, or nothing if it misses.
+    #[inline]
     fn span(&self, ray: &Ray) -> Option<Span> {
         let (o, d) = (ray.origin, ray.dir);
         let outside = o.x * o.x + o.y * o.y - self.radius * self.radius;
         let a = d.x * d.x + d.y * d.y;
         let b = o.x * d.x + o.y * d.y;
         let under_root = b * b - a * outside;
-        if under_root < 0.0 || (a == 0.0 && outside > 0.0) {
+        // Most rays end here: past the cylinder, or going away from it.
+        if under_root < 0.0 || (outside > 0.0 && b >= 0.0) {
             return None;
         }
         let (enter, exit) = if a == 0.0 {
@@ -50,6 +52,7 @@ impl UprightCylinder {
 }
 
 impl RayCast for UprightCylinder {
+    #[inline]
     fn cast_local_ray_and_get_normal(&self, ray: &Ray, most: f32, solid: bool) -> Option<RayIntersection> {
         let [first, last] = self.span(ray)?;
         let (time, face, outward) = match (first.0 >= 0.0, solid) {
@@ -80,6 +83,7 @@ pub(super) struct Block {
 }
 
 impl RayCast for Block {
+    #[inline]
     fn cast_local_ray_and_get_normal(&self, ray: &Ray, most: f32, solid: bool) -> Option<RayIntersection> {
         let moved = ray.translate_by(-Vector::from_array(self.middle));
         Cuboid::new(Vector::from_array(self.half)).cast_local_ray_and_get_normal(&moved, most, solid)

@@ -85,7 +85,8 @@ impl WorldConfig {
     }
 }
 
-fn in_range(name: &'static str, value: f64, least: f64, most: f64) -> Result<(), SimError> {
+/// Errors: `Setting` with the range if the value is not in it.
+pub(super) fn in_range(name: &'static str, value: f64, least: f64, most: f64) -> Result<(), SimError> {
     if value.is_finite() && (least..=most).contains(&value) {
         return Ok(());
     }

@@ -8,6 +8,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::config::in_range;
 use super::pid::Gains;
 use super::{PlanarPose, SimError, arena, robot};
 use crate::types::Seed;
@@ -20,6 +21,8 @@ pub const HEADING_GAIN: Range<f32> = 1.2..4.0;
 pub const HELD_OUT_HEADING_GAIN: Range<f32> = 2.44..2.72;
 /// Movers in `crowded` besides Tb2.
 const CROWD: usize = 3;
+/// Most movers besides Tb2 that parameters written by hand may ask for.
+const MAX_CROWD: usize = 16;
 
 /// Who moves, and when a trial ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
@@ -184,6 +187,21 @@ impl TrialParameters {
             observer,
             crowd,
         }
+    }
+
+    /// Errors: `Setting` where parameters that were written by hand name a start or goal that is not there, place a robot
+    /// outside the room, or crowd it.
+    pub fn validate(&self) -> Result<(), SimError> {
+        in_range("start", self.start as f64, 0.0, arena::STARTS_M.len() as f64 - 1.0)?;
+        in_range("goal", self.goal as f64, 0.0, arena::GOALS_M.len() as f64 - 1.0)?;
+        in_range("crowd's size", self.crowd.len() as f64, 0.0, MAX_CROWD as f64)?;
+        for pose in self.crowd.iter().map(|route| route.pose).chain([self.observer]) {
+            in_range("x_m", f64::from(pose.x_m), 0.0, f64::from(arena::LENGTH_M))?;
+            let side = f64::from(arena::WIDTH_M) / 2.0;
+            in_range("y_m", f64::from(pose.y_m), -side, side)?;
+            in_range("heading_rad", f64::from(pose.heading_rad), -7.0, 7.0)?;
+        }
+        Ok(())
     }
 
     /// Whether the trial belongs to those that no training may see, by its start/goal pair or its heading gain. Where

@@ -155,7 +155,11 @@ fn a_damaged_shard_of_an_unfinished_collection_is_made_anew() {
     let (_directory, whole) = finished();
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("set");
-    run_until(&config(&out), 8).unwrap_err();
+    let one_thread = CollectConfig {
+        threads: 1,
+        ..config(&out)
+    };
+    run_until(&one_thread, 8).unwrap_err();
     let shard = out.join("data/chunk-000/file-000.parquet");
     let bytes = fs::read(&shard).unwrap();
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();

@@ -8,5 +8,14 @@ mod jobs;
 mod server;
 mod service;
 mod sim;
+
+mod nn_cell;
+mod nn_common;
+mod nn_model;
+mod nn_optimizer;
+mod nn_spec;
+mod sim_refusals;
+mod evaluation;
+mod sim;
 mod stream;
 mod training;

@@ -3,8 +3,8 @@
 use foreframe::sim::camera::Camera;
 use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
 use foreframe::sim::{
-    Environment, Observation, PlanarPose, Scenario, SimError, TrialParameters, World, WorldConfig, action_channels,
-    arena, robot, state_channels,
+    Observation, PlanarPose, Scenario, TrialParameters, World, WorldConfig, action_channels, arena, robot,
+    state_channels,
 };
 use foreframe::types::{Action, Seed};
 
@@ -329,67 +329,4 @@ fn channels_name_what_actions_and_states_hold() {
     assert_eq!(world.policy_action().as_slice(), [0.0, 0.0]);
     assert_eq!(action_channels().len(), 2);
     assert_eq!(state_channels().len(), world.observe().state.as_slice().len());
-}
-
-#[test]
-fn an_unknown_scenario_is_answered_with_those_there_are() {
-    let error = "static".parse::<Scenario>().unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "there is no scenario \"static\"; there are static-observer, moving-observer, crowded"
-    );
-    for scenario in Scenario::ALL {
-        assert_eq!(scenario.to_string().parse::<Scenario>().unwrap(), scenario);
-        assert_eq!(serde_json::to_value(scenario).unwrap(), scenario.name());
-    }
-}
-
-#[test]
-fn settings_out_of_range_are_refused_with_their_range() {
-    let refusal = |change: fn(&mut WorldConfig)| {
-        let mut config = WorldConfig::default();
-        change(&mut config);
-        World::new(Scenario::StaticObserver, &config, Seed(1), 0)
-            .err()
-            .unwrap()
-            .to_string()
-    };
-    assert_eq!(
-        refusal(|config| config.frame_width_px = 0),
-        "a frame of 0×64 px is out of range; each side must be 1 to 4096 px"
-    );
-    assert_eq!(
-        refusal(|config| config.camera.noise_std = f64::NAN),
-        "camera.noise_std is NaN; it must be a finite number from 0 to 1"
-    );
-    assert!(refusal(|config| config.frame_period_s = 0.0).starts_with("frame_period_s is 0; it must be"));
-    assert!(refusal(|config| config.camera.horizontal_fov_rad = 4.0).contains("from 0.1 to 2.8"));
-    assert!(refusal(|config| config.camera.height_m = f64::INFINITY).starts_with("camera.height_m is inf"));
-    assert!(refusal(|config| config.max_duration_s = 0.1).contains("from 0.4 to 3600"));
-    assert!(serde_json::from_str::<WorldConfig>(r#"{"frame_widht_px": 64}"#).is_err());
-}
-
-#[test]
-fn an_action_of_another_length_is_refused() {
-    let mut world = World::new(Scenario::MovingObserver, &small(), Seed(1), 0).unwrap();
-    let error = world.step(&Action::try_from(vec![0.0; 3]).unwrap()).unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "an action of 3 components was given; it takes 2: linear (m/s) and angular (rad/s)"
-    );
-    assert!(Action::try_from(vec![0.0, f32::NAN]).is_err());
-}
-
-#[test]
-fn an_environment_is_reset_before_and_after_an_episode() {
-    let mut environment = Environment::new(Scenario::StaticObserver, small()).unwrap();
-    let still = action(0.0, 0.0);
-    assert!(matches!(environment.step(&still), Err(SimError::NotReset)));
-    let (first, drawn) = environment.reset(Some(Seed(8))).unwrap();
-    assert_eq!((drawn.seed, drawn.trial), (Seed(8), 0));
-    while !matches!(environment.step(&still), Err(SimError::Ended)) {}
-    let (next, drawn) = environment.reset(None).unwrap();
-    assert_eq!(drawn.trial, 1);
-    assert!(next != first);
-    assert_eq!(environment.reset(Some(Seed(8))).unwrap().0, first);
 }

@@ -1,0 +1,280 @@
+//! Does the action matter? The same weights told true, shuffled and zeroed actions, and an unconditioned twin.
+
+use rand::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::bootstrap::{Bootstrap, Interval, Trials};
+use super::inference::{self, Told};
+use super::metrics::Curve;
+use super::{EvaluationError, Stage, Watched};
+use crate::dataset::{Dataset, Window};
+use crate::frame::preprocess::scale;
+use crate::frame::quality;
+use crate::registry::LoadedModel;
+use crate::types::Seed;
+
+/// One row of the action table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Variant {
+    /// The actions that were taken.
+    True,
+    /// The actions of another window.
+    Shuffled,
+    /// Zero in every component.
+    Zeroed,
+    /// A model without conditioning, trained with the same budget.
+    UnconditionedTwin,
+}
+
+impl Variant {
+    /// The row's name in words.
+    #[must_use]
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::True => "true actions",
+            Self::Shuffled => "shuffled actions",
+            Self::Zeroed => "zeroed actions",
+            Self::UnconditionedTwin => "unconditioned twin",
+        }
+    }
+}
+
+/// Scores of one variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActionRow {
+    /// What the model was told.
+    pub variant: Variant,
+    /// Mean squared error per pixel.
+    pub mse: Curve,
+    /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
+    pub interval: Option<Interval>,
+    /// 1 − MSE(true) / MSE(this): by how much the true actions lower the error.
+    pub reduction: f64,
+    /// Its 95 % interval, both resampled together.
+    pub reduction_interval: Option<Interval>,
+}
+
+/// The table, and what may be said of it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActionTable {
+    /// True actions first.
+    pub rows: Vec<ActionRow>,
+    /// Whether true actions beat all three others with intervals that do not overlap.
+    pub conditioning_works: bool,
+    /// The finding in a sentence.
+    pub finding: String,
+}
+
+/// For each of `count` windows another one whose actions it is told: a single cycle through all (Sattolo 1986), so none
+/// keeps its own. With a single window there is no other.
+#[must_use]
+pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
+    let mut rng = seed.derive("shuffled actions", 0).rng();
+    let mut donors: Vec<usize> = (0..count).collect();
+    for last in (1..count).rev() {
+        donors.swap(last, rng.random_range(0..last));
+    }
+    donors
+}
+
+/// Errors of each variant, per window and step. Errors: those of the network, `NotFinite`.
+pub fn compare(
+    loaded: &LoadedModel,
+    twin: Option<&LoadedModel>,
+    dataset: &Dataset,
+    windows: &[Window],
+    watched: &Watched,
+) -> Result<Vec<(Variant, Vec<Vec<f64>>)>, EvaluationError> {
+    let donors: Vec<Window> = shuffle(windows.len(), watched.bootstrap.seed)
+        .into_iter()
+        .map(|donor| windows[donor])
+        .collect();
+    let mut variants = vec![
+        (Variant::True, loaded),
+        (Variant::Shuffled, loaded),
+        (Variant::Zeroed, loaded),
+    ];
+    variants.extend(twin.map(|twin| (Variant::UnconditionedTwin, twin)));
+    let total = variants.len() * windows.len();
+    let mut all = Vec::new();
+    for (variant, model) in variants {
+        let mut errors = Vec::with_capacity(windows.len());
+        for (batch, donors) in windows.chunks(watched.batch).zip(donors.chunks(watched.batch)) {
+            let told = match variant {
+                Variant::Shuffled => Told::Instead(donors),
+                Variant::Zeroed => Told::Zero,
+                Variant::True | Variant::UnconditionedTwin => Told::Truth,
+            };
+            errors.extend(errors_of(model, dataset, batch, told)?);
+            watched.tell(Stage::Actions, all.len() * windows.len() + errors.len(), total);
+        }
+        all.push((variant, errors));
+    }
+    Ok(all)
+}
+
+fn errors_of(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    told: Told,
+) -> Result<Vec<Vec<f64>>, EvaluationError> {
+    let spec = loaded.model.spec();
+    let predicted = inference::predict(loaded, dataset, windows, told)?;
+    let frames = predicted.par_chunks_exact(spec.horizon * spec.pixels());
+    let error = |(frames, window): (&[f32], &Window)| {
+        let steps = frames.chunks_exact(spec.pixels()).enumerate();
+        let mse = steps.map(|(step, frame)| {
+            let truth = scale(dataset.pixels(window.first_frame + spec.context + step));
+            quality::mse(&spec.preprocess.inverse(frame), &truth)
+        });
+        mse.collect()
+    };
+    Ok(frames.zip(windows).map(error).collect())
+}
+
+/// The table of these errors per variant, window and step; the true actions come first.
+#[must_use]
+pub fn table(errors: &[(Variant, Vec<Vec<f64>>)], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
+    let curves: Vec<Curve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
+    let of_window = |window: usize| -> Vec<f64> {
+        let mean = |(_, windows): &(Variant, Vec<Vec<f64>>)| Curve::new(windows[window].clone()).mean;
+        errors.iter().map(mean).collect()
+    };
+    let trials = Trials::group(trial_of, (0..trial_of.len()).map(of_window));
+    let reduction = |means: &[f64], row: usize| {
+        if means[row] > 0.0 {
+            1.0 - means[0] / means[row]
+        } else {
+            0.0
+        }
+    };
+    let intervals = trials.intervals(bootstrap, |means| {
+        let reductions = (0..means.len()).map(|row| reduction(means, row));
+        means.iter().copied().chain(reductions).collect()
+    });
+    let means = trials.means();
+    let rows: Vec<ActionRow> = errors
+        .iter()
+        .zip(curves)
+        .enumerate()
+        .map(|(row, ((variant, _), mse))| ActionRow {
+            variant: *variant,
+            mse,
+            interval: intervals.as_ref().map(|all| all[row]),
+            reduction: reduction(&means, row),
+            reduction_interval: intervals.as_ref().map(|all| all[errors.len() + row]),
+        })
+        .collect();
+    let (conditioning_works, finding) = judge(&rows);
+    ActionTable {
+        rows,
+        conditioning_works,
+        finding,
+    }
+}
+
+fn mean_over(windows: &[Vec<f64>]) -> Curve {
+    let mut sums = vec![0.0; windows.first().map_or(0, Vec::len)];
+    for window in windows {
+        for (sum, value) in sums.iter_mut().zip(window) {
+            *sum += value;
+        }
+    }
+    Curve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
+}
+
+/// "Works" only where true beats shuffled, zeroed and twin with intervals apart.
+fn judge(rows: &[ActionRow]) -> (bool, String) {
+    let Some((truth, others)) = rows.split_first() else {
+        return (false, "Nothing was compared.".to_owned());
+    };
+    let apart = |row: &&ActionRow| match (&truth.interval, &row.interval) {
+        (Some(truth), Some(other)) => truth.is_below(other),
+        _ => false,
+    };
+    let labels = |rows: &[&ActionRow]| {
+        rows.iter()
+            .map(|row| row.variant.label())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others.iter().partition(apart);
+    if !unbeaten.is_empty() {
+        let finding = format!(
+            "Conditioning is not shown to work: the interval of true actions is not wholly below that of {}.",
+            labels(&unbeaten)
+        );
+        return (false, finding);
+    }
+    if !others.iter().any(|row| row.variant == Variant::UnconditionedTwin) {
+        let finding = format!(
+            "Conditioning is not shown to work yet: true actions beat {} with intervals apart, but no unconditioned twin was compared.",
+            labels(&beaten)
+        );
+        return (false, finding);
+    }
+    let least = others.iter().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
+    let finding = format!(
+        "Conditioning works: true actions beat {} with intervals apart, by at least {:.0} % of the MSE.",
+        labels(&beaten),
+        100.0 * least
+    );
+    (true, finding)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn shuffling_permutes_and_no_window_keeps_its_own(count in 2usize..300, seed in any::<u64>()) {
+            let donors = shuffle(count, Seed(seed));
+            prop_assert!(donors.iter().enumerate().all(|(window, &donor)| window != donor));
+            let mut sorted = donors;
+            sorted.sort_unstable();
+            prop_assert_eq!(sorted, (0..count).collect::<Vec<_>>());
+        }
+    }
+
+    fn table_of(levels: &[(Variant, f64)]) -> ActionTable {
+        let trial_of: Vec<usize> = (0..60).map(|i| i / 3).collect();
+        let noisy = |level: f64| -> Vec<Vec<f64>> {
+            trial_of
+                .iter()
+                .map(|&trial| vec![level * (1.0 + 0.1 * (trial as f64).sin()); 2])
+                .collect()
+        };
+        let errors: Vec<_> = levels.iter().map(|&(variant, level)| (variant, noisy(level))).collect();
+        let bootstrap = Bootstrap {
+            samples: 200,
+            seed: Seed(1),
+        };
+        table(&errors, &trial_of, &bootstrap)
+    }
+
+    #[test]
+    fn conditioning_works_only_where_all_three_are_beaten_apart() {
+        let all = [
+            (Variant::True, 1.0),
+            (Variant::Shuffled, 2.0),
+            (Variant::Zeroed, 1.5),
+            (Variant::UnconditionedTwin, 1.4),
+        ];
+        let good = table_of(&all);
+        assert!(good.conditioning_works, "{}", good.finding);
+        assert!((good.rows[1].reduction - 0.5).abs() < 1e-9);
+        assert!(!table_of(&all[..3]).conditioning_works);
+        let close = table_of(&[all[0], all[1], (Variant::Zeroed, 1.01), all[3]]);
+        assert!(
+            !close.conditioning_works && close.finding.contains("zeroed"),
+            "{}",
+            close.finding
+        );
+    }
+}

@@ -1,0 +1,187 @@
+//! Intervals by bootstrap over trials (Efron 1979, percentiles). Windows overlap and so aren't independent; trials are.
+
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::types::Seed;
+
+/// How much of the resampled values an [`Interval`] holds.
+pub const CONFIDENCE: f64 = 0.95;
+
+/// The middle [`CONFIDENCE`] of the values that resampled trials gave.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Interval {
+    /// Lower end.
+    pub low: f64,
+    /// Upper end.
+    pub high: f64,
+}
+
+impl Interval {
+    /// Whether all of this interval lies under all of the other.
+    #[must_use]
+    pub fn is_below(&self, other: &Self) -> bool {
+        self.high < other.low
+    }
+}
+
+/// How often to resample, from which seed.
+#[derive(Clone, Copy, Debug)]
+pub struct Bootstrap {
+    /// Number of resamples.
+    pub samples: usize,
+    /// The same seed draws the same trials, so that what is computed apart is resampled alike.
+    pub seed: Seed,
+}
+
+/// Values per window, summed up by trial: all that resampling of trials needs.
+#[derive(Clone, Debug)]
+pub struct Trials {
+    windows: Vec<f64>,
+    sums: Vec<Vec<f64>>,
+}
+
+impl Trials {
+    /// Groups windows by their trial. `values` holds one row of equal length for every window, in the order of `trial_of`.
+    pub fn group<R: AsRef<[f64]>>(trial_of: &[usize], values: impl Iterator<Item = R>) -> Self {
+        let mut known: Vec<usize> = trial_of.to_vec();
+        known.sort_unstable();
+        known.dedup();
+        let mut trials = Self {
+            windows: vec![0.0; known.len()],
+            sums: vec![Vec::new(); known.len()],
+        };
+        for (trial, row) in trial_of.iter().zip(values) {
+            let Ok(group) = known.binary_search(trial) else {
+                continue;
+            };
+            let sums = &mut trials.sums[group];
+            sums.resize(row.as_ref().len(), 0.0);
+            trials.windows[group] += 1.0;
+            for (sum, value) in sums.iter_mut().zip(row.as_ref()) {
+                *sum += value;
+            }
+        }
+        trials
+    }
+
+    /// Number of trials.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.windows.len()
+    }
+
+    /// Mean over all windows, of each value.
+    #[must_use]
+    pub fn means(&self) -> Vec<f64> {
+        self.means_of(0..self.count())
+    }
+
+    fn means_of(&self, trials: impl Iterator<Item = usize>) -> Vec<f64> {
+        let mut means = vec![0.0; self.sums.first().map_or(0, Vec::len)];
+        let mut windows = 0.0;
+        for trial in trials {
+            windows += self.windows[trial];
+            for (mean, sum) in means.iter_mut().zip(&self.sums[trial]) {
+                *mean += sum;
+            }
+        }
+        for mean in &mut means {
+            *mean /= windows;
+        }
+        means
+    }
+
+    /// The interval of each value of `statistic`, a function of the means; none with fewer than two trials.
+    pub fn intervals(&self, bootstrap: &Bootstrap, statistic: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Interval>> {
+        let count = self.count();
+        if count < 2 || bootstrap.samples == 0 {
+            return None;
+        }
+        let mut rng = bootstrap.seed.derive("bootstrap", 0).rng();
+        let mut draws: Vec<Vec<f64>> = Vec::new();
+        for _ in 0..bootstrap.samples {
+            let drawn: Vec<usize> = (0..count).map(|_| rng.random_range(0..count)).collect();
+            let values = statistic(&self.means_of(drawn.into_iter()));
+            draws.resize(values.len(), Vec::with_capacity(bootstrap.samples));
+            for (draws, value) in draws.iter_mut().zip(values) {
+                draws.push(value);
+            }
+        }
+        Some(draws.into_iter().map(middle).collect())
+    }
+}
+
+fn middle(mut values: Vec<f64>) -> Interval {
+    values.sort_by(f64::total_cmp);
+    let tail = (1.0 - CONFIDENCE) / 2.0;
+    let at = |quantile: f64| values[(quantile * (values.len() - 1) as f64).round() as usize];
+    Interval {
+        low: at(tail),
+        high: at(1.0 - tail),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    fn means_only(means: &[f64]) -> Vec<f64> {
+        means.to_vec()
+    }
+
+    #[test]
+    fn a_known_mean_is_covered_about_as_often_as_promised() {
+        let normal = Normal::new(2.0, 1.0).unwrap();
+        let trial_of: Vec<usize> = (0..40).collect();
+        let covered = (0..200)
+            .filter(|&round| {
+                let mut rng = Seed(round).rng();
+                let rows: Vec<[f64; 1]> = trial_of.iter().map(|_| [normal.sample(&mut rng)]).collect();
+                let bootstrap = Bootstrap {
+                    samples: 300,
+                    seed: Seed(round),
+                };
+                let trials = Trials::group(&trial_of, rows.iter());
+                let interval = trials.intervals(&bootstrap, means_only).unwrap()[0];
+                (interval.low..=interval.high).contains(&2.0)
+            })
+            .count();
+        assert!((178..=198).contains(&covered), "{covered} of 200");
+    }
+
+    #[test]
+    fn windows_of_one_trial_do_not_narrow_the_interval() {
+        let values = [0.0, 1.0, 3.0, 7.0];
+        let bootstrap = Bootstrap {
+            samples: 500,
+            seed: Seed(1),
+        };
+        let once = Trials::group(&[0, 1, 2, 3], values.iter().map(|&v| [v]));
+        let trial_of: Vec<usize> = (0..400).map(|i| i / 100).collect();
+        let often = Trials::group(&trial_of, trial_of.iter().map(|&trial| [values[trial]]));
+        assert_eq!(
+            once.intervals(&bootstrap, means_only),
+            often.intervals(&bootstrap, means_only)
+        );
+    }
+
+    #[test]
+    fn the_seed_decides_and_one_trial_has_no_interval() {
+        let trial_of: Vec<usize> = (0..60).map(|i| i / 2).collect();
+        let trials = Trials::group(&trial_of, (0..60).map(|i| [f64::from(i).sin()]));
+        let with = |seed| trials.intervals(&Bootstrap { samples: 50, seed }, means_only);
+        assert_eq!(with(Seed(1)), with(Seed(1)));
+        assert_ne!(with(Seed(1)), with(Seed(2)));
+        let uneven = Trials::group(&[4, 9, 9, 2], [[1.0], [2.0], [4.0], [8.0]].iter());
+        assert_eq!(uneven.means(), [3.75]);
+        let alone = Trials::group(&[4, 4], [[1.0], [2.0]].iter());
+        let bootstrap = Bootstrap {
+            samples: 50,
+            seed: Seed(1),
+        };
+        assert!(alone.intervals(&bootstrap, means_only).is_none());
+    }
+}

@@ -1,0 +1,104 @@
+//! Whether a model and a data set belong together, checked before anything is computed.
+
+use super::EvaluationError;
+use crate::dataset::{Dataset, DatasetInfo};
+use crate::nn::{ChannelScale, ModelSpec};
+use crate::registry::LoadedModel;
+use crate::types::{Channel, Seed};
+
+/// Periods that differ by less than this share of themselves are the same.
+const PERIOD_TOLERANCE: f64 = 0.01;
+
+/// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model can't be run on the data set.
+pub fn check(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), EvaluationError> {
+    let (spec, info) = (loaded.model.spec(), dataset.info());
+    let model = || loaded.manifest.name.clone();
+    if (info.frame_width_px, info.frame_height_px) != (spec.frame_width_px, spec.frame_height_px) {
+        return Err(EvaluationError::FrameSize {
+            dataset: info.name.clone(),
+            width: info.frame_width_px,
+            height: info.frame_height_px,
+            model: model(),
+            wanted_width: spec.frame_width_px,
+            wanted_height: spec.frame_height_px,
+        });
+    }
+    if (info.frame_period_s - spec.frame_period_s).abs() > PERIOD_TOLERANCE * spec.frame_period_s {
+        return Err(EvaluationError::FramePeriod {
+            dataset: info.name.clone(),
+            period_s: info.frame_period_s,
+            model: model(),
+            wanted_s: spec.frame_period_s,
+        });
+    }
+    check_channels(info, spec, &model())
+}
+
+fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(), EvaluationError> {
+    let uses = [
+        ("action", spec.action_inputs(), &spec.actions, &info.action_channels),
+        ("state", spec.state_inputs(), &spec.states, &info.state_channels),
+    ];
+    for (kind, used, wanted, found) in uses {
+        if used.is_none() {
+            continue;
+        }
+        let scales_name = |scale: &ChannelScale| described(&scale.name, &scale.unit);
+        let channels_name = |channel: &Channel| described(&channel.name, &channel.unit);
+        let wanted: Vec<String> = wanted.iter().map(scales_name).collect();
+        let found: Vec<String> = found.iter().map(channels_name).collect();
+        if wanted != found {
+            return Err(EvaluationError::Channels {
+                dataset: info.name.clone(),
+                kind,
+                found: found.join(", "),
+                model: model.to_owned(),
+                wanted: wanted.join(", "),
+            });
+        }
+    }
+    Ok(())
+}
+
+fn described(name: &str, unit: &str) -> String {
+    if unit.is_empty() {
+        name.to_owned()
+    } else {
+        format!("{name} {unit}")
+    }
+}
+
+/// The seed of the split to test with: that of the model's training unless another is asked for.
+/// Errors: `SplitSeed` where that would test on what was trained on.
+pub fn split_seed(loaded: &LoadedModel, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {
+    let trained = &loaded.manifest.dataset;
+    let seed = asked.unwrap_or(trained.split_seed);
+    if seed != trained.split_seed && trained.content_hash == dataset.info().content_hash {
+        return Err(EvaluationError::SplitSeed {
+            model: loaded.manifest.name.clone(),
+            trained: trained.split_seed.0,
+            given: seed.0,
+        });
+    }
+    Ok(seed)
+}
+
+/// Errors: `Twin` where the unconditioned twin takes other windows than the model, or is conditioned.
+pub fn check_twin(loaded: &LoadedModel, twin: &LoadedModel) -> Result<(), EvaluationError> {
+    let (spec, other) = (loaded.model.spec(), twin.model.spec());
+    let refused = |found: String, wanted: String| EvaluationError::Twin {
+        twin: twin.manifest.name.clone(),
+        found,
+        model: loaded.manifest.name.clone(),
+        wanted,
+    };
+    if other.action_inputs().is_some() {
+        let found = format!("conditioning \"{}\"", other.conditioning);
+        return Err(refused(found, "conditioning \"none\"".to_owned()));
+    }
+    let window = |spec: &ModelSpec| format!("{} context frames and {} to predict", spec.context, spec.horizon);
+    if window(spec) != window(other) {
+        return Err(refused(window(other), window(spec)));
+    }
+    Ok(())
+}

@@ -1,0 +1,142 @@
+//! Why an evaluation was refused or stopped.
+
+use std::path::PathBuf;
+
+use crate::dataset::DatasetError;
+use crate::frame::FrameError;
+use crate::nn::NnError;
+
+/// What was wrong, and what would be right.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluationError {
+    /// The frames have another size.
+    #[error(
+        "data set \"{dataset}\" has frames of {width}×{height} px; model \"{model}\" takes {wanted_width}×{wanted_height}"
+    )]
+    FrameSize {
+        /// The data set's name.
+        dataset: String,
+        /// Width of its frames.
+        width: u32,
+        /// Height of its frames.
+        height: u32,
+        /// The model's name.
+        model: String,
+        /// Width that it takes.
+        wanted_width: u32,
+        /// Height that it takes.
+        wanted_height: u32,
+    },
+    /// The frames are further apart, or closer, than the model's.
+    #[error("data set \"{dataset}\" has a frame every {period_s} s; model \"{model}\" predicts one every {wanted_s} s")]
+    FramePeriod {
+        /// The data set's name.
+        dataset: String,
+        /// Seconds between its frames.
+        period_s: f64,
+        /// The model's name.
+        model: String,
+        /// Seconds between the model's frames.
+        wanted_s: f64,
+    },
+    /// Actions or states have other components.
+    #[error("data set \"{dataset}\" has the {kind} [{found}]; model \"{model}\" takes [{wanted}]")]
+    Channels {
+        /// The data set's name.
+        dataset: String,
+        /// `action` or `state`.
+        kind: &'static str,
+        /// Its components with units.
+        found: String,
+        /// The model's name.
+        model: String,
+        /// The components that it takes, with units.
+        wanted: String,
+    },
+    /// Another split would test on what the model was trained on.
+    #[error(
+        "model \"{model}\" was trained on this data set with split seed {trained}; split seed {given} would test it on frames it was trained on"
+    )]
+    SplitSeed {
+        /// The model's name.
+        model: String,
+        /// The seed of its training's split.
+        trained: u64,
+        /// The seed asked for.
+        given: u64,
+    },
+    /// The twin can't be compared with the model.
+    #[error("twin \"{twin}\" has {found}; to be compared with model \"{model}\" it needs {wanted}")]
+    Twin {
+        /// The twin's name.
+        twin: String,
+        /// What it has.
+        found: String,
+        /// The model's name.
+        model: String,
+        /// What it needs.
+        wanted: String,
+    },
+    /// A setting is out of range.
+    #[error("{setting} is {value}; it must be at least {least}")]
+    Setting {
+        /// The setting.
+        setting: &'static str,
+        /// Its value.
+        value: usize,
+        /// The least accepted.
+        least: usize,
+    },
+    /// There is nothing to test on.
+    #[error("data set \"{dataset}\" has no held-out trials with split seed {split_seed}; collect at least ten trials")]
+    NothingHeldOut {
+        /// The data set's name.
+        dataset: String,
+        /// The split's seed.
+        split_seed: u64,
+    },
+    /// A prediction was NaN or infinite.
+    #[error(
+        "model \"{model}\" predicted a value that is not a finite number for the window at frame {frame}; its weights are not usable"
+    )]
+    NotFinite {
+        /// The model's name.
+        model: String,
+        /// First frame of the window.
+        frame: usize,
+    },
+    /// The output directory holds something.
+    #[error("{} exists and is not empty; name a new directory", .0.display())]
+    OutputExists(PathBuf),
+    /// A file could not be written.
+    #[error("could not write {}: {source}", path.display())]
+    Io {
+        /// The file or directory.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A chart could not be drawn.
+    #[error("could not draw {file}: {reason}")]
+    Chart {
+        /// The chart's file.
+        file: String,
+        /// The drawing library's reason.
+        reason: String,
+    },
+    /// The data set does not serve.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// A frame does not serve.
+    #[error(transparent)]
+    Frame(#[from] FrameError),
+    /// The network refused its input.
+    #[error(transparent)]
+    Network(#[from] NnError),
+}
+
+impl From<candle_core::Error> for EvaluationError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Network(error.into())
+    }
+}

@@ -1,0 +1,63 @@
+//! What the model sees ahead over a whole trial, as an endless GIF.
+
+use super::montage::{Row, Style, montage};
+use crate::frame::{Frame, FrameError, codec};
+
+/// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
+#[derive(Clone, Debug)]
+pub struct Moment {
+    /// What came.
+    pub truth: Frame,
+    /// What the model predicted.
+    pub predicted: Frame,
+    /// What a trivial baseline predicted.
+    pub copied: Frame,
+}
+
+/// Moments in their order.
+#[derive(Clone, Debug)]
+pub struct Animation {
+    /// How far ahead of the last frame seen.
+    pub steps_ahead: usize,
+    /// Seconds from one moment to the next.
+    pub period_s: f64,
+    /// The baseline's name.
+    pub baseline: &'static str,
+    /// What is shown.
+    pub moments: Vec<Moment>,
+}
+
+impl Animation {
+    /// What it shows, in a phrase.
+    #[must_use]
+    pub fn caption(&self) -> String {
+        format!(
+            "The trial of the median window, {} frames ({:.1} s) ahead: truth, prediction, {}",
+            self.steps_ahead,
+            self.steps_ahead as f64 * self.period_s,
+            self.baseline
+        )
+    }
+
+    /// The animation as a GIF. Errors: `Size` if the frames are too large to be put side by side.
+    pub fn encode(&self) -> Result<Vec<u8>, FrameError> {
+        let frames = self.moments.iter().map(|moment| {
+            let cell = |label: &str, frame: &Frame| (label.to_owned(), frame.clone());
+            let row = Row {
+                label: String::new(),
+                cells: vec![
+                    cell("truth", &moment.truth),
+                    cell("predicted", &moment.predicted),
+                    cell("last seen", &moment.copied),
+                ],
+            };
+            let style = Style {
+                grid_lines: 0,
+                ..Style::for_frames_of(moment.truth.width())
+            };
+            montage(&format!("{} frames ahead", self.steps_ahead), &[row], &style)
+        });
+        let frames = frames.collect::<Result<Vec<Frame>, FrameError>>()?;
+        codec::encode_gif(&frames, (self.period_s * 1000.0).round().max(20.0) as u32)
+    }
+}

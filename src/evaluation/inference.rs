@@ -1,0 +1,153 @@
+//! Windows through a model, batch by batch.
+
+use candle_core::{Device, Tensor};
+use rayon::prelude::*;
+
+use super::EvaluationError;
+use crate::dataset::{Dataset, Window};
+use crate::frame::Frame;
+use crate::frame::preprocess::Preprocess;
+use crate::nn::{Condition, ModelSpec};
+use crate::registry::LoadedModel;
+
+/// Which actions the model is told.
+#[derive(Clone, Copy, Debug)]
+pub enum Told<'a> {
+    /// Those that were taken.
+    Truth,
+    /// For each window, in the order of the batch, those taken in another one.
+    Instead(&'a [Window]),
+    /// Zero in every component, in the channels' own units.
+    Zero,
+}
+
+/// What a model made of a batch of windows. All frames are `[window][step]`, P values each, one after another, in the
+/// model's space and not clamped.
+#[derive(Clone, Debug)]
+pub struct Predicted {
+    /// The predicted frames.
+    pub frames: Vec<f32>,
+    /// The true frames to come.
+    pub truth: Vec<f32>,
+    /// The true frames to come through the dense layers.
+    pub codec: Vec<f32>,
+}
+
+/// Predicts each window's frames to come. Errors: those of the network, `NotFinite`.
+pub fn predict(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    told: Told,
+) -> Result<Vec<f32>, EvaluationError> {
+    let spec = loaded.model.spec();
+    let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
+    let frames = Tensor::from_vec(inputs, (windows.len(), spec.context, spec.pixels()), &Device::Cpu)?;
+    let condition = condition(spec, dataset, windows, told)?;
+    let predicted = values(&loaded.model.predict_frames(&frames, &condition)?)?;
+    let window_values = spec.horizon * spec.pixels();
+    match predicted.iter().position(|value| !value.is_finite()) {
+        Some(place) => Err(EvaluationError::NotFinite {
+            model: loaded.manifest.name.clone(),
+            frame: windows
+                .get(place / window_values)
+                .map_or(0, |window| window.first_frame),
+        }),
+        None => Ok(predicted),
+    }
+}
+
+/// As [`predict`] with the true actions, and what the dense layers alone make of the true frames to come.
+pub fn predict_with_ceiling(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+) -> Result<Predicted, EvaluationError> {
+    let spec = loaded.model.spec();
+    let frames = predict(loaded, dataset, windows, Told::Truth)?;
+    let truth = model_space(
+        dataset,
+        spec.preprocess,
+        windows,
+        spec.context..spec.context + spec.horizon,
+    )?;
+    let targets = Tensor::from_slice(&truth, (windows.len() * spec.horizon, spec.pixels()), &Device::Cpu)?;
+    let codec = values(&loaded.model.decode_frames(&loaded.model.encode_frames(&targets)?)?)?;
+    Ok(Predicted { frames, truth, codec })
+}
+
+/// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space.
+pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
+    let (model, spec) = (&loaded.model, loaded.model.spec());
+    let (batch, context) = (windows.len(), spec.context);
+    let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
+    let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
+    let features = model.encode_frames(&frames)?.reshape((batch, context, spec.features))?;
+    let features = model
+        .reconstruct(&features)?
+        .reshape((batch * context, spec.features))?;
+    values(&model.decode_frames(&features)?)
+}
+
+fn values(tensor: &Tensor) -> Result<Vec<f32>, EvaluationError> {
+    Ok(tensor.flatten_all()?.to_vec1::<f32>()?)
+}
+
+/// Those steps of each window in the model's space.
+fn model_space(
+    dataset: &Dataset,
+    preprocess: Preprocess,
+    windows: &[Window],
+    steps: std::ops::Range<usize>,
+) -> Result<Vec<f32>, EvaluationError> {
+    let info = dataset.info();
+    let frames: Vec<usize> = windows
+        .iter()
+        .flat_map(|window| steps.clone().map(|step| window.first_frame + step))
+        .collect();
+    let size = info.frame_pixels();
+    let mut all = vec![0.0; frames.len() * size];
+    all.par_chunks_mut(size)
+        .zip(frames)
+        .try_for_each(|(out, frame)| -> Result<(), EvaluationError> {
+            let pixels = dataset.pixels(frame).to_vec();
+            let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels)?;
+            out.copy_from_slice(&preprocess.forward(&frame));
+            Ok(())
+        })?;
+    Ok(all)
+}
+
+/// Action k of a window is the one taken at the frame before its k-th predicted frame.
+fn condition(
+    spec: &ModelSpec,
+    dataset: &Dataset,
+    windows: &[Window],
+    told: Told,
+) -> Result<Condition, EvaluationError> {
+    let batch = windows.len();
+    let mut condition = Condition::none();
+    if let Some(count) = spec.action_inputs() {
+        let taken = |windows: &[Window]| -> Vec<f32> {
+            let frames = windows.iter().flat_map(|window| {
+                let last = window.first_frame + spec.context - 1;
+                last..last + spec.horizon
+            });
+            frames.flat_map(|frame| dataset.action(frame).iter().copied()).collect()
+        };
+        let actions = match told {
+            Told::Truth => taken(windows),
+            Told::Instead(others) => taken(others),
+            Told::Zero => vec![0.0; batch * spec.horizon * count],
+        };
+        condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);
+    }
+    if let Some(count) = spec.state_inputs() {
+        let states: Vec<f32> = windows
+            .iter()
+            .flat_map(|window| dataset.state(window.first_frame + spec.context - 1).iter().copied())
+            .collect();
+        condition.state = Some(Tensor::from_vec(states, (batch, count), &Device::Cpu)?);
+    }
+    Ok(condition)
+}

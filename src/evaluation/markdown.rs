@@ -1,0 +1,327 @@
+//! The report in Markdown.
+
+use std::fmt::Write;
+
+use super::actions::ActionTable;
+use super::baselines::Method;
+use super::bootstrap::{CONFIDENCE, Interval};
+use super::metrics::{Curve, MethodScores, PSNR_CAP_DB};
+use super::report::{ModelSummary, Outcome, Report, SetReport, SetScores, Stamp};
+
+/// Squared errors are shown in this unit.
+const MSE_UNIT: f64 = 1e-4;
+
+pub(super) fn render(report: &Report) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_report(&mut text, report);
+    text
+}
+
+fn write_report(out: &mut String, report: &Report) -> std::fmt::Result {
+    writeln!(
+        out,
+        "# Model `{}` on data set `{}`\n",
+        report.stamp.model, report.stamp.dataset
+    )?;
+    headline(out, report)?;
+    for set in &report.sets {
+        if let Some(scores) = set.outcome.scores() {
+            writeln!(out, "\n## {}\n", title(&set.split))?;
+            set_section(out, scores)?;
+        }
+    }
+    figures(out, report)?;
+    how(out)?;
+    model(out, &report.model)?;
+    stamp(out, &report.stamp)
+}
+
+fn title(split: &str) -> &'static str {
+    match split {
+        "test" => "Trials never seen",
+        _ => "Start/goal pairs and gains never seen",
+    }
+}
+
+fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
+    writeln!(
+        out,
+        "Skill is 1 − MSE / MSE of the best trivial baseline at each step: 1 is perfect, 0 no better than the best of them.\n"
+    )?;
+    writeln!(
+        out,
+        "| Test set | Windows | Trials | Skill, mean t+1…t+{} | 95 % interval |",
+        report.model.horizon
+    )?;
+    writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
+    for SetReport { split, outcome } in &report.sets {
+        match outcome {
+            Outcome::Scored(scores) => writeln!(
+                out,
+                "| {} (`{split}`) | {} | {} | **{:.3}** | {} |",
+                title(split),
+                scores.windows,
+                scores.trials,
+                scores.skill.skill.mean,
+                interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}")),
+            )?,
+            Outcome::Skipped { reason } => {
+                writeln!(out, "| {} (`{split}`) | – | – | skipped: {reason} | – |", title(split))?
+            }
+        }
+    }
+    Ok(())
+}
+
+fn interval(interval: Option<&Interval>, format: impl Fn(f64) -> String) -> String {
+    interval.map_or_else(
+        || "– (one trial)".to_owned(),
+        |interval| format!("{} … {}", format(interval.low), format(interval.high)),
+    )
+}
+
+fn in_mse_units(value: f64) -> String {
+    let scaled = value / MSE_UNIT;
+    match scaled.abs() {
+        size if size >= 100.0 => format!("{scaled:.0}"),
+        size if size >= 10.0 => format!("{scaled:.1}"),
+        size if size >= 0.1 || size == 0.0 => format!("{scaled:.2}"),
+        _ => format!("{scaled:.4}"),
+    }
+}
+
+fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
+    if scores.windows < scores.windows_available {
+        writeln!(
+            out,
+            "{} of {} windows, evenly spread over {} trials.\n",
+            scores.windows, scores.windows_available, scores.trials
+        )?;
+    }
+    skill_table(out, scores)?;
+    let methods = &scores.methods;
+    table(out, "MSE per pixel, ×10⁻⁴", methods, |row| Some(&row.mse), in_mse_units)?;
+    table(
+        out,
+        "PSNR, dB",
+        methods,
+        |row| Some(&row.psnr_db),
+        |value| format!("{value:.2}"),
+    )?;
+    table(
+        out,
+        "SSIM",
+        methods,
+        |row| Some(&row.ssim),
+        |value| format!("{value:.4}"),
+    )?;
+    if methods.iter().any(|row| row.mover_mse.is_some()) {
+        let name = "MSE on the pixels of moving robots, ×10⁻⁴";
+        table(out, name, methods, |row| row.mover_mse.as_ref(), in_mse_units)?;
+    } else {
+        writeln!(
+            out,
+            "No error inside a mask: the data has no masks, or nobody moves in view.\n"
+        )?;
+    }
+    writeln!(
+        out,
+        "In the model's own space (smoothed, and inverted where it inverts) its MSE is {} ×10⁻⁴; that number serves no \
+         comparison with models that preprocess differently.",
+        in_mse_units(scores.model_space_mse.mean)
+    )?;
+    match &scores.actions {
+        Some(table) => action_table(out, table),
+        None => writeln!(out, "\nThe model takes no actions, so there is no action table."),
+    }
+}
+
+fn header(out: &mut String, first: &str, steps: usize) -> std::fmt::Result {
+    write!(out, "| {first} |")?;
+    for step in 1..=steps {
+        write!(out, " t+{step} |")?;
+    }
+    writeln!(out, " mean |")?;
+    writeln!(out, "| --- |{}", " ---: |".repeat(steps + 1))
+}
+
+fn skill_table(out: &mut String, scores: &SetScores) -> std::fmt::Result {
+    let skill = &scores.skill;
+    header(out, "Skill", skill.skill.per_step.len())?;
+    row(out, "**skill**", &skill.skill, |value| format!("**{value:.3}**"))?;
+    write!(out, "| 95 % interval |")?;
+    let intervals = skill.per_step_interval.iter().map(Some);
+    let none = std::iter::repeat_n(None, skill.skill.per_step.len() - skill.per_step_interval.len());
+    for step in intervals.chain(none).chain([skill.mean_interval.as_ref()]) {
+        write!(out, " {} |", interval(step, |value| format!("{value:.3}")))?;
+    }
+    write!(out, "\n| against |")?;
+    for method in &skill.best_baseline {
+        write!(out, " {} |", method.label())?;
+    }
+    writeln!(out, " |\n")
+}
+
+fn table<'a>(
+    out: &mut String,
+    name: &str,
+    methods: &'a [MethodScores],
+    curve: impl Fn(&'a MethodScores) -> Option<&'a Curve>,
+    format: impl Fn(f64) -> String,
+) -> std::fmt::Result {
+    let steps = methods.first().map_or(0, |method| method.mse.per_step.len());
+    header(out, name, steps)?;
+    for method in methods {
+        let Some(curve) = curve(method) else { continue };
+        if method.method == Method::Model {
+            row(out, "**model**", curve, |value| format!("**{}**", format(value)))?;
+        } else {
+            row(out, method.method.label(), curve, &format)?;
+        }
+    }
+    writeln!(out)
+}
+
+fn row(out: &mut String, label: &str, curve: &Curve, format: impl Fn(f64) -> String) -> std::fmt::Result {
+    write!(out, "| {label} |")?;
+    for &value in curve.per_step.iter().chain([&curve.mean]) {
+        write!(out, " {} |", format(value))?;
+    }
+    writeln!(out)
+}
+
+fn action_table(out: &mut String, table: &ActionTable) -> std::fmt::Result {
+    writeln!(out, "\n### Does the action matter?\n")?;
+    writeln!(out, "{}\n", table.finding)?;
+    writeln!(
+        out,
+        "| Told | MSE, ×10⁻⁴ | 95 % interval | True actions lower it by | 95 % interval |"
+    )?;
+    writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
+    let percent = |value: f64| format!("{:.1} %", 100.0 * value);
+    for (place, row) in table.rows.iter().enumerate() {
+        let mse = in_mse_units(row.mse.mean);
+        let mse_interval = interval(row.interval.as_ref(), in_mse_units);
+        let (reduction, reduction_interval) = if place == 0 {
+            ("–".to_owned(), "–".to_owned())
+        } else {
+            (
+                percent(row.reduction),
+                interval(row.reduction_interval.as_ref(), percent),
+            )
+        };
+        writeln!(
+            out,
+            "| {} | {mse} | {mse_interval} | {reduction} | {reduction_interval} |",
+            row.variant.label()
+        )?;
+    }
+    Ok(())
+}
+
+fn figures(out: &mut String, report: &Report) -> std::fmt::Result {
+    if report.figures.is_empty() {
+        return Ok(());
+    }
+    writeln!(out, "\n## Pictures\n")?;
+    writeln!(
+        out,
+        "Windows are chosen by the model's error alone: the median, the best and the worst."
+    )?;
+    for figure in &report.figures {
+        writeln!(out, "\n![{0}]({1})\n\n{0}.", figure.caption, figure.file)?;
+    }
+    Ok(())
+}
+
+fn how(out: &mut String) -> std::fmt::Result {
+    writeln!(out, "\n## How this was measured\n")?;
+    writeln!(
+        out,
+        "Frames are compared as the camera saw them, 0…1, neither inverted nor smoothed. PSNR is the mean over frames of each \
+         frame's own, at most {PSNR_CAP_DB:.0} dB (the error of rounding to 8 bits). SSIM has an 11-tap Gaussian window, \
+         sigma 1.5. The mean training frame knows the training split alone. Linear extrapolation is the least-squares line \
+         through each pixel's inputs. The constant global shift is that between the last two inputs, by phase correlation. \
+         \"Codec only\" puts the true future frame through the model's dense layers. Intervals hold {:.0} % of bootstrap \
+         resamples of whole trials; the best baseline is chosen anew at each step and in each resample.",
+        100.0 * CONFIDENCE
+    )
+}
+
+fn model(out: &mut String, model: &ModelSummary) -> std::fmt::Result {
+    writeln!(out, "\n## Model\n")?;
+    writeln!(out, "| | |\n| --- | --- |")?;
+    writeln!(
+        out,
+        "| frames | {}×{} px every {} s, {} seen, {} predicted |",
+        model.frame_width_px, model.frame_height_px, model.frame_period_s, model.context, model.horizon
+    )?;
+    writeln!(out, "| conditioning | {} |", model.conditioning)?;
+    writeln!(
+        out,
+        "| intensities | {} |",
+        if model.inverted { "inverted" } else { "as they are" }
+    )?;
+    writeln!(out, "| parameters | {} |", grouped(model.parameters))?;
+    writeln!(
+        out,
+        "| multiply–adds per predicted frame | {} |",
+        grouped(model.multiply_adds_per_frame)
+    )?;
+    writeln!(
+        out,
+        "| trained on | {} windows of `{}` (`{}`) |",
+        model.trained_on.windows, model.trained_on.name, model.trained_on.content_hash
+    )
+}
+
+/// 1234567 as 1 234 567.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (place, digit) in digits.chars().enumerate() {
+        if place > 0 && (digits.len() - place).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+fn stamp(out: &mut String, stamp: &Stamp) -> std::fmt::Result {
+    let commit = stamp.program.git_commit.as_deref().unwrap_or("unknown");
+    writeln!(out, "\n## Stamp\n")?;
+    writeln!(out, "| | |\n| --- | --- |")?;
+    writeln!(
+        out,
+        "| data set | `{}`, content `{}` |",
+        stamp.dataset, stamp.dataset_content_hash
+    )?;
+    writeln!(out, "| split seed | {} |", stamp.split_seed.0)?;
+    writeln!(out, "| model | `{}`, weights `{}` |", stamp.model, stamp.model_sha256)?;
+    if let Some((name, hash)) = &stamp.twin {
+        writeln!(out, "| unconditioned twin | `{name}`, weights `{hash}` |")?;
+    }
+    writeln!(
+        out,
+        "| program | foreframe {}, commit {commit} |",
+        stamp.program.version
+    )?;
+    writeln!(out, "| command | `{}` |", stamp.command)?;
+    writeln!(
+        out,
+        "| windows | every {}; {} resamples, seed {} |",
+        match stamp.stride {
+            1 => "frame starts one".to_owned(),
+            stride => format!("{stride} frames one starts"),
+        },
+        stamp.bootstrap_samples,
+        stamp.seed.0
+    )?;
+    writeln!(
+        out,
+        "| took | {:.1} s on {}, {} threads |",
+        stamp.wall_time_s, stamp.cpu, stamp.threads
+    )
+}

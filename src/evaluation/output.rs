@@ -1,0 +1,44 @@
+//! The directory that an evaluation leaves: figures first, the report last, each file whole or absent.
+
+use std::path::{Path, PathBuf};
+
+use super::figures::{self, FigureInputs};
+use super::{EvaluationError, Report};
+use crate::files::write_atomically;
+
+/// Makes the output directory, to be called before anything is computed.
+/// Errors: `OutputExists` if there is something in it, `Io`.
+pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
+    let failed = |source| EvaluationError::Io {
+        path: dir.to_owned(),
+        source,
+    };
+    std::fs::create_dir_all(dir).map_err(failed)?;
+    match std::fs::read_dir(dir).map_err(failed)?.next() {
+        Some(_) => Err(EvaluationError::OutputExists(dir.to_owned())),
+        None => Ok(()),
+    }
+}
+
+/// Writes the figures, `report.md` and, last, `report.json`; gives the paths of both reports. The figures' names go into
+/// the report. Errors: `Io`, `Chart`, `Frame`.
+pub fn write(dir: &Path, report: &mut Report, inputs: &FigureInputs) -> Result<[PathBuf; 2], EvaluationError> {
+    report.figures = figures::write(dir, inputs)?;
+    let markdown = dir.join("report.md");
+    save(&markdown, report.to_markdown().as_bytes())?;
+    let json = dir.join("report.json");
+    let mut bytes = serde_json::to_vec_pretty(report).map_err(|error| EvaluationError::Io {
+        path: json.clone(),
+        source: error.into(),
+    })?;
+    bytes.push(b'\n');
+    save(&json, &bytes)?;
+    Ok([markdown, json])
+}
+
+pub(super) fn save(path: &Path, bytes: &[u8]) -> Result<(), EvaluationError> {
+    write_atomically(path, bytes).map_err(|source| EvaluationError::Io {
+        path: path.to_owned(),
+        source,
+    })
+}

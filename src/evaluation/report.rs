@@ -1,0 +1,273 @@
+//! What an evaluation found: `report.json` as it is, `report.md` by [`Report::to_markdown`].
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::actions::ActionTable;
+use super::bootstrap::{Bootstrap, Trials};
+use super::figures::FigureFile;
+use super::metrics::{Curve, MethodScores, WindowScores, summarize};
+use super::skill::{Skill, skill};
+use super::{EvaluateConfig, markdown};
+use crate::dataset::Dataset;
+use crate::registry::{DatasetStamp, LoadedModel, ProgramStamp};
+use crate::types::Seed;
+
+/// All that an evaluation found, and how to find it again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// What was tested, with what, where.
+    pub stamp: Stamp,
+    /// The model's sizes.
+    pub model: ModelSummary,
+    /// Both test sets.
+    pub sets: Vec<SetReport>,
+    /// The pictures beside the report; filled in when they are written.
+    pub figures: Vec<FigureFile>,
+}
+
+impl Report {
+    /// The report as Markdown, with its figures in the same directory.
+    #[must_use]
+    pub fn to_markdown(&self) -> String {
+        markdown::render(self)
+    }
+
+    /// The scores of a test set, `test` or `test-unseen`, unless it was skipped.
+    #[must_use]
+    pub fn scores(&self, split: &str) -> Option<&SetScores> {
+        self.sets.iter().find(|set| set.split == split)?.outcome.scores()
+    }
+}
+
+/// What was tested, with what, where.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Stamp {
+    /// The data set's name.
+    pub dataset: String,
+    /// SHA-256 of its content.
+    pub dataset_content_hash: String,
+    /// Seed of the split into training, validation and test.
+    pub split_seed: Seed,
+    /// The model's name.
+    pub model: String,
+    /// SHA-256 of its weights' file.
+    pub model_sha256: String,
+    /// Name and SHA-256 of the unconditioned twin, if one was compared.
+    pub twin: Option<(String, String)>,
+    /// The program's version and the commit it was built from.
+    pub program: ProgramStamp,
+    /// The command line.
+    pub command: String,
+    /// Frames from the start of one window to that of the next.
+    pub stride: usize,
+    /// Resamples for the intervals.
+    pub bootstrap_samples: usize,
+    /// Seed of the resamples and of the shuffled actions.
+    pub seed: Seed,
+    /// Time that it took in seconds.
+    pub wall_time_s: f64,
+    /// The processor's name.
+    pub cpu: String,
+    /// Threads that it was given.
+    pub threads: usize,
+}
+
+impl Stamp {
+    pub(super) fn new(
+        loaded: &LoadedModel,
+        dataset: &Dataset,
+        split_seed: Seed,
+        config: &EvaluateConfig,
+        wall_time: Duration,
+    ) -> Self {
+        let named = |model: &LoadedModel| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
+        let (model, model_sha256) = named(loaded);
+        Self {
+            dataset: dataset.info().name.clone(),
+            dataset_content_hash: dataset.info().content_hash.clone(),
+            split_seed,
+            model,
+            model_sha256,
+            twin: config.twin.map(named),
+            program: ProgramStamp::current(),
+            command: config.command.clone(),
+            stride: config.stride,
+            bootstrap_samples: config.bootstrap_samples,
+            seed: config.seed,
+            wall_time_s: wall_time.as_secs_f64(),
+            cpu: cpu_name(),
+            threads: rayon::current_num_threads(),
+        }
+    }
+}
+
+/// As Linux tells it; elsewhere the architecture.
+fn cpu_name() -> String {
+    let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    told.lines()
+        .find(|line| line.starts_with("model name"))
+        .and_then(|line| line.split_once(':'))
+        .map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}
+
+/// The model's sizes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelSummary {
+    /// Width of a frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of a frame in pixels.
+    pub frame_height_px: u32,
+    /// Seconds between frames.
+    pub frame_period_s: f64,
+    /// Frames seen.
+    pub context: usize,
+    /// Frames predicted.
+    pub horizon: usize,
+    /// What it is conditioned on.
+    pub conditioning: String,
+    /// Whether it sees inverted intensities.
+    pub inverted: bool,
+    /// Trained numbers.
+    pub parameters: u64,
+    /// Multiply–adds to predict one frame.
+    pub multiply_adds_per_frame: u64,
+    /// What it was trained on.
+    pub trained_on: DatasetStamp,
+}
+
+impl ModelSummary {
+    pub(super) fn of(loaded: &LoadedModel) -> Self {
+        let spec = loaded.model.spec();
+        Self {
+            frame_width_px: spec.frame_width_px,
+            frame_height_px: spec.frame_height_px,
+            frame_period_s: spec.frame_period_s,
+            context: spec.context,
+            horizon: spec.horizon,
+            conditioning: spec.conditioning.to_string(),
+            inverted: spec.preprocess.invert,
+            parameters: spec.parameter_count(),
+            multiply_adds_per_frame: spec.multiply_adds_per_frame(),
+            trained_on: loaded.manifest.dataset.clone(),
+        }
+    }
+}
+
+/// One test set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SetReport {
+    /// `test` or `test-unseen`.
+    pub split: String,
+    /// Its scores, or why there are none.
+    #[serde(flatten)]
+    pub outcome: Outcome,
+}
+
+/// A test set's scores, or why there are none.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "status", rename_all = "kebab-case")]
+pub enum Outcome {
+    /// It was tested.
+    Scored(Box<SetScores>),
+    /// It is empty.
+    Skipped {
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Outcome {
+    /// The scores, unless it was skipped.
+    #[must_use]
+    pub fn scores(&self) -> Option<&SetScores> {
+        match self {
+            Self::Scored(scores) => Some(scores),
+            Self::Skipped { .. } => None,
+        }
+    }
+}
+
+/// The scores of one test set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SetScores {
+    /// Windows tested.
+    pub windows: usize,
+    /// Windows that there are at that stride.
+    pub windows_available: usize,
+    /// Trials that they come from.
+    pub trials: usize,
+    /// The headline.
+    pub skill: Skill,
+    /// Model, baselines and ceiling.
+    pub methods: Vec<MethodScores>,
+    /// Mean squared error of the model in its own space (smoothed, inverted where it inverts): not comparable between
+    /// models that preprocess differently.
+    pub model_space_mse: Curve,
+    /// Does the action matter? Absent for a model that takes none.
+    pub actions: Option<ActionTable>,
+    /// The windows that the figures show.
+    pub samples: Vec<SampleWindow>,
+}
+
+impl SetScores {
+    pub(super) fn new(
+        windows: &[WindowScores],
+        windows_available: usize,
+        actions: Option<ActionTable>,
+        bootstrap: &Bootstrap,
+    ) -> Self {
+        let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
+        let own_space = Trials::group(
+            &trial_of,
+            windows.iter().map(|window| window.model_space_mse.as_slice()),
+        );
+        Self {
+            windows: windows.len(),
+            windows_available,
+            trials: own_space.count(),
+            skill: skill(windows, bootstrap),
+            methods: summarize(windows),
+            model_space_mse: Curve::new(own_space.means()),
+            actions,
+            samples: SampleWindow::choose(windows),
+        }
+    }
+}
+
+/// A window that the figures show, chosen by the model's error alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SampleWindow {
+    /// `median`, `best` or `worst`.
+    pub rank: String,
+    /// Position of its trial in the data set.
+    pub episode: usize,
+    /// Its first frame in the data set.
+    pub first_frame: usize,
+    /// The model's mean squared error over all steps.
+    pub mse: f64,
+}
+
+impl SampleWindow {
+    fn choose(windows: &[WindowScores]) -> Vec<Self> {
+        let mut ranked: Vec<&WindowScores> = windows.iter().collect();
+        ranked.sort_by(|a, b| a.model_mse().total_cmp(&b.model_mse()));
+        let places = [
+            ("median", ranked.len() / 2),
+            ("best", 0),
+            ("worst", ranked.len().saturating_sub(1)),
+        ];
+        places
+            .into_iter()
+            .filter_map(|(rank, place)| {
+                ranked.get(place).map(|window| Self {
+                    rank: rank.to_owned(),
+                    episode: window.episode,
+                    first_frame: window.first_frame,
+                    mse: window.model_mse(),
+                })
+            })
+            .collect()
+    }
+}

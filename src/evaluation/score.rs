@@ -1,0 +1,108 @@
+//! Scores of a test set's windows: the model, the trivial baselines and the ceiling on the same frames.
+
+use rayon::prelude::*;
+
+use super::baselines::{self, Method, Seen};
+use super::inference::{Predicted, predict_with_ceiling};
+use super::metrics::{FrameScore, Truth, WindowScores};
+use super::{EvaluationError, Stage, Watched};
+use crate::dataset::sampler::{Split, Splits, WindowShape};
+use crate::dataset::{Dataset, Window};
+use crate::frame::preprocess::scale;
+use crate::frame::quality;
+use crate::nn::ModelSpec;
+use crate::registry::LoadedModel;
+
+/// At most `count` of the windows, evenly spread over all.
+#[must_use]
+pub fn evenly(windows: &[Window], count: usize) -> Vec<Window> {
+    if windows.len() <= count {
+        return windows.to_vec();
+    }
+    (0..count).map(|i| windows[i * windows.len() / count]).collect()
+}
+
+/// The mean frame, 0…1, of the training split: of every frame that another one of the split follows.
+/// Errors: those of [`Splits::windows`].
+pub fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
+    let pair = WindowShape { context: 1, horizon: 1 };
+    let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
+    let mut sums = vec![0_u64; dataset.info().frame_pixels()];
+    for pair in &pairs {
+        for (sum, &value) in sums.iter_mut().zip(dataset.pixels(pair.first_frame)) {
+            *sum += u64::from(value);
+        }
+    }
+    let scale = 1.0 / (255.0 * pairs.len().max(1) as f64);
+    Ok(sums.into_iter().map(|sum| (sum as f64 * scale) as f32).collect())
+}
+
+/// Scores every window. Errors: those of the network, `NotFinite`.
+pub fn score(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    training_mean: &[f32],
+    watched: &Watched,
+) -> Result<Vec<WindowScores>, EvaluationError> {
+    let spec = loaded.model.spec();
+    let mut scores = Vec::with_capacity(windows.len());
+    for batch in windows.chunks(watched.batch) {
+        let predicted = predict_with_ceiling(loaded, dataset, batch)?;
+        let scored = batch
+            .par_iter()
+            .enumerate()
+            .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, training_mean));
+        scores.par_extend(scored);
+        watched.tell(Stage::Scores, scores.len(), windows.len());
+    }
+    Ok(scores)
+}
+
+fn score_window(
+    spec: &ModelSpec,
+    dataset: &Dataset,
+    (place, window): (usize, Window),
+    predicted: &Predicted,
+    training_mean: &[f32],
+) -> WindowScores {
+    let (pixels, horizon) = (spec.pixels(), spec.horizon);
+    let width = spec.frame_width_px as usize;
+    let here = place * horizon * pixels..(place + 1) * horizon * pixels;
+    let camera_space = |values: &[f32]| -> Vec<Vec<f32>> {
+        let frames = values[here.clone()].chunks_exact(pixels);
+        frames.map(|frame| spec.preprocess.inverse(frame)).collect()
+    };
+    let frame = |step: usize| scale(dataset.pixels(window.first_frame + step));
+    let inputs: Vec<Vec<f32>> = (0..spec.context).map(frame).collect();
+    let truth: Vec<Vec<f32>> = (spec.context..spec.context + horizon).map(frame).collect();
+    let seen = Seen {
+        inputs: &inputs,
+        training_mean,
+        width,
+    };
+    let frames = Method::ALL
+        .into_iter()
+        .map(|method| {
+            let guesses = match method {
+                Method::Model => camera_space(&predicted.frames),
+                Method::CodecOnly => camera_space(&predicted.codec),
+                baseline => baselines::predict(baseline, &seen, horizon),
+            };
+            let compared = guesses.iter().zip(&truth).enumerate();
+            let score = compared.map(|(step, (guess, pixels))| {
+                let mask = dataset.mask(window.first_frame + spec.context + step);
+                FrameScore::of(guess, &Truth { pixels, mask, width })
+            });
+            score.collect()
+        })
+        .collect();
+    let own = predicted.frames[here.clone()].chunks_exact(pixels);
+    let own_truth = predicted.truth[here.clone()].chunks_exact(pixels);
+    WindowScores {
+        episode: window.episode,
+        first_frame: window.first_frame,
+        frames,
+        model_space_mse: own.zip(own_truth).map(|(a, b)| quality::mse(a, b)).collect(),
+    }
+}

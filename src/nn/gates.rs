@@ -1,0 +1,106 @@
+//! Equations (1)–(5) of the paper on rows of plain numbers, and the way back. [`super::lstm_cell`] has them on tensors;
+//! a test holds the two together, values and gradients.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use super::activation::{sigmoid, tanh};
+
+/// Diagonals of `W_ci`, `W_cf`, `W_co`, [H] each.
+#[derive(Clone, Copy)]
+pub(super) struct Peepholes<'a> {
+    pub(super) i: &'a [f32],
+    pub(super) f: &'a [f32],
+    pub(super) o: &'a [f32],
+}
+
+/// One row's step. `sums` [4H] holds `W_x x + W_h h + b` and becomes the activations i, f, tanh(·), o; `c_before` is the
+/// memory before, `c` and `h` [H] receive the new state.
+#[inline(always)]
+pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, c: &mut [f32], h: &mut [f32]) {
+    let hidden = c.len();
+    let (i, rest) = sums.split_at_mut(hidden);
+    let (f, rest) = rest.split_at_mut(hidden);
+    let (g, o) = rest.split_at_mut(hidden);
+    gate(i, peepholes.i, c_before);
+    gate(f, peepholes.f, c_before);
+    for g in &mut *g {
+        *g = tanh(*g);
+    }
+    for ((((c, c_before), i), f), g) in c.iter_mut().zip(c_before).zip(&*i).zip(&*f).zip(&*g) {
+        *c = f * c_before + i * g;
+    }
+    gate(o, peepholes.o, c);
+    for ((h, o), c) in h.iter_mut().zip(&*o).zip(&*c) {
+        *h = o * tanh(*c);
+    }
+}
+
+/// σ(sum + peephole · c), in place.
+#[inline(always)]
+fn gate(sums: &mut [f32], peephole: &[f32], c: &[f32]) {
+    for ((sum, w), c) in sums.iter_mut().zip(peephole).zip(c) {
+        *sum = sigmoid(*sum + w * c);
+    }
+}
+
+/// What one row's step kept for the way back.
+#[derive(Clone, Copy)]
+pub(super) struct Kept<'a> {
+    /// i, f, tanh(·), o [4H].
+    pub(super) activations: &'a [f32],
+    /// Memory before [H].
+    pub(super) c_before: &'a [f32],
+    /// Memory after [H].
+    pub(super) c: &'a [f32],
+}
+
+/// One row's way back. `d_h` [H] is the gradient of h; `d_c` [H] that of c from later steps, and becomes that of
+/// `c_before`; `d_sums` [4H] receives that of the sums.
+#[inline(always)]
+pub(super) fn backward(kept: Kept, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
+    let Kept {
+        activations,
+        c_before,
+        c,
+    } = kept;
+    let hidden = c.len();
+    let (i, rest) = activations.split_at(hidden);
+    let (f, rest) = rest.split_at(hidden);
+    let (g, o) = rest.split_at(hidden);
+    let (d_i, rest) = d_sums.split_at_mut(hidden);
+    let (d_f, rest) = rest.split_at_mut(hidden);
+    let (d_g, d_o) = rest.split_at_mut(hidden);
+    // tanh(c) waits in d_g until d_o and d_c have used it.
+    for (d_g, c) in d_g.iter_mut().zip(c) {
+        *d_g = tanh(*c);
+    }
+    for (((d_o, d_h), o), tanh_c) in d_o.iter_mut().zip(d_h).zip(o).zip(&*d_g) {
+        *d_o = d_h * tanh_c * o * (1.0 - o);
+    }
+    for (((d_c, d_h), o), tanh_c) in d_c.iter_mut().zip(d_h).zip(o).zip(&*d_g) {
+        *d_c += d_h * o * (1.0 - tanh_c * tanh_c);
+    }
+    add_product(d_c, d_o, peepholes.o);
+    for (((d_i, d_c), i), g) in d_i.iter_mut().zip(&*d_c).zip(i).zip(g) {
+        *d_i = d_c * g * i * (1.0 - i);
+    }
+    for (((d_f, d_c), f), c_before) in d_f.iter_mut().zip(&*d_c).zip(f).zip(c_before) {
+        *d_f = d_c * c_before * f * (1.0 - f);
+    }
+    for (((d_g, d_c), i), g) in d_g.iter_mut().zip(&*d_c).zip(i).zip(g) {
+        *d_g = d_c * i * (1.0 - g * g);
+    }
+    for (d_c, f) in d_c.iter_mut().zip(f) {
+        *d_c *= f;
+    }
+    add_product(d_c, d_i, peepholes.i);
+    add_product(d_c, d_f, peepholes.f);
+}
+
+/// sums += a · b, by elements.
+#[inline(always)]
+pub(super) fn add_product(sums: &mut [f32], a: &[f32], b: &[f32]) {
+    for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
+        *sum += a * b;
+    }
+}

@@ -1,0 +1,264 @@
+//! Evaluation: a whole run on a small scene, what it leaves on disk, what it refuses.
+
+use std::collections::BTreeSet;
+
+use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::evaluation::report::{Outcome, Report};
+use foreframe::evaluation::{self, EvaluateConfig, EvaluationError};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
+use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe::types::{Channel, Seed};
+
+const SIDE: u32 = 16;
+const FRAMES: u32 = 14;
+
+/// Episodes in which a dark square moves over a ramp, by as many pixels a frame as the action says.
+fn scene(episodes: usize, side: u32, period_s: f64) -> Dataset {
+    let data = (0..episodes).map(|episode| {
+        let speed = (episode % 3) as u32;
+        let inside = |frame: u32, i: u32| (i / side) / 4 == 1 && (i % side + side - (speed * frame) % side) % side < 4;
+        let pixel = |frame: u32, i: u32| {
+            if inside(frame, i) {
+                20
+            } else {
+                (120 + 4 * (i % side)) as u8
+            }
+        };
+        let each = |value: &dyn Fn(u32, u32) -> u8| -> Vec<u8> {
+            (0..FRAMES)
+                .flat_map(|frame| (0..side * side).map(move |i| value(frame, i)))
+                .collect()
+        };
+        EpisodeData {
+            pixels: each(&pixel),
+            masks: Some(each(&|frame, i| u8::from(inside(frame, i)))),
+            actions: vec![speed as f32; FRAMES as usize],
+            states: vec![0.5; FRAMES as usize],
+            timestamps_s: (0..FRAMES).map(|frame| f64::from(frame) * period_s).collect(),
+            ..EpisodeData::default()
+        }
+    });
+    let info = DatasetInfo {
+        name: "squares".to_owned(),
+        frame_width_px: side,
+        frame_height_px: side,
+        frame_period_s: period_s,
+        action_channels: vec![Channel::new("speed", "px/frame")],
+        state_channels: vec![Channel::new("phase", "")],
+        content_hash: String::new(),
+        scenario: None,
+        seed: None,
+        frame_count: 0,
+        episode_count: 0,
+        has_masks: false,
+    };
+    Dataset::from_episodes(info, data.collect()).unwrap()
+}
+
+fn spec(conditioning: Conditioning) -> ModelSpec {
+    let channel = |name: &str, unit: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 1.0,
+        std: 0.8,
+    };
+    ModelSpec {
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        features: 8,
+        hidden: 12,
+        context: 4,
+        horizon: 3,
+        conditioning,
+        actions: vec![channel("speed", "px/frame")],
+        states: vec![channel("phase", "")],
+        ..ModelSpec::default()
+    }
+}
+
+/// A model that was never trained, published and loaded as any other.
+fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let manifest = Manifest {
+        name: name.to_owned(),
+        version: 1,
+        weights_sha256: String::new(),
+        dataset: DatasetStamp {
+            name: dataset.info().name.clone(),
+            content_hash: dataset.info().content_hash.clone(),
+            scenario: None,
+            windows: 0,
+            split_seed: Seed(7),
+        },
+        seed: Seed(1),
+        command: "test".to_owned(),
+        training: serde_json::Value::Null,
+        metrics: serde_json::Value::Null,
+        parameters: spec.parameter_count(),
+        multiply_adds_per_frame: spec.multiply_adds_per_frame(),
+        program: ProgramStamp::current(),
+        spec,
+    };
+    let dir = tempfile::tempdir().unwrap();
+    registry::publish(dir.path(), &parameters, &manifest).unwrap();
+    registry::load(dir.path()).unwrap()
+}
+
+fn config() -> EvaluateConfig<'static> {
+    EvaluateConfig {
+        max_windows: 15,
+        bootstrap_samples: 100,
+        batch: 4,
+        command: "foreframe evaluate".to_owned(),
+        ..EvaluateConfig::default()
+    }
+}
+
+fn evaluate(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> Result<Report, EvaluationError> {
+    evaluation::run(loaded, dataset, config, &|_| {})
+}
+
+fn refusal(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> String {
+    evaluate(loaded, dataset, config).unwrap_err().to_string()
+}
+
+#[test]
+fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
+    let dataset = scene(40, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::StateAction), &dataset);
+    let twin = untrained("twin", spec(Conditioning::None), &dataset);
+    let with_twin = EvaluateConfig {
+        twin: Some(&twin),
+        ..config()
+    };
+    let report = evaluate(&model, &dataset, &with_twin).unwrap();
+    let scores = report.scores("test").unwrap();
+    assert_eq!((scores.windows, scores.methods.len()), (15, 7));
+    assert!(scores.trials >= 2 && scores.windows_available > 15);
+    assert!(scores.skill.skill.mean < 0.0, "an untrained model has no skill");
+    for row in &scores.methods {
+        assert_eq!(row.mse.per_step.len(), 3);
+        assert!(row.mover_mse.is_some() && row.ssim.mean <= 1.0);
+    }
+    let variants = &scores.actions.as_ref().unwrap().rows;
+    assert_eq!(variants.len(), 4);
+    assert!((variants[0].mse.mean - scores.methods[0].mse.mean).abs() < 1e-9);
+    assert!(matches!(&report.sets[1].outcome, Outcome::Skipped { reason } if reason.contains("start/goal")));
+    assert_eq!(report.stamp.split_seed, Seed(7), "the split is that of the training");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
+    let dataset = scene(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let first = evaluate(&model, &dataset, &config()).unwrap();
+    let larger = EvaluateConfig { batch: 7, ..config() };
+    let second = evaluate(&model, &dataset, &larger).unwrap();
+    let (first, second) = (first.scores("test").unwrap(), second.scores("test").unwrap());
+    assert_eq!(first.samples[0].first_frame, second.samples[0].first_frame);
+    assert!((first.skill.skill.mean - second.skill.skill.mean).abs() < 1e-5);
+    assert!(first.actions.is_none());
+}
+
+#[test]
+fn report_and_figures_are_written_and_read_back() {
+    let dataset = scene(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::Action), &dataset);
+    let mut report = evaluate(&model, &dataset, &config()).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("report");
+    evaluation::prepare(&out).unwrap();
+    let inputs = evaluation::figure_inputs(&model, &dataset, &report).unwrap();
+    evaluation::write(&out, &mut report, &inputs).unwrap();
+    let written: BTreeSet<String> = std::fs::read_dir(&out)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    let expected = [
+        "error-by-horizon.svg",
+        "prediction-best.png",
+        "prediction-median.png",
+        "prediction-worst.png",
+        "prediction.gif",
+        "reconstruction-best.png",
+        "reconstruction-median.png",
+        "reconstruction-worst.png",
+        "report.json",
+        "report.md",
+    ];
+    assert_eq!(written, expected.map(str::to_owned).into());
+    let read: Report = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!(
+        read.to_markdown(),
+        std::fs::read_to_string(out.join("report.md")).unwrap()
+    );
+    let again = evaluation::prepare(&out).unwrap_err().to_string();
+    assert!(
+        again.ends_with("exists and is not empty; name a new directory"),
+        "{again}"
+    );
+}
+
+#[test]
+fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
+    let dataset = scene(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::StateAction), &dataset);
+    assert_eq!(
+        refusal(&model, &scene(30, 20, 0.2), &config()),
+        "data set \"squares\" has frames of 20×20 px; model \"still\" takes 16×16"
+    );
+    assert_eq!(
+        refusal(&model, &scene(30, SIDE, 0.1), &config()),
+        "data set \"squares\" has a frame every 0.1 s; model \"still\" predicts one every 0.2 s"
+    );
+    let mut turned = spec(Conditioning::StateAction);
+    turned.actions[0].unit = "rad/s".to_owned();
+    assert_eq!(
+        refusal(&untrained("turning", turned, &dataset), &dataset, &config()),
+        "data set \"squares\" has the action [speed px/frame]; model \"turning\" takes [speed rad/s]"
+    );
+    let other_split = EvaluateConfig {
+        split_seed: Some(Seed(8)),
+        ..config()
+    };
+    assert!(refusal(&model, &dataset, &other_split).contains("split seed 8 would test it on frames it was trained on"));
+    let twin = EvaluateConfig {
+        twin: Some(&model),
+        ..config()
+    };
+    assert!(refusal(&model, &dataset, &twin).contains("needs conditioning \"none\""));
+    let none = EvaluateConfig {
+        max_windows: 0,
+        ..config()
+    };
+    assert_eq!(
+        refusal(&model, &dataset, &none),
+        "the number of windows is 0; it must be at least 1"
+    );
+}
+
+#[test]
+fn the_markdown_reads_as_agreed() {
+    let dataset = scene(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::Action), &dataset);
+    let mut report = evaluate(&model, &dataset, &config()).unwrap();
+    report.stamp.wall_time_s = 1.5;
+    "a processor".clone_into(&mut report.stamp.cpu);
+    report.stamp.threads = 2;
+    report.stamp.program.git_commit = Some("0123abc".to_owned());
+    // Figures differ from one processor to the next in their last digits; their places don't.
+    let markdown = report.to_markdown();
+    let masked: String = markdown.lines().map(|line| mask_numbers(line) + "\n").collect();
+    insta::assert_snapshot!(masked);
+}
+
+/// Replaces every decimal fraction and hash by a mark.
+fn mask_numbers(line: &str) -> String {
+    let is_measured = |word: &str| {
+        let digits = word.trim_matches(|c: char| !c.is_ascii_alphanumeric());
+        let fraction = digits.contains('.') && digits.chars().all(|c| c.is_ascii_digit() || c == '.');
+        fraction || digits.len() == 64
+    };
+    let words = line.split(' ').map(|word| if is_measured(word) { "#" } else { word });
+    words.collect::<Vec<_>>().join(" ")
+}

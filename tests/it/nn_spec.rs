@@ -1,0 +1,134 @@
+//! A model's specification and its weights: bounds, counts, names, storage.
+
+use std::collections::BTreeMap;
+
+use candle_core::{DType, Tensor};
+use foreframe::nn::{Conditioning, Loss, Model, ModelSpec, NnError, Parameters, Reconstruction};
+use foreframe::types::Seed;
+
+use crate::nn_common::{all_kinds, bits, channel, largest_difference, tiny, values};
+
+#[test]
+fn every_bound_of_the_specification_refuses() {
+    type Change = fn(&mut ModelSpec);
+    let changes: [(&str, Change); 12] = [
+        ("frame_width_px", |spec| spec.frame_width_px = 0),
+        ("frame_height_px", |spec| spec.frame_height_px = 513),
+        ("frame_period_s", |spec| spec.frame_period_s = f64::NAN),
+        ("preprocess.blur_sigma_px", |spec| spec.preprocess.blur_sigma_px = -1.0),
+        ("context", |spec| spec.context = 0),
+        ("horizon", |spec| spec.horizon = 257),
+        ("features", |spec| spec.features = 0),
+        ("hidden", |spec| spec.hidden = 100_000),
+        ("number of actions", |spec| {
+            spec.actions = vec![channel("a", 0.0, 1.0); 65];
+        }),
+        ("number of states", |spec| {
+            spec.states = vec![channel("a", 0.0, 1.0); 65];
+        }),
+        ("number of parameters", |spec| {
+            (spec.hidden, spec.features) = (4096, 4096);
+        }),
+        ("conditioning", |spec| spec.states.clear()),
+    ];
+    for (field, change) in changes {
+        let mut spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
+        spec.validate().unwrap();
+        change(&mut spec);
+        let message = spec.validate().unwrap_err().to_string();
+        assert!(
+            message.starts_with(&format!("model specification: {field}")),
+            "{message}"
+        );
+    }
+    let mut spec = tiny(Conditioning::None, Reconstruction::Sequence);
+    spec.actions[0].std = f32::INFINITY;
+    assert!(matches!(spec.validate(), Err(NnError::ChannelScale { .. })));
+}
+
+#[test]
+fn parameters_are_counted_as_they_are() {
+    for (spec, _) in all_kinds() {
+        let parameters = Parameters::initialize(&spec, Seed(0)).unwrap();
+        assert_eq!(spec.parameter_count(), parameters.count());
+    }
+}
+
+/// Each weight (no bias) counts once for each frame it works on.
+#[test]
+fn multiply_adds_are_the_weights_times_their_uses() {
+    for (spec, _) in all_kinds() {
+        let parameters = Parameters::initialize(&spec, Seed(0)).unwrap();
+        let uses = |name: &str| match name.split('.').next().unwrap() {
+            _ if name.ends_with("bias") => 0,
+            "frame_encoder" | "encoder" => spec.context,
+            "frame_decoder" | "predictor" => spec.horizon,
+            _ => 0,
+        };
+        let count = |(name, var): (&str, &candle_core::Var)| (uses(name) * var.elem_count()) as u64;
+        let total: u64 = parameters.iter().map(count).sum();
+        assert_eq!(spec.multiply_adds_per_frame(), total.div_ceil(spec.horizon as u64));
+    }
+}
+
+#[test]
+fn stored_weights_are_checked_by_name_and_shape_and_widened() {
+    let spec = tiny(Conditioning::None, Reconstruction::Sequence);
+    let parameters = Parameters::initialize(&spec, Seed(4)).unwrap();
+    let stored: BTreeMap<String, Tensor> = parameters.snapshot().unwrap();
+    let halved = stored
+        .iter()
+        .map(|(name, tensor)| (name.clone(), tensor.to_dtype(DType::F16).unwrap()))
+        .collect();
+    let loaded = Parameters::from_tensors(&spec, halved).unwrap();
+    assert!(loaded.iter().all(|(_, var)| var.dtype() == DType::F32));
+    let refused = |change: &dyn Fn(&mut BTreeMap<String, Tensor>)| {
+        let mut tensors = stored.clone();
+        change(&mut tensors);
+        Parameters::from_tensors(&spec, tensors).unwrap_err().to_string()
+    };
+    let missing = refused(&|tensors| drop(tensors.remove("encoder.w_h")));
+    assert!(missing.starts_with("tensor \"encoder.w_h\" is missing"), "{missing}");
+    let unknown = refused(&|tensors| drop(tensors.insert("extra".to_owned(), values(&[1], 0.0))));
+    assert!(unknown.contains("\"extra\""), "{unknown}");
+    let shape = refused(&|tensors| drop(tensors.insert("encoder.bias".to_owned(), values(&[3], 0.0))));
+    assert_eq!(shape, "tensor \"encoder.bias\" has shape [3]; the model needs [28]");
+    let nan = refused(&|tensors| drop(tensors.insert("encoder.bias".to_owned(), (values(&[28], 0.0) / 0.0).unwrap())));
+    assert!(nan.ends_with("not a finite number"), "{nan}");
+}
+
+#[test]
+fn a_snapshot_keeps_its_values_and_restores_them() {
+    let spec = tiny(Conditioning::None, Reconstruction::Stepwise);
+    let parameters = Parameters::initialize(&spec, Seed(4)).unwrap();
+    let snapshot = parameters.snapshot().unwrap();
+    let bias = parameters.get("encoder.bias").unwrap();
+    let before = bits(bias);
+    bias.set(&values(&[28], 0.3)).unwrap();
+    assert_eq!(bits(&snapshot["encoder.bias"]), before);
+    parameters.restore(&snapshot).unwrap();
+    assert_eq!(bits(bias), before);
+}
+
+#[test]
+fn a_centred_codec_gives_the_mean_frame_for_the_mean_frame() {
+    let spec = tiny(Conditioning::None, Reconstruction::Sequence);
+    let parameters = Parameters::initialize(&spec, Seed(4)).unwrap();
+    let model = Model::new(spec.clone(), &parameters).unwrap();
+    let mean = values(&[spec.pixels()], 0.4);
+    parameters.center_codec(&mean).unwrap();
+    let mean = mean.unsqueeze(0).unwrap();
+    let again = model.decode_frames(&model.encode_frames(&mean).unwrap()).unwrap();
+    assert!(largest_difference(&again, &mean) < 1e-5);
+}
+
+#[test]
+fn a_specification_keeps_its_names_on_disk() {
+    let spec = tiny(Conditioning::StateAction, Reconstruction::Stepwise);
+    let text = serde_json::to_string(&spec).unwrap();
+    assert!(text.contains("\"conditioning\":\"state-action\"") && text.contains("\"reconstruction\":\"stepwise\""));
+    assert_eq!(serde_json::from_str::<ModelSpec>(&text).unwrap(), spec);
+    let error = "max".parse::<Loss>().unwrap_err().to_string();
+    assert_eq!(error, "unknown loss \"max\"; there are \"mse\" and \"l1\"");
+    assert_eq!("l1".parse::<Loss>().unwrap().to_string(), "l1");
+}
