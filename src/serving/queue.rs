@@ -136,7 +136,11 @@ impl State {
         for (position, waiting) in self.waiting.drain(..).enumerate() {
             if plan.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
-            } else if plan.discard.binary_search(&position).is_err() {
+            } else if plan.discard.binary_search(&position).is_ok() {
+                let limit_ms = waiting.deadline.saturating_duration_since(waiting.accepted).as_millis();
+                // Nobody listens if the client has gone.
+                let _ = waiting.reply.send(Err(ServingError::Deadline { limit_ms }));
+            } else {
                 kept.push_back(waiting);
             }
         }

@@ -211,16 +211,15 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
 async fn a_collected_data_set_trains_a_model_that_serves_at_once() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let id = post(&app, JOBS, &collect("seen")).await.json()["id"]
-        .as_str()
-        .unwrap()
-        .to_owned();
+    let mut seen = collect("seen");
+    seen["trials"] = json!(40);
+    let id = post(&app, JOBS, &seen).await.json()["id"].as_str().unwrap().to_owned();
     let done = state_becomes(&app, &id, "succeeded").await;
     assert_eq!(
         (&done["progress"]["done"], &done["progress"]["total"]),
-        (&json!(12), &json!(12))
+        (&json!(40), &json!(40))
     );
-    let exists = post(&app, JOBS, &collect("seen")).await.detail(409);
+    let exists = post(&app, JOBS, &seen).await.detail(409);
     assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
 
     let settings = json!({

@@ -17,14 +17,14 @@ use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tower::ServiceExt as _;
 
-pub const WIDTH: u32 = 16;
-pub const HEIGHT: u32 = 12;
-pub const CONTEXT: usize = 3;
-pub const HORIZON: usize = 2;
+pub(crate) const WIDTH: u32 = 16;
+pub(crate) const HEIGHT: u32 = 12;
+pub(crate) const CONTEXT: usize = 3;
+pub(crate) const HORIZON: usize = 2;
 /// Longer than anything here takes.
-pub const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
-pub fn spec(conditioning: Conditioning) -> ModelSpec {
+pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
         name: name.to_owned(),
         unit: unit.to_owned(),
@@ -46,7 +46,7 @@ pub fn spec(conditioning: Conditioning) -> ModelSpec {
 }
 
 /// A model that takes long enough to compute that others queue behind it.
-pub fn slow_spec() -> ModelSpec {
+pub(crate) fn slow_spec() -> ModelSpec {
     ModelSpec {
         features: 64,
         hidden: 1024,
@@ -55,7 +55,7 @@ pub fn slow_spec() -> ModelSpec {
 }
 
 /// Publishes a model with random weights below `dir` and loads it.
-pub fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
+pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let manifest = Manifest {
         name: name.to_owned(),
@@ -83,7 +83,7 @@ pub fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
 }
 
 /// An unconditioned model `plain` and a conditioned one `moving`.
-pub fn app(dir: &Path, config: ServerConfig) -> App {
+pub(crate) fn app(dir: &Path, config: ServerConfig) -> App {
     let models = vec![
         model(&dir.join("models"), "plain", spec(Conditioning::None)),
         model(&dir.join("models"), "moving", spec(Conditioning::StateAction)),
@@ -91,39 +91,39 @@ pub fn app(dir: &Path, config: ServerConfig) -> App {
     App::start(with_data(dir, config), models).unwrap()
 }
 
-pub fn with_data(dir: &Path, config: ServerConfig) -> ServerConfig {
+pub(crate) fn with_data(dir: &Path, config: ServerConfig) -> ServerConfig {
     ServerConfig {
         data_dir: dir.to_owned(),
         ..config
     }
 }
 
-pub fn frame(value: u8) -> Frame {
+pub(crate) fn frame(value: u8) -> Frame {
     let pixels = (0..WIDTH * HEIGHT).map(|i| value.wrapping_add((i * 3) as u8)).collect();
     Frame::new(WIDTH, HEIGHT, pixels).unwrap()
 }
 
-pub fn png(frame: &Frame) -> String {
+pub(crate) fn png(frame: &Frame) -> String {
     STANDARD.encode(codec::encode_png(frame).unwrap())
 }
 
-pub fn context() -> Vec<String> {
+pub(crate) fn context() -> Vec<String> {
     (0..CONTEXT as u8).map(|i| png(&frame(i * 10))).collect()
 }
 
-pub struct Answer {
-    pub status: StatusCode,
-    pub headers: HeaderMap,
-    pub body: Vec<u8>,
+pub(crate) struct Answer {
+    pub(crate) status: StatusCode,
+    pub(crate) headers: HeaderMap,
+    pub(crate) body: Vec<u8>,
 }
 
 impl Answer {
-    pub fn json(&self) -> Value {
+    pub(crate) fn json(&self) -> Value {
         serde_json::from_slice(&self.body).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&self.body)))
     }
 
     /// The detail of a problem, whose shape is checked.
-    pub fn detail(&self, status: u16) -> String {
+    pub(crate) fn detail(&self, status: u16) -> String {
         assert_eq!(self.status, status, "{}", String::from_utf8_lossy(&self.body));
         assert_eq!(self.headers[header::CONTENT_TYPE], "application/problem+json");
         let problem = self.json();
@@ -136,7 +136,7 @@ impl Answer {
     }
 }
 
-pub async fn send(app: &App, request: Request<Body>) -> Answer {
+pub(crate) async fn send(app: &App, request: Request<Body>) -> Answer {
     let response = server::router(app.clone()).oneshot(request).await.unwrap();
     let (status, headers) = (response.status(), response.headers().clone());
     let body = axum::body::to_bytes(response.into_body(), 1 << 24)
@@ -146,15 +146,15 @@ pub async fn send(app: &App, request: Request<Body>) -> Answer {
     Answer { status, headers, body }
 }
 
-pub async fn get(app: &App, path: &str) -> Answer {
+pub(crate) async fn get(app: &App, path: &str) -> Answer {
     send(app, Request::get(path).body(Body::empty()).unwrap()).await
 }
 
-pub async fn post(app: &App, path: &str, body: &Value) -> Answer {
+pub(crate) async fn post(app: &App, path: &str, body: &Value) -> Answer {
     post_text(app, path, body.to_string(), "*/*").await
 }
 
-pub async fn post_text(app: &App, path: &str, body: String, accept: &str) -> Answer {
+pub(crate) async fn post_text(app: &App, path: &str, body: String, accept: &str) -> Answer {
     let request = Request::builder()
         .method(Method::POST)
         .uri(path)
@@ -166,13 +166,13 @@ pub async fn post_text(app: &App, path: &str, body: String, accept: &str) -> Ans
 }
 
 /// A server on a port of its own.
-pub struct Running {
-    pub address: std::net::SocketAddr,
-    pub shutdown: oneshot::Sender<()>,
-    pub task: JoinHandle<Result<(), ServerError>>,
+pub(crate) struct Running {
+    pub(crate) address: std::net::SocketAddr,
+    pub(crate) shutdown: oneshot::Sender<()>,
+    pub(crate) task: JoinHandle<Result<(), ServerError>>,
 }
 
-pub async fn run(app: App) -> Running {
+pub(crate) async fn run(app: App) -> Running {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let (shutdown, asked) = oneshot::channel();
@@ -187,7 +187,7 @@ pub async fn run(app: App) -> Running {
 }
 
 impl Running {
-    pub async fn stop(self) {
+    pub(crate) async fn stop(self) {
         let _ = self.shutdown.send(());
         tokio::time::timeout(PATIENCE, self.task)
             .await
@@ -198,7 +198,7 @@ impl Running {
 }
 
 /// Asks again and again until the answer is `Some`.
-pub async fn until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+pub(crate) async fn until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + PATIENCE;
     loop {
         if let Some(answer) = ask().await {
