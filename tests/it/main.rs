@@ -4,18 +4,16 @@
 mod architecture;
 mod dataset_collect;
 mod dataset_sampler;
+mod evaluation;
 mod jobs;
-mod server;
-mod service;
-mod sim;
-
 mod nn_cell;
 mod nn_common;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
-mod sim_refusals;
-mod evaluation;
+mod server;
+mod service;
 mod sim;
+mod sim_refusals;
 mod stream;
 mod training;
