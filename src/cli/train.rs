@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::{CliError, command_line, interrupt, progress::Progress, say};
 use crate::dataset::Dataset;
-use crate::training::{self, Event, Outcome, TrainConfig, Training};
+use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
 
 /// Train a model on a data set.
 ///
@@ -93,7 +93,7 @@ fn default_dataset(preset: &str) -> PathBuf {
 struct Watch<'a> {
     progress: &'a Progress,
     steps: [usize; 2],
-    is_started: bool,
+    stage: Option<Stage>,
     validation: Option<f64>,
 }
 
@@ -102,7 +102,7 @@ impl<'a> Watch<'a> {
         Self {
             progress,
             steps: [config.pretrain.steps, config.fit.steps],
-            is_started: false,
+            stage: None,
             validation: None,
         }
     }
@@ -119,10 +119,9 @@ impl<'a> Watch<'a> {
                 steps,
                 loss,
             } => {
-                if step == 1 && !self.is_started {
-                    self.start(stage, 0);
+                if self.stage != Some(stage) {
+                    self.start(stage, step - 1);
                 }
-                self.is_started = false;
                 let validation = self.validation;
                 self.progress.update(step as u64, steps as u64, || match validation {
                     Some(best) => format!("loss {loss:.6}, validation {best:.6}"),
@@ -141,9 +140,9 @@ impl<'a> Watch<'a> {
         }
     }
 
-    fn start(&mut self, stage: training::Stage, step: usize) {
-        let total = self.steps[usize::from(stage == training::Stage::Fit)];
+    fn start(&mut self, stage: Stage, step: usize) {
+        let total = self.steps[usize::from(stage == Stage::Fit)];
         self.progress.start(&stage.to_string(), step as u64, total as u64);
-        self.is_started = true;
+        self.stage = Some(stage);
     }
 }

@@ -240,7 +240,7 @@ impl TrainConfig {
         }
         let (run, fit, pretrain) = (&self.run, &self.fit, &self.pretrain);
         let counts = [
-            ("pretrain.steps", pretrain.steps, 1, MAX_STEPS),
+            ("pretrain.steps", pretrain.steps, 0, MAX_STEPS),
             ("pretrain.batch_size", pretrain.batch_size, 1, MAX_BATCH_SIZE),
             ("fit.steps", fit.steps, 1, MAX_STEPS),
             ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),

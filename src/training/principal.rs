@@ -14,7 +14,7 @@ const OVERSAMPLING: usize = 16;
 /// Rounds of orthogonal iteration.
 const ITERATIONS: usize = 6;
 /// Standard deviation of a feature before the tanh: small enough for tanh to be nearly straight.
-const FEATURE_STD: f64 = 0.25;
+const FEATURE_STD: f64 = 0.15;
 /// The least standard deviation of a component, in the model's space; below it there is only noise.
 const MIN_STD: f64 = 1e-4;
 
