@@ -70,6 +70,9 @@ pub enum ServerError {
     Listen(#[source] std::io::Error),
 }
 
+/// What [`finish`] may take past the deadline to say what did not end.
+const GRACE: Duration = Duration::from_millis(200);
+
 /// What the handlers share; clones are the same.
 #[derive(Clone)]
 pub struct App {
@@ -175,7 +178,8 @@ pub async fn serve(
     app: App,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), ServerError> {
-    let mut stopping = app.streams().stopping();
+    let limit = Duration::from_millis(app.config().shutdown_deadline_ms);
+    let (told, mut deadline) = tokio::sync::watch::channel(None::<Instant>);
     let listener = BoundedListener::new(listener, app.config().max_connections);
     let of_signal = app.clone();
     let signal = async move {
@@ -183,21 +187,32 @@ pub async fn serve(
         info!("stopping");
         of_signal.streams().stop();
         of_signal.jobs().begin_stop();
+        told.send_replace(Some(Instant::now() + limit));
     };
     let server = axum::serve(listener, router(app.clone())).with_graceful_shutdown(signal);
-    let limit = Duration::from_millis(app.config().shutdown_deadline_ms);
+    let at_end = deadline.clone();
+    let work = async {
+        server.await.map_err(ServerError::Listen)?;
+        let deadline = at_end.borrow().unwrap_or_else(Instant::now);
+        finish(app, deadline).await;
+        Ok(())
+    };
     let over = async {
-        streams::told(&mut stopping).await;
-        tokio::time::sleep(limit).await;
+        // The sender lives until it has sent.
+        let deadline = deadline
+            .wait_for(Option::is_some)
+            .await
+            .ok()
+            .and_then(|deadline| *deadline);
+        tokio::time::sleep_until((deadline.unwrap_or_else(Instant::now) + GRACE).into()).await;
     };
     tokio::select! {
-        result = async { server.await.map_err(ServerError::Listen) } => {
-            result?;
-            finish(app, Instant::now() + limit).await;
+        result = work => result,
+        () = over => {
+            warn!("some requests were not answered within the deadline");
+            Ok(())
         }
-        () = over => warn!("some requests were not answered within the deadline"),
     }
-    Ok(())
 }
 
 /// Waits for the streams, the running job and the predictor to end.
@@ -207,11 +222,11 @@ async fn finish(app: App, deadline: Instant) {
         warn!("some streams did not end within the deadline");
     }
     let ended = blocking(move || {
-        if app.jobs().finish_stop(deadline) {
-            app.predictor().stop();
-        }
+        let ended = app.jobs().finish_stop(deadline);
+        app.predictor().stop();
+        ended
     });
-    if ended.await.is_ok() {
+    if ended.await == Ok(true) {
         info!("stopped");
     }
 }

@@ -152,7 +152,11 @@ impl TrainSpec {
             field: "settings",
             reason,
         };
-        let text = toml::to_string(&self.settings).map_err(|error| settings(error.to_string()))?;
+        let text = toml::to_string(&self.settings).map_err(|error| {
+            settings(format!(
+                "{error}; a setting is a number, a text or true or false, not null"
+            ))
+        })?;
         let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
         let config = layered.map_err(|error| match error {
             TrainError::UnknownPreset(_) => JobError::Invalid {

@@ -11,6 +11,7 @@ use super::images::{self, ImageError, ImageFormat};
 use super::picture;
 use super::protocol::Timing;
 use super::{App, blocking};
+use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::{Frame, FrameError, codec};
 use crate::registry::Manifest;
 use crate::serving::{Prediction, PredictionInput, ServingError};
@@ -169,7 +170,7 @@ fn answer(
     let predicted = &prediction.frames;
     match wanted {
         Wanted::Png => picture(
-            picture::contact_sheet(seen, predicted, &[]).and_then(|sheet| codec::encode_png(&sheet)),
+            prediction_sheet(seen, predicted, &[]).and_then(|sheet| codec::encode_png(&sheet)),
             "image/png",
         ),
         Wanted::Gif => picture(picture::animation(seen, predicted, period_s), "image/gif"),

@@ -7,7 +7,8 @@ use axum::response::IntoResponse;
 use super::error::{ApiError, Problem};
 use super::extract::Path;
 use super::predict::PredictError;
-use super::{App, blocking, picture};
+use super::{App, blocking};
+use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::{Frame, codec};
 use crate::nn::{Conditioning, ModelSpec};
 use crate::registry::Manifest;
@@ -39,7 +40,7 @@ pub(super) async fn preview(State(app): State<App>, Path(model): Path<String>) -
         .map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
     let predicted = app.predictor().predict(&model, input).await?.frames;
-    let sheet = blocking(move || picture::contact_sheet(&seen, &predicted, &came).and_then(|s| codec::encode_png(&s)));
+    let sheet = blocking(move || prediction_sheet(&seen, &predicted, &came).and_then(|s| codec::encode_png(&s)));
     let bytes = sheet.await?.map_err(PredictError::Picture)?;
     Ok(([(header::CONTENT_TYPE, "image/png")], bytes))
 }

@@ -72,7 +72,7 @@ fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
     let started = Instant::now();
     compute::predict(model, &[&blank_input(model.model.spec())?])?;
     let warm_up_us = micros_since(started);
-    info!(model.id = %model.manifest.name, model.version = model.manifest.version, warm_up_us, "model loaded");
+    info!(model.id = %model.manifest.name, warm_up_us, "first prediction made");
     Ok(())
 }
 
