@@ -117,7 +117,8 @@ fn stop(message: &str, code: u8) -> ExitCode {
 
 /// Writes a line of the command's answer to standard output.
 fn say(line: impl Display) -> Result<(), CliError> {
-    writeln!(std::io::stdout(), "{line}").map_err(|error| CliError::Failed(format!("could not write the answer: {error}")))
+    writeln!(std::io::stdout(), "{line}")
+        .map_err(|error| CliError::Failed(format!("could not write the answer: {error}")))
 }
 
 /// The command line as it was given, for stamps.

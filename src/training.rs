@@ -9,6 +9,7 @@ mod fit;
 pub mod observer;
 pub mod optimizer;
 mod pretrain;
+mod principal;
 mod stage;
 
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ use std::sync::atomic::AtomicBool;
 use self::batches::FrameSource;
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
-use self::config::WindowBudget;
+use self::config::{CodecStart, WindowBudget};
 pub use self::observer::{Event, Observer, Stage};
 use self::stage::{Flow, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
@@ -26,6 +27,9 @@ use crate::files::{sha256_hex, write_atomically};
 use crate::frame::FrameError;
 use crate::nn::{ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError};
+
+/// Frames that the principal components are taken from, at most.
+const MAX_PRINCIPAL_FRAMES: usize = 8192;
 
 /// Why a training did not start or stopped.
 #[derive(Debug, thiserror::Error)]
@@ -155,10 +159,7 @@ pub fn run(
     let plan = Plan::new(config, dataset)?;
     let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
         Some(checkpoint) => checkpoint.into_state(),
-        None => TrainState::new(
-            Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?,
-            &config.run,
-        )?,
+        None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
     };
     observer.on_event(Event::Started {
         stage: state.stage,
@@ -193,6 +194,18 @@ pub fn run(
     write_history(&files, &state)?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
     Ok(Outcome::Finished { model_dir, manifest })
+}
+
+fn initial_parameters(plan: &Plan<'_>, config: &TrainConfig) -> Result<Parameters, TrainError> {
+    let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
+    if config.pretrain.start == CodecStart::Principal {
+        let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
+        let stride = frames.len().div_ceil(MAX_PRINCIPAL_FRAMES).max(1);
+        let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
+        let (read, written) = (plan.source.frames(&frames)?, plan.source.targets(&frames)?);
+        principal::set_codec(&parameters, &read, &written, config.seed.derive("principal", 0))?;
+    }
+    Ok(parameters)
 }
 
 fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
@@ -231,7 +244,7 @@ impl<'a> Plan<'a> {
         let spec = config.model_spec(dataset, &frames);
         spec.validate()?;
         Ok(Self {
-            source: FrameSource::new(dataset, spec.preprocess),
+            source: FrameSource::new(dataset, spec.preprocess, config.fit.target),
             spec,
             train,
             validation,
@@ -257,7 +270,7 @@ impl<'a> Plan<'a> {
             command: training.command.to_owned(),
             training: settings,
             metrics: serde_json::json!({
-                "validation": { "mse_model_space": state.best_loss, "step": state.best_step }
+                "validation": { "mse": state.best_loss, "step": state.best_step }
             }),
             parameters: self.spec.parameter_count(),
             multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),

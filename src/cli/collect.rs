@@ -43,18 +43,27 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
     if args.trials == 0 {
         return Err(CliError::Usage("--trials is 0; a data set takes at least 1".to_owned()));
     }
-    let out = args.out.unwrap_or_else(|| PathBuf::from("data").join(args.scenario.to_string()));
+    let out = args
+        .out
+        .unwrap_or_else(|| PathBuf::from("data").join(args.scenario.to_string()));
     let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), &out);
     config.world.frame_width_px = args.frame_size;
     config.world.frame_height_px = args.frame_size;
     config.world.camera.noise_std = args.noise;
-    config.world.validate().map_err(|error| CliError::Usage(error.to_string()))?;
+    config
+        .world
+        .validate()
+        .map_err(|error| CliError::Usage(error.to_string()))?;
     if let Some(threads) = args.threads {
         config.threads = threads;
     }
     let (cancelled, progress) = (interrupt::flag()?, Progress::new("trials"));
     progress.start(&format!("collecting {}", config.scenario), 0, config.trials);
-    let collected = collect(&config, &|now| progress.update(now.done, now.total, String::new), &cancelled);
+    let collected = collect(
+        &config,
+        &|now| progress.update(now.done, now.total, String::new),
+        &cancelled,
+    );
     progress.finish();
     match collected {
         Ok(info) => say(format!(

@@ -48,8 +48,15 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
     let (model_dir, loaded) = load_model(&args.model, &args.models)?;
-    let twin = args.twin.as_deref().map(|twin| load_model(twin, &args.models)).transpose()?;
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
+    let twin = args
+        .twin
+        .as_deref()
+        .map(|twin| load_model(twin, &args.models))
+        .transpose()?;
+    let out = args
+        .out
+        .clone()
+        .unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
     evaluation::prepare(&out)?;
     let dataset = Dataset::open(&args.dataset).map_err(CliError::failed)?;
     let config = EvaluateConfig {

@@ -34,27 +34,39 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
     let dataset = Dataset::open(&args.dataset).map_err(CliError::failed)?;
-    let episode = dataset.episodes().iter().find(|episode| episode.index == args.episode).ok_or_else(|| {
-        CliError::Usage(format!(
-            "there is no episode {} in {}; it has {} of them",
-            args.episode,
-            args.dataset.display(),
-            dataset.episodes().len()
-        ))
-    })?;
+    let episode = dataset
+        .episodes()
+        .iter()
+        .find(|episode| episode.index == args.episode)
+        .ok_or_else(|| {
+            CliError::Usage(format!(
+                "there is no episode {} in {}; it has {} of them",
+                args.episode,
+                args.dataset.display(),
+                dataset.episodes().len()
+            ))
+        })?;
     if args.first >= episode.frame_count {
         return Err(CliError::Usage(format!(
             "--first is {}; episode {} has {} frames",
             args.first, args.episode, episode.frame_count
         )));
     }
-    let end = episode.frame_count.min(args.count.map_or(usize::MAX, |count| args.first.saturating_add(count)));
+    let end = episode
+        .frame_count
+        .min(args.count.map_or(usize::MAX, |count| args.first.saturating_add(count)));
     let range = episode.first_frame + args.first..episode.first_frame + end;
     std::fs::create_dir_all(&args.out).map_err(|error| CliError::io("make", &args.out, &error))?;
     let info = dataset.info();
     let frames = range
         .clone()
-        .map(|frame| Frame::new(info.frame_width_px, info.frame_height_px, dataset.pixels(frame).to_vec()))
+        .map(|frame| {
+            Frame::new(
+                info.frame_width_px,
+                info.frame_height_px,
+                dataset.pixels(frame).to_vec(),
+            )
+        })
         .collect::<Result<Vec<_>, _>>()
         .map_err(CliError::failed)?;
     for (index, frame) in frames.iter().enumerate() {
@@ -62,12 +74,19 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
         write(&args.out.join(format!("frame-{index:03}.png")), &png)?;
     }
     let delay_ms = (info.frame_period_s * 1000.0).round() as u32;
-    write(&args.out.join("episode.gif"), &codec::encode_gif(&frames, delay_ms).map_err(CliError::failed)?)?;
+    write(
+        &args.out.join("episode.gif"),
+        &codec::encode_gif(&frames, delay_ms).map_err(CliError::failed)?,
+    )?;
     let actions: Vec<&[f32]> = range.clone().map(|frame| dataset.action(frame)).collect();
     let states: Vec<&[f32]> = range.map(|frame| dataset.state(frame)).collect();
     let text = json!({ "states": states, "actions": actions }).to_string();
     write(&args.out.join("actions.json"), text.as_bytes())?;
-    say(format!("{}: {} frames, episode.gif, actions.json", args.out.display(), frames.len()))
+    say(format!(
+        "{}: {} frames, episode.gif, actions.json",
+        args.out.display(),
+        frames.len()
+    ))
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), CliError> {

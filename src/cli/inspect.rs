@@ -32,10 +32,19 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
 
 fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
     let spec = &manifest.spec;
-    say(format!("{} ({} version {})", dir.display(), manifest.name, manifest.version))?;
+    say(format!(
+        "{} ({} version {})",
+        dir.display(),
+        manifest.name,
+        manifest.version
+    ))?;
     say(format!(
         "  takes       {} frames of {}×{} px, gray, {} s apart{}",
-        spec.context, spec.frame_width_px, spec.frame_height_px, spec.frame_period_s, conditions(spec)
+        spec.context,
+        spec.frame_width_px,
+        spec.frame_height_px,
+        spec.frame_period_s,
+        conditions(spec)
     ))?;
     say(format!("  predicts    the {} frames that follow", spec.horizon))?;
     say(format!(
@@ -45,10 +54,17 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
         spec.features,
         spec.conditioning,
         spec.reconstruction,
-        if spec.preprocess.invert { "inverted" } else { "not inverted" },
+        if spec.preprocess.invert {
+            "inverted"
+        } else {
+            "not inverted"
+        },
     ))?;
     say(format!("  parameters  {}", manifest.parameters))?;
-    say(format!("  cost        {} multiply–adds a predicted frame", manifest.multiply_adds_per_frame))?;
+    say(format!(
+        "  cost        {} multiply–adds a predicted frame",
+        manifest.multiply_adds_per_frame
+    ))?;
     say(format!(
         "  trained on  {} windows of {} (content {})",
         manifest.dataset.windows, manifest.dataset.name, manifest.dataset.content_hash
@@ -76,20 +92,35 @@ fn conditions(spec: &ModelSpec) -> String {
 }
 
 fn label(name: &str, unit: &str) -> String {
-    if unit.is_empty() { name.to_owned() } else { format!("{name} {unit}") }
+    if unit.is_empty() {
+        name.to_owned()
+    } else {
+        format!("{name} {unit}")
+    }
 }
 
 fn describe_dataset(dir: &Path) -> Result<(), CliError> {
     let dataset = Dataset::open(dir).map_err(CliError::failed)?;
     let info = dataset.info();
-    let list = |channels: &[Channel]| channels.iter().map(|c| label(&c.name, &c.unit)).collect::<Vec<_>>().join(", ");
+    let list = |channels: &[Channel]| {
+        channels
+            .iter()
+            .map(|c| label(&c.name, &c.unit))
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
     say(format!("{} ({})", dir.display(), info.name))?;
-    say(format!("  frames      {} of {}×{} px, {} s apart", info.frame_count, info.frame_width_px,
-        info.frame_height_px, info.frame_period_s))?;
+    say(format!(
+        "  frames      {} of {}×{} px, {} s apart",
+        info.frame_count, info.frame_width_px, info.frame_height_px, info.frame_period_s
+    ))?;
     say(format!("  episodes    {}", info.episode_count))?;
     say(format!("  action      [{}]", list(&info.action_channels)))?;
     say(format!("  state       [{}]", list(&info.state_channels)))?;
     say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
-    say(format!("  scenario    {}", info.scenario.as_deref().unwrap_or("none: recorded")))?;
+    say(format!(
+        "  scenario    {}",
+        info.scenario.as_deref().unwrap_or("none: recorded")
+    ))?;
     say(format!("  content     SHA-256 {}", info.content_hash))
 }

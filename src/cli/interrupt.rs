@@ -9,7 +9,10 @@ use super::CliError;
 pub(super) fn flag() -> Result<Arc<AtomicBool>, CliError> {
     let cancelled = Arc::new(AtomicBool::new(false));
     let raised = Arc::clone(&cancelled);
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().map_err(CliError::failed)?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()
+        .map_err(CliError::failed)?;
     std::thread::Builder::new()
         .name("interrupt".to_owned())
         .spawn(move || {

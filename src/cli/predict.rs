@@ -19,12 +19,14 @@ use crate::types::{Action, RobotState};
 /// they are the truth that the prediction is shown over. Writes predicted-1.png and so on, contact-sheet.png and
 /// prediction.gif.
 #[derive(clap::Args)]
-#[command(after_help = "The actions file is JSON, one entry a frame from the directory's first on:
+#[command(
+    after_help = "The actions file is JSON, one entry a frame from the directory's first on:
   {\"states\": [[…], …], \"actions\": [[…], …]}
 The action of a frame acts from it to the next. A model that is told the state takes that of the last frame it sees.
 
 Example: foreframe export --dataset data/moving-observer --episode 3 --out look
-         foreframe predict --model moving --frames look --actions look/actions.json --out seen")]
+         foreframe predict --model moving --frames look --actions look/actions.json --out seen"
+)]
 pub(super) struct Args {
     /// A model's name or directory
     #[arg(long)]
@@ -67,9 +69,15 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     }
     let (seen, truth) = frames.split_at(spec.context);
     let input = input(spec, seen, args.actions.as_deref())?;
-    let predicted = serving::predict(&loaded, &[&input]).map_err(CliError::failed)?.remove(0);
+    let predicted = serving::predict(&loaded, &[&input])
+        .map_err(CliError::failed)?
+        .remove(0);
     write(&args.out, &loaded, seen, &predicted, truth)?;
-    say(format!("{}: {} predicted frames, contact-sheet.png, prediction.gif", args.out.display(), predicted.len()))
+    say(format!(
+        "{}: {} predicted frames, contact-sheet.png, prediction.gif",
+        args.out.display(),
+        predicted.len()
+    ))
 }
 
 fn input(spec: &ModelSpec, seen: &[Frame], actions: Option<&Path>) -> Result<PredictionInput, CliError> {
@@ -87,7 +95,10 @@ fn input(spec: &ModelSpec, seen: &[Frame], actions: Option<&Path>) -> Result<Pre
 fn read_trace(path: &Path) -> Result<Trace, CliError> {
     let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
     serde_json::from_slice(&bytes).map_err(|error| {
-        CliError::Failed(format!("{} is no actions file ({error}); see foreframe predict --help", path.display()))
+        CliError::Failed(format!(
+            "{} is no actions file ({error}); see foreframe predict --help",
+            path.display()
+        ))
     })
 }
 
@@ -126,11 +137,20 @@ fn write(
         write_atomically(&path, bytes).map_err(|error| CliError::io("write", &path, &error))
     };
     for (index, frame) in predicted.iter().enumerate() {
-        save(format!("predicted-{}.png", index + 1), &codec::encode_png(frame).map_err(CliError::failed)?)?;
+        save(
+            format!("predicted-{}.png", index + 1),
+            &codec::encode_png(frame).map_err(CliError::failed)?,
+        )?;
     }
     let sheet = montage::prediction_sheet(seen, predicted, truth).map_err(CliError::failed)?;
-    save("contact-sheet.png".to_owned(), &codec::encode_png(&sheet).map_err(CliError::failed)?)?;
+    save(
+        "contact-sheet.png".to_owned(),
+        &codec::encode_png(&sheet).map_err(CliError::failed)?,
+    )?;
     let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
     let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
-    save("prediction.gif".to_owned(), &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?)
+    save(
+        "prediction.gif".to_owned(),
+        &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,
+    )
 }

@@ -52,7 +52,12 @@ impl Progress {
         }
         *last = Instant::now();
         let (rate, left) = (self.bar.per_sec(), HumanDuration(self.bar.eta()));
-        self.line(&format!("{}/{total} {}, {rate:.1}/s, {left} left {}", done, self.unit, message()));
+        self.line(&format!(
+            "{}/{total} {}, {rate:.1}/s, {left} left {}",
+            done,
+            self.unit,
+            message()
+        ));
     }
 
     /// Writes a line above the bar.

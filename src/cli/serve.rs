@@ -56,23 +56,38 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     }
     let published = args.data_dir.join("models");
     let models = serving::load_models(&[args.models.as_path(), published.as_path()])?;
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(CliError::failed)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(CliError::failed)?;
     runtime.block_on(listen(args, models))
 }
 
 async fn listen(args: &Args, models: Vec<LoadedModel>) -> Result<(), CliError> {
-    let listener = TcpListener::bind(args.bind)
-        .await
-        .map_err(|error| CliError::Failed(format!("could not listen on {}: {error}; try another --bind", args.bind)))?;
+    let listener = TcpListener::bind(args.bind).await.map_err(|error| {
+        CliError::Failed(format!(
+            "could not listen on {}: {error}; try another --bind",
+            args.bind
+        ))
+    })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
     for model in &models {
-        info!(model = model.manifest.name, version = model.manifest.version, "model loaded");
+        info!(
+            model = model.manifest.name,
+            version = model.manifest.version,
+            "model loaded"
+        );
     }
     if models.is_empty() {
         info!(directory = %args.models.display(), "no models there; train one by POST /v1/jobs or foreframe train");
     }
-    let config = ServerConfig { data_dir: args.data_dir.clone(), ..ServerConfig::default() };
+    let config = ServerConfig {
+        data_dir: args.data_dir.clone(),
+        ..ServerConfig::default()
+    };
     let app = App::start(config, models).map_err(CliError::failed)?;
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
-    server::serve(listener, app, server::shutdown::requested()).await.map_err(CliError::failed)
+    server::serve(listener, app, server::shutdown::requested())
+        .await
+        .map_err(CliError::failed)
 }

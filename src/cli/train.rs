@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::{CliError, command_line, interrupt, progress::Progress, say};
 use crate::dataset::Dataset;
-use crate::training::{self, Event, Outcome, TrainConfig, Training};
+use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
 
 /// Train a model on a data set.
 ///
@@ -45,9 +45,17 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     }
     let dataset_dir = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
     let dataset = Dataset::open(&dataset_dir).map_err(CliError::failed)?;
-    let run_dir = args.out.clone().unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
+    let run_dir = args
+        .out
+        .clone()
+        .unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
     let command = command_line();
-    let job = Training { config: &config, dataset: &dataset, run_dir: &run_dir, command: &command };
+    let job = Training {
+        config: &config,
+        dataset: &dataset,
+        run_dir: &run_dir,
+        command: &command,
+    };
     let cancelled = interrupt::flag()?;
     let progress = Progress::new("steps");
     let mut watch = Watch::new(&progress, &config);
@@ -74,20 +82,29 @@ fn read_config(path: &Path) -> Result<String, CliError> {
 }
 
 fn default_dataset(preset: &str) -> PathBuf {
-    Path::new("data").join(if preset == "moving" { "moving-observer" } else { "static-observer" })
+    Path::new("data").join(if preset == "moving" {
+        "moving-observer"
+    } else {
+        "static-observer"
+    })
 }
 
 /// Shows a training's events.
 struct Watch<'a> {
     progress: &'a Progress,
     steps: [usize; 2],
-    is_started: bool,
+    stage: Option<Stage>,
     validation: Option<f64>,
 }
 
 impl<'a> Watch<'a> {
     fn new(progress: &'a Progress, config: &TrainConfig) -> Self {
-        Self { progress, steps: [config.pretrain.steps, config.fit.steps], is_started: false, validation: None }
+        Self {
+            progress,
+            steps: [config.pretrain.steps, config.fit.steps],
+            stage: None,
+            validation: None,
+        }
     }
 
     fn on_event(&mut self, event: Event) {
@@ -96,29 +113,36 @@ impl<'a> Watch<'a> {
                 self.start(stage, step);
                 self.progress.line(&format!("from step {step}, on {windows} windows"));
             }
-            Event::Step { stage, step, steps, loss } => {
-                if step == 1 && !self.is_started {
-                    self.start(stage, 0);
+            Event::Step {
+                stage,
+                step,
+                steps,
+                loss,
+            } => {
+                if self.stage != Some(stage) {
+                    self.start(stage, step - 1);
                 }
-                self.is_started = false;
                 let validation = self.validation;
                 self.progress.update(step as u64, steps as u64, || match validation {
                     Some(best) => format!("loss {loss:.6}, validation {best:.6}"),
                     None => format!("loss {loss:.6}"),
                 });
             }
-            Event::Validated { step, loss, is_best, .. } => {
+            Event::Validated {
+                step, loss, is_best, ..
+            } => {
                 self.validation = Some(loss);
                 let kept = if is_best { ", the best so far" } else { "" };
-                self.progress.line(&format!("step {step}: validation MSE {loss:.6} in the model's space{kept}"));
+                self.progress
+                    .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
             }
             Event::Checkpointed { .. } => {}
         }
     }
 
-    fn start(&mut self, stage: training::Stage, step: usize) {
-        let total = self.steps[usize::from(stage == training::Stage::Fit)];
+    fn start(&mut self, stage: Stage, step: usize) {
+        let total = self.steps[usize::from(stage == Stage::Fit)];
         self.progress.start(&stage.to_string(), step as u64, total as u64);
-        self.is_started = true;
+        self.stage = Some(stage);
     }
 }

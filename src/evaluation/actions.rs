@@ -67,6 +67,9 @@ pub struct ActionTable {
     pub finding: String,
 }
 
+/// A variant's mean squared errors, `[window][step]`.
+pub type VariantErrors = (Variant, Vec<Vec<f64>>);
+
 /// For each of `count` windows another one whose actions it is told: a single cycle through all (Sattolo 1986), so none
 /// keeps its own. With a single window there is no other.
 #[must_use]
@@ -86,7 +89,7 @@ pub fn compare(
     dataset: &Dataset,
     windows: &[Window],
     watched: &Watched,
-) -> Result<Vec<(Variant, Vec<Vec<f64>>)>, EvaluationError> {
+) -> Result<Vec<VariantErrors>, EvaluationError> {
     let donors: Vec<Window> = shuffle(windows.len(), watched.bootstrap.seed)
         .into_iter()
         .map(|donor| windows[donor])
@@ -137,10 +140,10 @@ fn errors_of(
 
 /// The table of these errors per variant, window and step; the true actions come first.
 #[must_use]
-pub fn table(errors: &[(Variant, Vec<Vec<f64>>)], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
+pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
     let curves: Vec<Curve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
     let of_window = |window: usize| -> Vec<f64> {
-        let mean = |(_, windows): &(Variant, Vec<Vec<f64>>)| Curve::new(windows[window].clone()).mean;
+        let mean = |(_, windows): &VariantErrors| Curve::new(windows[window].clone()).mean;
         errors.iter().map(mean).collect()
     };
     let trials = Trials::group(trial_of, (0..trial_of.len()).map(of_window));

@@ -56,19 +56,14 @@ fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
     )?;
     writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
     for SetReport { split, outcome } in &report.sets {
+        write!(out, "| {} (`{split}`) | ", title(split))?;
         match outcome {
-            Outcome::Scored(scores) => writeln!(
-                out,
-                "| {} (`{split}`) | {} | {} | **{:.3}** | {} |",
-                title(split),
-                scores.windows,
-                scores.trials,
-                scores.skill.skill.mean,
-                interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}")),
-            )?,
-            Outcome::Skipped { reason } => {
-                writeln!(out, "| {} (`{split}`) | – | – | skipped: {reason} | – |", title(split))?
+            Outcome::Scored(scores) => {
+                let interval = interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}"));
+                let (windows, trials, skill) = (scores.windows, scores.trials, scores.skill.skill.mean);
+                writeln!(out, "{windows} | {trials} | **{skill:.3}** | {interval} |")?;
             }
+            Outcome::Skipped { reason } => writeln!(out, "– | – | skipped: {reason} | – |")?,
         }
     }
     Ok(())

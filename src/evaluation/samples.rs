@@ -47,7 +47,7 @@ fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Resul
     Ok(Sample {
         name: sample.rank.clone(),
         note: format!(
-            "{} window of {} by error: MSE {:.2}e-4",
+            "{} window of {} by error: MSE {:.1}e-4",
             sample.rank,
             dataset.info().name,
             sample.mse * 1e4

@@ -5,6 +5,7 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 use super::TrainError;
+use super::config::Target;
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
@@ -16,48 +17,90 @@ use crate::types::Seed;
 pub(super) struct FrameSource<'a> {
     dataset: &'a Dataset,
     preprocess: Preprocess,
+    target: Preprocess,
 }
 
 /// One batch of windows.
 pub(super) struct WindowBatch {
-    /// `[B, T, P]`
+    /// `[B, T, P]`, as the encoder reads them.
     pub(super) inputs: Tensor,
-    /// `[B, horizon, P]`
+    /// `[B, T, P]`, as the reconstruction is to write them.
+    pub(super) input_targets: Tensor,
+    /// `[B, horizon, P]`, as the prediction is to write them.
     pub(super) targets: Tensor,
+    /// `[B, horizon, P]`, the same as the encoder would read them, if asked for.
+    pub(super) future: Option<Tensor>,
     /// The actions that lead to the targets, and the state at the last input.
     pub(super) condition: Condition,
 }
 
 impl<'a> FrameSource<'a> {
-    pub(super) fn new(dataset: &'a Dataset, preprocess: Preprocess) -> Self {
-        Self { dataset, preprocess }
+    pub(super) fn new(dataset: &'a Dataset, preprocess: Preprocess, target: Target) -> Self {
+        let target = match target {
+            Target::Sharp => Preprocess {
+                blur_sigma_px: 0.0,
+                ..preprocess
+            },
+            Target::Smoothed => preprocess,
+        };
+        Self {
+            dataset,
+            preprocess,
+            target,
+        }
     }
 
-    /// The frames as `[N, P]`.
+    /// The frames as the encoder reads them, `[N, P]`.
     pub(super) fn frames(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        let pixels = self.pixel_count();
+        self.through(&self.preprocess, frames)
+    }
+
+    /// The frames as the decoder is to write them, `[N, P]`.
+    pub(super) fn targets(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
+        self.through(&self.target, frames)
+    }
+
+    fn through(&self, preprocess: &Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
+        let info = self.dataset.info();
+        let pixels = info.frame_pixels();
         let mut values = vec![0.0; frames.len() * pixels];
         values
             .par_chunks_exact_mut(pixels)
             .zip(frames)
-            .try_for_each(|(out, &frame)| self.fill(frame, out))?;
+            .try_for_each(|(out, &frame)| {
+                let pixels = self.dataset.pixels(frame).to_vec();
+                let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels)?;
+                out.copy_from_slice(&preprocess.forward(&frame));
+                Ok::<(), TrainError>(())
+            })?;
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
     }
 
-    /// The windows' inputs, targets and conditions.
-    pub(super) fn windows(&self, windows: &[&Window], shape: WindowShape) -> Result<WindowBatch, TrainError> {
+    /// The windows' inputs, targets and conditions. The future as the encoder would read it is made only if asked for.
+    pub(super) fn windows(
+        &self,
+        windows: &[&Window],
+        shape: WindowShape,
+        with_future: bool,
+    ) -> Result<WindowBatch, TrainError> {
         let (context, horizon) = (shape.context, shape.horizon);
-        let length = context + horizon;
-        let frames: Vec<usize> = windows
-            .iter()
-            .flat_map(|window| window.first_frame..window.first_frame + length)
-            .collect();
-        let all = self
-            .frames(&frames)?
-            .reshape((windows.len(), length, self.pixel_count()))?;
+        let span = |from: usize, length: usize| -> Vec<usize> {
+            windows
+                .iter()
+                .flat_map(|w| w.first_frame + from..w.first_frame + from + length)
+                .collect()
+        };
+        let (seen, to_come) = (span(0, context), span(context, horizon));
+        let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         Ok(WindowBatch {
-            inputs: all.narrow(1, 0, context)?.contiguous()?,
-            targets: all.narrow(1, context, horizon)?.contiguous()?,
+            inputs: batched(self.frames(&seen)?, context)?,
+            input_targets: batched(self.targets(&seen)?, context)?,
+            future: with_future
+                .then(|| self.frames(&to_come))
+                .transpose()?
+                .map(|f| batched(f, horizon))
+                .transpose()?,
+            targets: batched(self.targets(&to_come)?, horizon)?,
             condition: self.condition(windows, shape)?,
         })
     }
@@ -86,22 +129,6 @@ impl<'a> FrameSource<'a> {
                 .then(|| tensor(present, &[windows.len(), states]))
                 .transpose()?,
         })
-    }
-
-    fn pixel_count(&self) -> usize {
-        let info = self.dataset.info();
-        info.frame_width_px as usize * info.frame_height_px as usize
-    }
-
-    fn fill(&self, frame: usize, out: &mut [f32]) -> Result<(), TrainError> {
-        let info = self.dataset.info();
-        let frame = Frame::new(
-            info.frame_width_px,
-            info.frame_height_px,
-            self.dataset.pixels(frame).to_vec(),
-        )?;
-        out.copy_from_slice(&self.preprocess.forward(&frame));
-        Ok(())
     }
 }
 

@@ -97,12 +97,24 @@ pub enum All {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PretrainConfig {
+    /// Where the codec's weights start.
+    pub start: CodecStart,
     /// Updates.
     pub steps: usize,
     /// Frames an update.
     pub batch_size: usize,
     /// Adam's, at its highest.
     pub learning_rate: f64,
+}
+
+/// Where the codec's weights start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CodecStart {
+    /// At the principal components of the training frames.
+    Principal,
+    /// At random.
+    Random,
 }
 
 /// Stage 2.
@@ -119,10 +131,22 @@ pub struct FitConfig {
     pub codec: CodecTraining,
     /// What is minimized, in the model's space.
     pub loss: Loss,
+    /// Which frames the decoder learns to write.
+    pub target: Target,
     /// What the predictor reads after its first step while it is trained.
     pub feedback: TrainingFeedback,
     /// Weight of the reconstruction's loss beside the prediction's; 0 leaves the reconstruction decoder untrained.
     pub reconstruction_weight: f64,
+}
+
+/// Which frames the decoder learns to write, in both stages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Target {
+    /// As the camera took them, inverted where the model inverts.
+    Sharp,
+    /// As the encoder reads them: smoothed too.
+    Smoothed,
 }
 
 /// What becomes of the pre-trained codec in stage 2.
@@ -216,7 +240,7 @@ impl TrainConfig {
         }
         let (run, fit, pretrain) = (&self.run, &self.fit, &self.pretrain);
         let counts = [
-            ("pretrain.steps", pretrain.steps, 1, MAX_STEPS),
+            ("pretrain.steps", pretrain.steps, 0, MAX_STEPS),
             ("pretrain.batch_size", pretrain.batch_size, 1, MAX_BATCH_SIZE),
             ("fit.steps", fit.steps, 1, MAX_STEPS),
             ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::batches::{Shuffle, WindowBatch};
+use super::batches::Shuffle;
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
 use super::observer::Stage;
 use super::stage::{Objective, Part};
@@ -34,10 +34,6 @@ impl<'a> SequenceObjective<'a> {
 
     fn is_frozen(&self) -> bool {
         self.config.fit.codec == CodecTraining::Frozen
-    }
-
-    fn batch(&self, windows: &[&Window]) -> Result<WindowBatch, TrainError> {
-        self.plan.source.windows(windows, self.config.window_shape())
     }
 
     /// The features of `[B, T, P]` frames as `[B, T, F]`.
@@ -72,23 +68,27 @@ impl Objective for SequenceObjective<'_> {
         let fit = &self.config.fit;
         let drawn = part.of(self.shuffle.batch(step, fit.batch_size));
         let windows: Vec<&Window> = drawn.into_iter().map(|position| &self.plan.train[position]).collect();
-        let batch = self.batch(&windows)?;
+        let is_forced = fit.feedback == TrainingFeedback::Truth;
+        let batch = self
+            .plan
+            .source
+            .windows(&windows, self.config.window_shape(), is_forced)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
         let inputs = self.features(&model, &batch.inputs)?;
-        let predicted = match fit.feedback {
-            TrainingFeedback::Prediction => model.predict(&inputs, &batch.condition, Feedback::Prediction)?,
-            TrainingFeedback::Truth => {
-                let truth = self.features(&model, &batch.targets)?;
-                model.predict(&inputs, &batch.condition, Feedback::Truth(&truth))?
-            }
-        };
+        let truth = batch
+            .future
+            .as_ref()
+            .map(|future| self.features(&model, future))
+            .transpose()?;
+        let feedback = truth.as_ref().map_or(Feedback::Prediction, Feedback::Truth);
+        let predicted = model.predict(&inputs, &batch.condition, feedback)?;
         let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
         if fit.reconstruction_weight == 0.0 {
             return Ok(loss);
         }
         let reconstructed = Self::frames(&model, &model.reconstruct(&inputs)?)?;
-        let reconstruction = fit.loss.between(&reconstructed, &batch.inputs)?;
+        let reconstruction = fit.loss.between(&reconstructed, &batch.input_targets)?;
         Ok((loss + (reconstruction * fit.reconstruction_weight)?)?)
     }
 
@@ -97,7 +97,7 @@ impl Objective for SequenceObjective<'_> {
         let windows: Vec<&Window> = self.plan.validation.iter().collect();
         let mut sum = 0.0;
         for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
-            let batch = self.batch(chunk)?;
+            let batch = self.plan.source.windows(chunk, self.config.window_shape(), false)?;
             let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
             let loss = Loss::Mse.between(&predicted, &batch.targets)?.to_scalar::<f32>()?;
             sum += f64::from(loss) * chunk.len() as f64;

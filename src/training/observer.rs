@@ -50,7 +50,7 @@ pub enum Event {
         stage: Stage,
         /// After so many updates.
         step: usize,
-        /// Mean squared error in the model's space.
+        /// Their mean squared error against the target frames.
         loss: f64,
         /// Whether it is the lowest so far, whose weights are kept.
         is_best: bool,

@@ -19,7 +19,8 @@ pub(super) struct CodecObjective<'a> {
     config: &'a TrainConfig,
     frames: Vec<usize>,
     shuffle: Shuffle,
-    validation: Tensor,
+    /// Frames of the validation windows as they are read, and as they are to be written.
+    validation: [Tensor; 2],
 }
 
 impl<'a> CodecObjective<'a> {
@@ -34,7 +35,7 @@ impl<'a> CodecObjective<'a> {
             config,
             shuffle: Shuffle::new(frames.len(), config.seed.derive("pretrain", 0)),
             frames,
-            validation: plan.source.frames(&validation)?,
+            validation: [plan.source.frames(&validation)?, plan.source.targets(&validation)?],
         })
     }
 
@@ -69,7 +70,8 @@ impl Objective for CodecObjective<'_> {
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
-        let loss = Loss::Mse.between(&self.reconstruct(parameters, &self.validation)?, &self.validation)?;
+        let [frames, targets] = &self.validation;
+        let loss = Loss::Mse.between(&self.reconstruct(parameters, frames)?, targets)?;
         Ok(f64::from(loss.to_scalar::<f32>()?))
     }
 }

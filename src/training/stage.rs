@@ -28,7 +28,7 @@ pub(super) trait Objective: Sync {
     fn learning_rate(&self) -> f64;
     /// The loss of one part of the batch that belongs to a step, a scalar to differentiate.
     fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError>;
-    /// The mean squared error of the validation split, in the model's space.
+    /// The mean squared error of the validation split against the target frames.
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
 }
 

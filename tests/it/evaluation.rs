@@ -252,12 +252,12 @@ fn the_markdown_reads_as_agreed() {
     insta::assert_snapshot!(masked);
 }
 
-/// Replaces every decimal fraction and hash by a mark.
+/// Replaces every number of three digits or more, every fraction and every hash by a mark.
 fn mask_numbers(line: &str) -> String {
     let is_measured = |word: &str| {
         let digits = word.trim_matches(|c: char| !c.is_ascii_alphanumeric());
-        let fraction = digits.contains('.') && digits.chars().all(|c| c.is_ascii_digit() || c == '.');
-        fraction || digits.len() == 64
+        let number = digits.chars().all(|c| c.is_ascii_digit() || c == '.');
+        (number && digits.len() >= 3) || digits.len() == 64
     };
     let words = line.split(' ').map(|word| if is_measured(word) { "#" } else { word });
     words.collect::<Vec<_>>().join(" ")

@@ -51,9 +51,11 @@ impl Animation {
                     cell("last seen", &moment.copied),
                 ],
             };
+            // Smaller than a panel: every moment costs bytes.
+            let panel = Style::for_frames_of(moment.truth.width());
             let style = Style {
+                scale: (panel.scale * 2 / 3).max(1),
                 grid_lines: 0,
-                ..Style::for_frames_of(moment.truth.width())
             };
             montage(&format!("{} frames ahead", self.steps_ahead), &[row], &style)
         });

@@ -60,7 +60,8 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
         .x_desc("frames ahead")
         .y_desc("MSE per pixel, ×10⁻⁴ (log scale)")
         .label_style(("sans-serif", 14))
-        .light_line_style(RGBColor(240, 240, 240))
+        .max_light_lines(0)
+        .bold_line_style(RGBColor(225, 225, 225))
         .draw()
         .map_err(told)?;
     for (method, values) in &chart.series {
