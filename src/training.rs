@@ -8,6 +8,7 @@ pub mod config;
 mod fit;
 pub mod observer;
 pub mod optimizer;
+mod preset;
 mod pretrain;
 mod principal;
 mod stage;
@@ -53,6 +54,12 @@ pub enum TrainError {
         run_dir: PathBuf,
         /// `configuration` or `data set`.
         what: &'static str,
+    },
+    /// No window is left to choose the best weights by.
+    #[error("the validation split holds no window of {frames} frames; collect more trials, 40 or more")]
+    NoValidation {
+        /// Frames of a window.
+        frames: usize,
     },
     /// The loss or a gradient became NaN or infinite, or the loss absurdly large.
     #[error(
@@ -238,6 +245,9 @@ impl<'a> Plan<'a> {
             WindowBudget::All(_) => splits.windows(dataset, Split::Train, shape, 1)?,
         };
         let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
+        if validation.is_empty() {
+            return Err(TrainError::NoValidation { frames: shape.frames() });
+        }
         let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
         let validation = validation.into_iter().step_by(stride).collect();
         let frames = window_frames(&train, shape.context + shape.horizon);

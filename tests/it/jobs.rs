@@ -239,7 +239,7 @@ async fn a_collected_data_set_trains_a_model_that_serves_at_once() {
     );
 
     let description = get(&app, "/v1/models/fresh").await.json();
-    assert_eq!(description["lineage"]["dataset"], "seen");
+    assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-0");
     let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
         .await
         .detail(422);

@@ -133,6 +133,8 @@ fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_mani
     let config = small_config(&[
         "pretrain.steps=300",
         "fit.steps=300",
+        "pretrain.start=random",
+        "pretrain.learning_rate=1e-2",
         "model.features=16",
         "model.hidden=24",
     ]);
