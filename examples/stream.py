@@ -2,7 +2,7 @@
 
     pip install websockets
     foreframe export --dataset data/moving-observer --episode 3 --out look
-    python examples/stream.py --model moving --frames look --actions look/actions.json --out seen
+    python examples/stream.py --frames look --actions look/actions.json --out seen
 
 The actions file is JSON, {"actions": [[linear, angular], ...], "states": [[...], ...]}, one entry a frame; a model that is
 told nothing needs none. After the frame of number N, the prediction of the k-th frame to come is OUT/after-N-k.png.
@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--server", default="ws://127.0.0.1:8642", help="where Foreframe listens (default: %(default)s)")
-parser.add_argument("--model", required=True, help="a model's name")
+parser.add_argument("--model", default="moving", help="a model's name (default: %(default)s)")
 parser.add_argument("--frames", required=True, type=pathlib.Path, help="a directory of PNG or JPEG frames")
 parser.add_argument("--actions", type=pathlib.Path, help="what the robot did and said of itself, as JSON")
 parser.add_argument("--out", required=True, type=pathlib.Path, help="the directory to write into")

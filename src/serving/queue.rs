@@ -162,7 +162,7 @@ mod tests {
             model: model.to_owned(),
             input: PredictionInput::default(),
             accepted,
-            deadline: accepted + Duration::from_secs(60),
+            deadline: accepted + Duration::from_mins(1),
             reply,
         };
         (waiting, answer)

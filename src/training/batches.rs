@@ -52,15 +52,15 @@ impl<'a> FrameSource<'a> {
 
     /// The frames as the encoder reads them, `[N, P]`.
     pub(super) fn frames(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.through(&self.preprocess, frames)
+        self.through(self.preprocess, frames)
     }
 
     /// The frames as the decoder is to write them, `[N, P]`.
     pub(super) fn targets(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.through(&self.target, frames)
+        self.through(self.target, frames)
     }
 
-    fn through(&self, preprocess: &Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
+    fn through(&self, preprocess: Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
         let info = self.dataset.info();
         let pixels = info.frame_pixels();
         let mut values = vec![0.0; frames.len() * pixels];

@@ -31,20 +31,20 @@ impl TrainConfig {
             .iter()
             .find(|(name, _)| *name == preset)
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
-        let mut table: Table = text.parse().map_err(describe)?;
+        let mut table: Table = text.parse().map_err(|error| describe(&error))?;
         if let Some(file) = file {
-            merge(&mut table, file.parse().map_err(describe)?);
+            merge(&mut table, file.parse().map_err(|error| describe(&error))?);
         }
         for setting in settings {
             merge(&mut table, parse_setting(setting)?);
         }
-        let config: Self = table.try_into().map_err(describe)?;
+        let config: Self = table.try_into().map_err(|error| describe(&error))?;
         config.validate()?;
         Ok(config)
     }
 }
 
-fn describe(error: toml::de::Error) -> TrainError {
+fn describe(error: &toml::de::Error) -> TrainError {
     TrainError::Config(error.message().to_owned())
 }
 
@@ -59,7 +59,7 @@ fn parse_setting(setting: &str) -> Result<Table, TrainError> {
     format!("{key} = {value}")
         .parse()
         .or_else(|_| format!("{key} = {value:?}").parse())
-        .map_err(describe)
+        .map_err(|error| describe(&error))
 }
 
 /// Lays `over` upon `base`, table by table.

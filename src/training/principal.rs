@@ -94,7 +94,9 @@ fn orthonormalize(rows: &mut [Vec<f32>]) {
         }
         let length = norm(row);
         let scale = if length > 1e-6 * original { 1.0 / length } else { 0.0 };
-        row.iter_mut().for_each(|value| *value *= scale);
+        for value in row.iter_mut() {
+            *value *= scale;
+        }
     }
 }
 

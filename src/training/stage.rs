@@ -144,7 +144,7 @@ impl StageRunner<'_> {
                 loss,
             });
             if step.is_multiple_of(self.run.validate_every_steps) || step == steps {
-                self.validate(objective, state, loss, observer)?;
+                Self::validate(objective, state, loss, observer)?;
             }
             if step.is_multiple_of(self.run.checkpoint_every_steps) || step == steps {
                 self.save(state, observer)?;
@@ -209,7 +209,6 @@ impl StageRunner<'_> {
     }
 
     fn validate(
-        &self,
         objective: &dyn Objective,
         state: &mut TrainState,
         train_loss: f64,

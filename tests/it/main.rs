@@ -1,5 +1,6 @@
 //! Behaviour of the whole library, one test binary.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
+#![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
 mod dataset_collect;

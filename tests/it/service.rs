@@ -22,7 +22,7 @@ pub(crate) const HEIGHT: u32 = 12;
 pub(crate) const CONTEXT: usize = 3;
 pub(crate) const HORIZON: usize = 2;
 /// Longer than anything here takes.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
 
 pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
