@@ -1,5 +1,5 @@
-//! From windows to weights. [`run`] goes through two stages — [`pretrain`] teaches the dense codec single frames, [`fit`]
-//! the recurrent network their order — each a loop of [`stage`]; [`checkpoint`] lets either be stopped at any step and gone
+//! From windows to weights. [`run`] goes through two stages — `pretrain` teaches the dense codec single frames, `fit`
+//! the recurrent network their order — each a loop of `stage`; `checkpoint` lets either be stopped at any step and gone
 //! on with to the same bits.
 
 mod batches;

@@ -13,7 +13,7 @@ use super::{ModelSpec, NnError, Parameters, Reconstruction};
 pub enum Feedback<'a> {
     /// The features it predicted: how it is used.
     Prediction,
-    /// The true features [B, horizon, F] of the frames to come ("teacher forcing"); the last of them is not used.
+    /// The true features `[B, horizon, F]` of the frames to come ("teacher forcing"); the last of them is not used.
     Truth(&'a Tensor),
 }
 
@@ -89,19 +89,19 @@ impl Model {
         &self.spec
     }
 
-    /// Features [N, F] of frames [N, P] in the model's space. Errors: `Shape`.
+    /// Features `[N, F]` of frames `[N, P]` in the model's space. Errors: `Shape`.
     pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
         self.frame_encoder.forward(frames)
     }
 
-    /// Frames [N, P] in the model's space, not clamped, of features [N, F]. Errors: `Shape`.
+    /// Frames `[N, P]` in the model's space, not clamped, of features `[N, F]`. Errors: `Shape`.
     pub fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", features, &[None, Some(self.spec.features)])?;
         self.frame_decoder.forward(features)
     }
 
-    /// Features [B, horizon, F] of the frames that follow those with `features` [B, context, F]. The predictor starts
+    /// Features `[B, horizon, F]` of the frames that follow those with `features` [B, context, F]. The predictor starts
     /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
     /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
     pub fn predict(&self, features: &Tensor, condition: &Condition, feedback: Feedback) -> Result<Tensor, NnError> {
@@ -161,7 +161,7 @@ impl Model {
         }
     }
 
-    /// Frames [B, horizon, P] that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
+    /// Frames `[B, horizon, P]` that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
     pub fn predict_frames(&self, frames: &Tensor, condition: &Condition) -> Result<Tensor, NnError> {
         let (context, pixels) = (self.spec.context, self.spec.pixels());
         let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;

@@ -10,9 +10,9 @@ use super::{ChannelScale, ModelSpec, NnError};
 /// ignored; what it takes and isn't there is an error.
 #[derive(Clone, Debug, Default)]
 pub struct Condition {
-    /// Actions to come [B, horizon, A]; action k leads to predicted frame k.
+    /// Actions to come `[B, horizon, A]`; action k leads to predicted frame k.
     pub actions: Option<Tensor>,
-    /// State at the last context frame [B, S].
+    /// State at the last context frame `[B, S]`.
     pub state: Option<Tensor>,
 }
 

@@ -19,7 +19,7 @@ pub enum Activation {
     Tanh,
 }
 
-/// y = activation(x · weight + bias); weight [D, O], bias [O].
+/// y = activation(x · weight + bias); weight `[D, O]`, bias `[O]`.
 #[derive(Clone, Debug)]
 pub struct Dense {
     pub(super) weight: Tensor,
@@ -28,7 +28,7 @@ pub struct Dense {
 }
 
 impl Dense {
-    /// A layer of weight [D, O] and bias [O].
+    /// A layer of weight `[D, O]` and bias `[O]`.
     #[must_use]
     pub fn new(weight: Tensor, bias: Tensor, activation: Activation) -> Self {
         Self {
@@ -38,7 +38,7 @@ impl Dense {
         }
     }
 
-    /// The layer's output [N, O] for x [N, D].
+    /// The layer's output `[N, O]` for x `[N, D]`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
         if x.dtype() == DType::F32 {
             let fused = Fused {

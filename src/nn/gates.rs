@@ -5,7 +5,7 @@
 
 use super::activation::{sigmoid, tanh};
 
-/// Diagonals of `W_ci`, `W_cf`, `W_co`, [H] each.
+/// Diagonals of `W_ci`, `W_cf`, `W_co`, `[H]` each.
 #[derive(Clone, Copy)]
 pub(super) struct Peepholes<'a> {
     pub(super) i: &'a [f32],
@@ -13,8 +13,8 @@ pub(super) struct Peepholes<'a> {
     pub(super) o: &'a [f32],
 }
 
-/// One row's step. `sums` [4H] holds `W_x x + W_h h + b` and becomes the activations i, f, tanh(·), o; `c_before` is the
-/// memory before, `c` and `h` [H] receive the new state.
+/// One row's step. `sums` `[4H]` holds `W_x x + W_h h + b` and becomes the activations i, f, tanh(·), o; `c_before` is the
+/// memory before, `c` and `h` `[H]` receive the new state.
 #[inline(always)]
 pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, c: &mut [f32], h: &mut [f32]) {
     let hidden = c.len();
@@ -46,16 +46,16 @@ fn gate(sums: &mut [f32], peephole: &[f32], c: &[f32]) {
 /// What one row's step kept for the way back.
 #[derive(Clone, Copy)]
 pub(super) struct Kept<'a> {
-    /// i, f, tanh(·), o [4H].
+    /// i, f, tanh(·), o `[4H]`.
     pub(super) activations: &'a [f32],
-    /// Memory before [H].
+    /// Memory before `[H]`.
     pub(super) c_before: &'a [f32],
-    /// Memory after [H].
+    /// Memory after `[H]`.
     pub(super) c: &'a [f32],
 }
 
-/// One row's way back. `d_h` [H] is the gradient of h; `d_c` [H] that of c from later steps, and becomes that of
-/// `c_before`; `d_sums` [4H] receives that of the sums.
+/// One row's way back. `d_h` `[H]` is the gradient of h; `d_c` `[H]` that of c from later steps, and becomes that of
+/// `c_before`; `d_sums` `[4H]` receives that of the sums.
 #[inline(always)]
 pub(super) fn backward(kept: Kept, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
     let Kept {

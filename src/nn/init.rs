@@ -1,7 +1,7 @@
 //! Fresh weights from our own seeded generator. Each tensor draws from a stream of its own name, so that one tensor's
 //! values don't depend on which others a model has.
 //!
-//! - Dense weights [D, O]: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
+//! - Dense weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
 //! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts "nothing changes".
 

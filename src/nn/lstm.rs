@@ -1,5 +1,5 @@
 //! An LSTM over time: driven by a sequence, or by its own output. f32 goes through one fused operation
-//! ([`super::recurrence`]); other types, which only tests use, go step by step through [`PeepholeCell::step`].
+//! (`recurrence`); other types, which only tests use, go step by step through [`PeepholeCell::step`].
 
 use candle_core::{DType, Tensor};
 
@@ -8,7 +8,7 @@ use super::dense::{Activation, Dense};
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::recurrence::{driven, fed_back};
 
-/// Runs the cell over a sequence x [B, T, D] from `state`: the outputs [B, T, H] and the last state.
+/// Runs the cell over a sequence x `[B, T, D]` from `state`: the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
     let (batch, steps, _) = x.dims3()?;
     if x.dtype() == DType::F32 {
@@ -25,8 +25,8 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
     Ok((Tensor::stack(&outputs, 1)?, state))
 }
 
-/// What x [B, T, D] adds to the cell's sums through `w_x` from row `first_row`, bias included: one product for all steps,
-/// [T, B, 4H].
+/// What x `[B, T, D]` adds to the cell's sums through `w_x` from row `first_row`, bias included: one product for all steps,
+/// `[T, B, 4H]`.
 fn drive(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let (batch, steps, inputs) = x.dims3()?;
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
@@ -47,7 +47,7 @@ pub struct Decoder<'a> {
 }
 
 impl Decoder<'_> {
-    /// Features [B, steps, F] that follow `first` [B, F]; step k also takes `conditions` [B, steps, C] at k.
+    /// Features [B, steps, F] that follow `first` `[B, F]`; step k also takes `conditions` [B, steps, C] at k.
     pub fn run(
         &self,
         steps: usize,

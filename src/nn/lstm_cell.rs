@@ -7,27 +7,27 @@ use super::NnError;
 /// What an LSTM carries from one step to the next.
 #[derive(Clone, Debug)]
 pub struct LstmState {
-    /// Output of the units, h [B, H].
+    /// Output of the units, h `[B, H]`.
     pub h: Tensor,
-    /// Memory of the cells, c [B, H].
+    /// Memory of the cells, c `[B, H]`.
     pub c: Tensor,
 }
 
 /// The weights of one LSTM layer. Gate order: i, f, c, o.
 #[derive(Clone, Debug)]
 pub struct PeepholeCell {
-    /// Input weights [D, 4H].
+    /// Input weights `[D, 4H]`.
     pub(super) w_x: Tensor,
-    /// Recurrent weights [H, 4H].
+    /// Recurrent weights `[H, 4H]`.
     pub(super) w_h: Tensor,
-    /// Bias [4H].
+    /// Bias `[4H]`.
     pub(super) bias: Tensor,
-    /// Diagonals of `W_ci`, `W_cf` and `W_co`, [H] each.
+    /// Diagonals of `W_ci`, `W_cf` and `W_co`, `[H]` each.
     pub(super) peepholes: [Tensor; 3],
 }
 
 impl PeepholeCell {
-    /// A cell of those weights: `w_x` [D, 4H], `w_h` [H, 4H], bias [4H], and the diagonals of `W_ci`, `W_cf`, `W_co` [H].
+    /// A cell of those weights: `w_x` `[D, 4H]`, `w_h` `[H, 4H]`, bias `[4H]`, and the diagonals of `W_ci`, `W_cf`, `W_co` `[H]`.
     #[must_use]
     pub fn new(w_x: Tensor, w_h: Tensor, bias: Tensor, peepholes: [Tensor; 3]) -> Self {
         Self {
@@ -52,7 +52,7 @@ impl PeepholeCell {
         })
     }
 
-    /// Advances the cell one step (paper, eqs. 1–5). x is [B, D], state [B, H].
+    /// Advances the cell one step (paper, eqs. 1–5). x is `[B, D]`, state `[B, H]`.
     /// Sequences of f32 go through [`super::lstm`], which does the same in fewer passes.
     pub fn step(&self, x: &Tensor, state: &LstmState) -> Result<LstmState, NnError> {
         let sums = (x.matmul(&self.w_x)?.broadcast_add(&self.bias)? + state.h.matmul(&self.w_h)?)?;

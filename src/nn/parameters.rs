@@ -113,7 +113,7 @@ impl Parameters {
         Ok(Self(tensors))
     }
 
-    /// Sets the codec from the mean frame of the training data, `mean` [P] in the model's space: the decoder's bias
+    /// Sets the codec from the mean frame of the training data, `mean` `[P]` in the model's space: the decoder's bias
     /// becomes the mean frame, and the encoder sees frames less the mean (its bias becomes −mean · weight). Pre-training
     /// then starts from the mean frame instead of black.
     pub fn center_codec(&self, mean: &Tensor) -> Result<(), NnError> {

@@ -18,11 +18,11 @@ use super::tensors::{add_columns, matrix, slice, with_values};
 /// A layer that feeds its output back into the cell.
 #[derive(Clone)]
 struct FeedbackLoop {
-    /// Weights from the features to the cell's sums [F, 4H].
+    /// Weights from the features to the cell's sums `[F, 4H]`.
     w_x: Tensor,
-    /// Weights from the cell's output to the features [H, F].
+    /// Weights from the cell's output to the features `[H, F]`.
     weight: Tensor,
-    /// Bias of the features [F].
+    /// Bias of the features `[F]`.
     bias: Vec<f32>,
     /// Whether the layer's output is added to the features before, instead of replacing them.
     adds: bool,
@@ -49,7 +49,7 @@ struct Recurrence {
     trace: Mutex<Option<Trace>>,
 }
 
-/// Runs the cell on sums that are known beforehand, `drive` [T, B, 4H] = `W_x x + b`: every h [T, B, H] and the last c [B, H].
+/// Runs the cell on sums that are known beforehand, `drive` `[T, B, 4H]` = `W_x x + b`: every h `[T, B, H]` and the last c `[B, H]`.
 pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
     let steps = drive.dim(0)?;
     let start = Tensor::cat(&[&state.h, &state.c], 1)?;
@@ -57,8 +57,8 @@ pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> 
     Ok((all.narrow(0, 0, steps)?, all.get(steps)?))
 }
 
-/// Runs a decoder on its own output: features [T, B, F]. Only the first F rows of the cell's `w_x` take features; `drive`
-/// is what all else adds to the sums, [T, B, 4H], or [4H] if the same in every step.
+/// Runs a decoder on its own output: features `[T, B, F]`. Only the first F rows of the cell's `w_x` take features; `drive`
+/// is what all else adds to the sums, `[T, B, 4H]`, or `[4H]` if the same in every step.
 pub(super) fn fed_back(
     decoder: &Decoder,
     steps: usize,

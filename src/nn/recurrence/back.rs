@@ -13,13 +13,13 @@ use super::{Recurrence, Trace};
 pub(super) struct Back {
     /// Of the sums [T · B, 4H].
     pub(super) sums: Vec<f32>,
-    /// Of h and c before the step, [B, H] each.
+    /// Of h and c before the step, `[B, H]` each.
     pub(super) h: Vec<f32>,
     pub(super) c: Vec<f32>,
-    /// Of the features after each step [T · B, F], and of those before the first [B, F].
+    /// Of the features after each step [T · B, F], and of those before the first `[B, F]`.
     pub(super) features: Vec<f32>,
     pub(super) first: Vec<f32>,
-    /// Of the peepholes, [H] each.
+    /// Of the peepholes, `[H]` each.
     peepholes: [Vec<f32>; 3],
 }
 
