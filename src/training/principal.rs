@@ -13,12 +13,16 @@ use crate::types::Seed;
 const OVERSAMPLING: usize = 16;
 /// Rounds of orthogonal iteration.
 const ITERATIONS: usize = 6;
-/// Standard deviation of a feature before the tanh: small enough for tanh to be nearly straight.
+/// Root mean square over the features of their standard deviations before the tanh: small enough for tanh to be nearly
+/// straight.
 const FEATURE_STD: f64 = 0.15;
+/// What power of a component's own standard deviation its feature keeps: at 0 every feature varies alike and the network
+/// overfits the fine ones, at 1 it hardly sees them.
+const STD_POWER: f64 = 0.5;
 /// The least standard deviation of a component, in the model's space; below it there is only noise.
 const MIN_STD: f64 = 1e-4;
 
-/// Sets the encoder to the leading principal components of `frames` `[N, P]`, each scaled to the same standard deviation,
+/// Sets the encoder to the leading principal components of `frames` `[N, P]`, scaled by [`FEATURE_STD`] and [`STD_POWER`],
 /// and the reconstruction layer to what these best write `targets` `[N, P]` with. Errors: `Network` if the tensors don't fit.
 pub(super) fn set_codec(
     parameters: &Parameters,
@@ -49,11 +53,15 @@ pub(super) fn set_codec(
         .sqrt()?
         .clamp(MIN_STD, f64::MAX)?
         .reshape((features, 1))?;
-    let encoder = (basis.broadcast_div(&std)? * FEATURE_STD)?.t()?.contiguous()?;
+    let kept = std.powf(STD_POWER)?;
+    let rms = kept.sqr()?.mean_all()?.to_scalar::<f32>()?.sqrt();
+    // What one unit of a component becomes in its feature.
+    let gain = (kept.div(&std)? * (FEATURE_STD / f64::from(rms)))?;
+    let encoder = basis.broadcast_mul(&gain)?.t()?.contiguous()?;
     // Components are uncorrelated, so each one's least-squares weights stand alone: covariance over variance.
     let target_mean = targets.mean(0)?;
     let covariance = (scores.t()?.matmul(&targets.broadcast_sub(&target_mean)?)? / count as f64)?;
-    let decoder = (covariance.broadcast_div(&std)? / FEATURE_STD)?;
+    let decoder = covariance.broadcast_div(&(std.sqr()? * gain)?)?;
     let bias = mean.reshape((1, pixels))?.matmul(&encoder)?.neg()?.reshape(features)?;
     for (name, tensor) in [
         ("frame_encoder.weight", encoder),
