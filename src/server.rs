@@ -3,6 +3,7 @@
 
 mod config;
 mod dashboard;
+mod environments;
 mod error;
 mod extract;
 mod health;
@@ -27,11 +28,12 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::routing::{get, post};
+use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
 pub use config::ServerConfig;
+use environments::Environments;
 use error::ApiError;
 pub use error::Problem;
 pub use images::ImageFormat;
@@ -84,6 +86,7 @@ struct Shared {
     predictor: Predictor,
     jobs: Jobs,
     streams: Streams,
+    environments: Environments,
     request_ids: RequestIds,
     contract: String,
 }
@@ -105,12 +108,15 @@ impl App {
     #[must_use]
     pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs) -> Self {
         let streams = Streams::new(config.max_streams);
+        let idle = Duration::from_millis(config.environment_idle_ms);
+        let environments = Environments::new(config.max_environments, idle);
         Self {
             shared: Arc::new(Shared {
                 config,
                 predictor,
                 jobs,
                 streams,
+                environments,
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
@@ -139,6 +145,10 @@ impl App {
         &self.shared.streams
     }
 
+    fn environments(&self) -> &Environments {
+        &self.shared.environments
+    }
+
     fn request_ids(&self) -> &RequestIds {
         &self.shared.request_ids
     }
@@ -152,6 +162,8 @@ impl App {
 pub fn router(app: App) -> Router {
     Router::new()
         .route("/", get(dashboard::page))
+        .route("/dashboard.js", get(dashboard::script))
+        .route("/dashboard.css", get(dashboard::style))
         .route("/livez", get(health::livez))
         .route("/readyz", get(health::readyz))
         .route("/openapi.json", get(openapi::openapi_json))
@@ -163,6 +175,10 @@ pub fn router(app: App) -> Router {
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
+        .route("/v1/environments", post(environments::create))
+        .route("/v1/environments/{id}", delete(environments::delete))
+        .route("/v1/environments/{id}/reset", post(environments::reset))
+        .route("/v1/environments/{id}/step", post(environments::step))
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(app.config().max_body_bytes))

@@ -27,6 +27,8 @@ pub struct ServerConfig {
     pub max_connections: usize,
     /// Streams at a time; more are answered 503.
     pub max_streams: usize,
+    /// Simulated environments at a time; more are answered 503.
+    pub max_environments: usize,
     /// Jobs that may wait; more are answered 503.
     pub max_queued_jobs: usize,
     /// Ended jobs that are remembered.
@@ -35,6 +37,8 @@ pub struct ServerConfig {
     pub prediction_deadline_ms: u64,
     /// How long a request may take to arrive and be answered, in milliseconds.
     pub request_deadline_ms: u64,
+    /// How long an environment is kept that nobody steps, in milliseconds.
+    pub environment_idle_ms: u64,
     /// How long a stream may be silent, in milliseconds.
     pub stream_idle_ms: u64,
     /// How long a client may take to read a message of its stream, in milliseconds.
@@ -53,10 +57,12 @@ impl Default for ServerConfig {
             max_batch: 16,
             max_connections: 512,
             max_streams: 128,
+            max_environments: 16,
             max_queued_jobs: 16,
             max_ended_jobs: 100,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
+            environment_idle_ms: 600_000,
             stream_idle_ms: 60_000,
             stream_send_ms: 10_000,
             shutdown_deadline_ms: 10_000,
@@ -82,10 +88,12 @@ impl ServerConfig {
             ("max_batch", self.max_batch as u64, 1..=4096),
             ("max_connections", self.max_connections as u64, 1..=1_000_000),
             ("max_streams", self.max_streams as u64, 1..=1_000_000),
+            ("max_environments", self.max_environments as u64, 1..=10_000),
             ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadlines.clone()),
             ("request_deadline_ms", self.request_deadline_ms, deadlines.clone()),
+            ("environment_idle_ms", self.environment_idle_ms, deadlines.clone()),
             ("stream_idle_ms", self.stream_idle_ms, deadlines.clone()),
             ("stream_send_ms", self.stream_send_ms, deadlines.clone()),
             ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadlines),

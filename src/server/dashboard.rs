@@ -1,12 +1,14 @@
-//! The first page: what this is, which models there are, what runs.
+//! The first page: a simulated robot to drive, its frames beside the predicted ones, the models, and the running jobs.
 
 use axum::http::header;
 use axum::response::{Html, IntoResponse};
 
 const PAGE: &str = include_str!("dashboard/index.html");
-/// The page's own script and style, and pictures from this server; nothing from elsewhere.
+const SCRIPT: &str = include_str!("dashboard/dashboard.js");
+const STYLE: &str = include_str!("dashboard/dashboard.css");
+/// Script, style and pictures from this server, and frames as they come in answers; nothing from elsewhere.
 const CONTENT_SECURITY_POLICY: &str =
-    "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; frame-ancestors 'none'";
+    "default-src 'self'; img-src 'self' data:; script-src 'self'; style-src 'self'; frame-ancestors 'none'";
 
 /// A page for people.
 #[utoipa::path(
@@ -15,4 +17,14 @@ const CONTENT_SECURITY_POLICY: &str =
 )]
 pub(super) async fn page() -> impl IntoResponse {
     ([(header::CONTENT_SECURITY_POLICY, CONTENT_SECURITY_POLICY)], Html(PAGE))
+}
+
+/// The page's script.
+pub(super) async fn script() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "text/javascript; charset=utf-8")], SCRIPT)
+}
+
+/// The page's style.
+pub(super) async fn style() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "text/css; charset=utf-8")], STYLE)
 }

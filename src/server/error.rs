@@ -8,6 +8,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::error;
 
+use super::environments::EnvironmentError;
 use super::images::ImageError;
 use super::predict::PredictError;
 use crate::frame::FrameError;
@@ -180,6 +181,16 @@ impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
             ImageError::Encode(_) => Self::Internal(with_cause(&error)),
+            _ => Self::Unprocessable(error.to_string()),
+        }
+    }
+}
+
+impl From<EnvironmentError> for ApiError {
+    fn from(error: EnvironmentError) -> Self {
+        match error {
+            EnvironmentError::Ended => Self::Conflict(error.to_string()),
+            EnvironmentError::Image(image) => image.into(),
             _ => Self::Unprocessable(error.to_string()),
         }
     }

@@ -5,7 +5,7 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use utoipa::OpenApi;
 
-use super::{App, dashboard, error, health, jobs, models, predict, preview, stream};
+use super::{App, dashboard, environments, error, health, jobs, models, predict, preview, stream};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -23,6 +23,10 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
         predict::predict,
         preview::preview,
         stream::stream,
+        environments::create,
+        environments::reset,
+        environments::step,
+        environments::delete,
         jobs::create,
         jobs::list,
         jobs::get,
@@ -33,6 +37,7 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
     components(schemas(error::Problem)),
     tags(
         (name = "models", description = "Models and their predictions"),
+        (name = "environments", description = "The simulator, with Gymnasium's reset and step"),
         (name = "jobs", description = "Collection and training in the background"),
         (name = "health", description = "Whether the server lives and is ready"),
         (name = "about", description = "This contract and a page for people"),

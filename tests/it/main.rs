@@ -3,8 +3,10 @@
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
+mod browser;
 mod dataset_collect;
 mod dataset_sampler;
+mod environments;
 mod evaluation;
 mod jobs;
 mod nn_cell;

@@ -1,0 +1,228 @@
+"use strict";
+// A simulated robot runs on the server; this page drives it, streams its frames to a model, and shows what the model
+// foresaw beside what came.
+
+const by_id = id => document.getElementById(id);
+const as_png = frame => `data:image/png;base64,${frame}`;
+const pause = ms => new Promise(done => setTimeout(done, ms));
+
+async function call(method, path, body) {
+  const options = body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
+  const response = await fetch(path, { method, ...options });
+  const answer = response.status === 204 ? null : await response.json();
+  if (!response.ok) throw new Error(answer.detail);
+  return answer;
+}
+
+// The keys that are held, as a command in m/s and rad/s.
+const held = new Set();
+const KEYS = { w: "w", arrowup: "w", a: "a", arrowleft: "a", s: "s", arrowdown: "s", d: "d", arrowright: "d" };
+const [SPEED_M_S, TURN_RAD_S] = [0.35, 0.9];
+function command() {
+  const pull = (plus, minus) => held.has(plus) - held.has(minus);
+  return held.size ? [SPEED_M_S * pull("w", "s"), TURN_RAD_S * pull("a", "d")] : null;
+}
+function on_key(event, down) {
+  const key = KEYS[event.key.toLowerCase()];
+  if (!key || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  event.preventDefault();
+  down ? held.add(key) : held.delete(key);
+  for (const cap of document.querySelectorAll("kbd")) cap.classList.toggle("down", held.has(cap.textContent.toLowerCase()));
+}
+addEventListener("keydown", event => on_key(event, true));
+addEventListener("keyup", event => on_key(event, false));
+addEventListener("blur", () => held.clear());
+
+// A stream of one model: `send` answers with the message that belongs to the frame.
+class Stream {
+  static open(model) {
+    return new Promise((opened, failed) => {
+      const address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/v1/models/${model}/stream`;
+      const stream = new Stream(new WebSocket(address, "foreframe.v1.json"));
+      stream.waiting = { resolve: ready => opened(Object.assign(stream, { ready })), reject: failed };
+    });
+  }
+  constructor(socket) {
+    this.socket = socket;
+    this.seq = 0;
+    const end = reason => this.waiting?.reject(new Error(reason));
+    socket.onmessage = ({ data }) => {
+      const message = JSON.parse(data);
+      if (message.type === "error") return end(message.detail);
+      if (message.type === "closing") return end(`the stream was closed: ${message.reason}`);
+      this.waiting?.resolve(message);
+    };
+    socket.onclose = () => end("the stream is closed");
+  }
+  send(image, action, state) {
+    return new Promise((resolve, reject) => {
+      this.waiting = { resolve, reject };
+      const timestamp_us = Math.round(performance.now() * 1000);
+      this.socket.send(JSON.stringify({ type: "frame", seq: this.seq++, timestamp_us, image, format: "png", action, state }));
+    });
+  }
+  close() {
+    this.waiting = null;
+    this.socket.close();
+  }
+}
+
+// Gray values 0…1 of a PNG.
+async function pixels(frame) {
+  const image = new Image();
+  image.src = as_png(frame);
+  await image.decode();
+  const canvas = new OffscreenCanvas(image.width, image.height), context = canvas.getContext("2d");
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, image.width, image.height).data.filter((_, index) => index % 4 === 0);
+}
+const mse = (one, other) => one.reduce((sum, value, i) => sum + ((value - other[i]) / 255) ** 2, 0) / one.length;
+
+// The rows of film: one column for each predicted step.
+function lay_out(horizon) {
+  const head = document.querySelector("#film thead tr");
+  for (const row of [head, ...document.querySelectorAll("#film tbody tr")]) while (row.cells.length > 1) row.deleteCell(1);
+  for (let step = 1; step <= horizon; step++) {
+    head.insertCell().textContent = `t+${step}`;
+    for (const row of ["next", "foreseen", "came"]) by_id(row).insertCell().append(new Image());
+    by_id("error").insertCell();
+  }
+}
+function show(row, frames) {
+  document.querySelectorAll(`#${row} img`).forEach((image, step) => {
+    if (frames[step]) image.src = as_png(frames[step]); else image.removeAttribute("src");
+  });
+}
+
+// One trial after another until another model is chosen or the server ends it.
+let run = 0;
+async function drive(model) {
+  const mine = ++run;
+  const { context, horizon, frame_period_s, frame_width_px, frame_height_px, conditioning, actions, states } = model.spec;
+  const told = conditioning !== "none";
+  const scenario = model.lineage.scenario ?? (told ? "moving-observer" : "static-observer");
+  const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: scenario === "static-observer" ? 30 : 3600 };
+  lay_out(horizon);
+  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)} s ago`;
+  by_id("keys").hidden = scenario === "static-observer";
+  const seed = Math.floor(Math.random() * 2 ** 32);
+  const environment = await call("POST", "/v1/environments", { scenario, seed, world });
+  const path = `/v1/environments/${environment.id}`;
+  let stream = null;
+  try {
+    let { observation, info } = environment;
+    while (mine === run) {
+      stream = await Stream.open(model.name);
+      const past = []; // What was seen and foreseen, the latest last.
+      for (let ended = false; !ended && mine === run;) {
+        const started = performance.now();
+        const action = command() ?? info.policy_action;
+        const answer = await stream.send(observation.frame, told ? action : undefined, states.length ? observation.state : undefined);
+        const round_trip_ms = performance.now() - started;
+        past.push({ frame: observation.frame, foreseen: answer.frames });
+        if (past.length > horizon + 1) past.shift();
+        by_id("now").src = as_png(observation.frame);
+        show("next", answer.frames ?? []);
+        const origin = past[0];
+        if (past.length > horizon && origin.foreseen) {
+          show("foreseen", origin.foreseen);
+          show("came", past.slice(1).map(moment => moment.frame));
+          compare(origin, past.slice(1).map(moment => moment.frame));
+        }
+        const speed = action.map(value => value.toFixed(2));
+        by_id("status").textContent = (answer.type === "warming" ? `${answer.have} of ${context} frames seen` :
+          `answered in ${round_trip_ms.toFixed(1)} ms, ${(answer.timing.compute_us / 1000).toFixed(1)} ms of it the model`) +
+          (told ? `; ${held.size ? "your keys" : "its own driver"}: ${speed[0]} m/s, ${speed[1]} rad/s` : "");
+        const step = await call("POST", `${path}/step`, { action });
+        ({ observation, info } = step);
+        ended = step.terminated || step.truncated;
+        await pause(Math.max(0, frame_period_s * 1000 - (performance.now() - started)));
+      }
+      stream.close();
+      if (mine === run) ({ observation, info } = await call("POST", `${path}/reset`, {}));
+    }
+  } finally {
+    stream?.close();
+    await call("DELETE", path).catch(() => null); // It may be gone already.
+  }
+}
+
+async function compare(origin, came) {
+  const [last, foreseen, truth] = [await pixels(origin.frame), await Promise.all(origin.foreseen.map(pixels)), await Promise.all(came.map(pixels))];
+  truth.forEach((frame, step) => {
+    const cell = by_id("error").cells[step + 1];
+    if (!cell || !foreseen[step]) return;
+    const share = 100 * mse(foreseen[step], frame) / mse(last, frame);
+    cell.textContent = Number.isFinite(share) ? `${share < 999 ? share.toFixed(0) : ">999"} %` : "–";
+  });
+}
+
+async function start() {
+  const model = models.find(({ name }) => name === by_id("model").value);
+  if (!model) return;
+  try {
+    await drive(model);
+  } catch (error) {
+    by_id("status").textContent = `${error.message}. Trying again…`;
+    await pause(2000);
+    start();
+  }
+}
+by_id("model").addEventListener("change", () => { by_id("model").blur(); start(); });
+by_id("again").addEventListener("click", () => { by_id("again").blur(); start(); });
+
+// The tables of models and jobs.
+function fill(id, rows, empty) {
+  const body = by_id(id);
+  const columns = body.parentElement.tHead.rows[0].cells.length;
+  body.replaceChildren();
+  if (!rows.length) {
+    const cell = body.insertRow().insertCell();
+    Object.assign(cell, { colSpan: columns, className: "quiet", textContent: empty });
+  }
+  for (const parts of rows) {
+    const row = body.insertRow();
+    for (const part of parts) row.insertCell().append(part);
+  }
+}
+function progress(job) {
+  if (job.error) return job.error;
+  const { done, total, remaining_s, message } = job.progress;
+  const span = document.createElement("span"), bar = document.createElement("progress");
+  Object.assign(bar, { max: total || 1, value: done });
+  const left = remaining_s == null ? "" : `, ${Math.ceil(remaining_s)} s left`;
+  const loss = job.losses?.train == null ? "" : `, loss ${job.losses.train.toPrecision(3)}`;
+  span.append(bar, ` ${done}/${total} ${message}${left}${loss}`);
+  return span;
+}
+function skill({ metrics }) {
+  const value = metrics.test?.skill;
+  return value === undefined ? "not measured" : value.toFixed(2);
+}
+let models = [];
+async function refresh() {
+  try {
+    const names = models.map(({ name }) => name).join();
+    ({ models } = await call("GET", "/v1/models"));
+    fill("models", models.map(model => [
+      `${model.name} v${model.active_version}`,
+      `${model.spec.frame_width_px}×${model.spec.frame_height_px} px every ${model.spec.frame_period_s} s`,
+      `${model.spec.context} → ${model.spec.horizon}`,
+      { none: "nothing", action: "actions", "state-action": "state and actions" }[model.spec.conditioning],
+      skill(model),
+    ]), "none is loaded; train one");
+    if (names !== models.map(({ name }) => name).join()) {
+      const chosen = by_id("model").value;
+      by_id("model").replaceChildren(...models.map(({ name }) => new Option(name)));
+      const first = models.find(({ name }) => name === chosen) ?? models.find(({ spec }) => spec.conditioning !== "none") ?? models[0];
+      if (first) by_id("model").value = first.name;
+      if (!chosen) start();
+    }
+    const { jobs } = await call("GET", "/v1/jobs");
+    fill("jobs", jobs.map(job => [job.id, `${job.spec.kind} ${job.spec.name}`, job.state, progress(job)]), "none");
+  } catch {
+    // The server is away; the next refresh may find it.
+  }
+  setTimeout(refresh, 1000);
+}
+refresh();
