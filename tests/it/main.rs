@@ -3,6 +3,7 @@
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
+mod cli;
 mod dataset_collect;
 mod dataset_sampler;
 mod evaluation;
