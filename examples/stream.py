@@ -1,7 +1,7 @@
 """Streams a directory of frames to a running Foreframe and writes the frames it predicts.
 
     pip install websockets
-    foreframe export --dataset data/moving-observer --episode 3 --out look
+    foreframe export --dataset moving-observer --episode 3 --out look
     python examples/stream.py --frames look --actions look/actions.json --out seen
 
 The actions file is JSON, {"actions": [[linear, angular], ...], "states": [[...], ...]}, one entry a frame; a model that is

@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand. Exit code 2 for what was asked wrongly, 1 for what went wrong.
 
 mod collect;
+mod error;
 mod evaluate;
 mod export;
 mod inspect;
@@ -17,9 +18,13 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::registry::{self, LoadedModel, RegistryError};
+use self::error::CliError;
+use crate::dataset::{self, Dataset};
+use crate::registry::{self, LoadedModel};
 use crate::telemetry;
-use crate::training::TrainError;
+
+/// Where data sets are kept: also the server's jobs find them there.
+const DATASETS_DIR: &str = "data/datasets";
 
 /// Sees a few moments ahead for robots: predicts the camera frames to come from frames, actions and state.
 ///
@@ -49,44 +54,6 @@ enum Command {
     Export(export::Args),
 }
 
-/// What a subcommand fails with.
-enum CliError {
-    /// It was asked wrongly.
-    Usage(String),
-    /// It went wrong.
-    Failed(String),
-    /// It was interrupted; what was finished is kept.
-    Interrupted(String),
-}
-
-impl CliError {
-    fn failed(error: impl Display) -> Self {
-        Self::Failed(error.to_string())
-    }
-
-    fn io(action: &str, path: &Path, source: &std::io::Error) -> Self {
-        Self::Failed(format!("could not {action} {}: {source}", path.display()))
-    }
-}
-
-impl From<TrainError> for CliError {
-    fn from(error: TrainError) -> Self {
-        match error {
-            TrainError::UnknownPreset(_) | TrainError::Config(_) => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
-}
-
-impl From<RegistryError> for CliError {
-    fn from(error: RegistryError) -> Self {
-        match error {
-            RegistryError::Unknown { .. } | RegistryError::Name(_) => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
-}
-
 /// Runs the program with the process's arguments and says how it ended.
 #[must_use]
 pub fn main() -> ExitCode {
@@ -101,18 +68,11 @@ pub fn main() -> ExitCode {
         Some(Command::Export(args)) => export::run(&args),
         None => serve::run(&serve::Args::default()),
     };
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(CliError::Usage(message)) => stop(&format!("error: {message}"), 2),
-        Err(CliError::Failed(message)) => stop(&format!("error: {message}"), 1),
-        Err(CliError::Interrupted(message)) => stop(&message, 130),
-    }
-}
-
-fn stop(message: &str, code: u8) -> ExitCode {
+    let Err(error) = result else { return ExitCode::SUCCESS };
+    let (sentence, code) = error.told();
     // Nothing is left to do if even standard error is closed.
-    let _ = writeln!(std::io::stderr(), "{message}");
-    ExitCode::from(code)
+    let _ = writeln!(std::io::stderr(), "{sentence}");
+    code
 }
 
 /// Writes a line of the command's answer to standard output.
@@ -136,12 +96,14 @@ fn command_line() -> String {
 
 /// Loads a model by the directory it stands in, or by its name in the models' directory.
 fn load_model(model: &str, models_dir: &Path) -> Result<(PathBuf, LoadedModel), CliError> {
-    let given = Path::new(model);
-    let dir = if given.join(registry::MANIFEST_FILE).is_file() {
-        given.to_owned()
-    } else {
-        registry::find(models_dir, model)?
-    };
+    let dir = registry::locate(models_dir, model)?;
     let loaded = registry::load(&dir)?;
     Ok((dir, loaded))
+}
+
+/// Reads a data set by the directory it stands in, or by its name in [`DATASETS_DIR`].
+fn open_dataset(dataset: &Path) -> Result<(PathBuf, Dataset), CliError> {
+    let dir = dataset::find(Path::new(DATASETS_DIR), dataset)?;
+    let dataset = Dataset::open(&dir)?;
+    Ok((dir, dataset))
 }

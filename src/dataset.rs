@@ -3,6 +3,7 @@
 //! A [`Dataset`] lies in memory as a whole, its frames as bytes in one buffer. [`sampler`] says which [`Window`]s of it
 //! train, validate and test; [`collect()`] simulates one into a directory in LeRobot's v3.0 layout.
 
+mod catalog;
 mod check;
 pub mod collect;
 mod collection;
@@ -20,6 +21,7 @@ use std::ops::Range;
 
 use sha2::{Digest, Sha256};
 
+pub use catalog::{find, list};
 use check::{check_description, check_episode};
 pub use collect::{CollectConfig, Progress, collect};
 pub use collection::Standing;
@@ -28,6 +30,7 @@ pub use sampler::{Split, Splits, WindowShape};
 
 pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
+use crate::wording::listed;
 
 /// What a data set is: sizes, rates, meanings and the hash of its content.
 #[derive(Clone, Debug, PartialEq)]
@@ -267,12 +270,11 @@ impl Dataset {
         if channels.len() == wanted {
             return Ok(());
         }
-        let names: Vec<_> = channels.iter().map(|channel| channel.name.as_str()).collect();
         Err(DatasetError::Channels {
             name: self.info.name.clone(),
             kind,
             found: channels.len(),
-            names: names.join(", "),
+            names: listed(channels),
             wanted,
         })
     }

@@ -6,6 +6,8 @@ pub mod types;
 
 pub mod files;
 
+pub mod wording;
+
 pub mod frame;
 
 pub mod nn;

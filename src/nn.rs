@@ -7,11 +7,12 @@
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
 //! → [`lstm`] (over time; `recurrence` and `gates` are its
-//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`].
+//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`]; [`costs`] compares with other networks.
 
 mod activation;
 pub mod autoencoder;
 pub mod conditioned;
+pub mod costs;
 pub mod dense;
 mod gates;
 pub mod init;

@@ -11,6 +11,7 @@ pub use self::loader::{LoadedModel, load};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
+use crate::wording::those;
 
 /// The weights' file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";
@@ -33,6 +34,9 @@ pub enum RegistryError {
     /// A name that could leave the directory or confuse a shell.
     #[error("{0:?} is no model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
     Name(String),
+    /// The path leads to no model.
+    #[error("{} holds no model ({MANIFEST_FILE} is missing); name one that `foreframe train` made", .0.display())]
+    NotAModel(PathBuf),
     /// A file could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
     Io {
@@ -77,14 +81,6 @@ pub enum RegistryError {
         /// Where it went wrong.
         source: candle_core::Error,
     },
-}
-
-fn those(names: &[String]) -> String {
-    if names.is_empty() {
-        "are none".to_owned()
-    } else {
-        format!("are: {}", names.join(", "))
-    }
 }
 
 /// Whether the name is safe as a directory's and in an address: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
@@ -133,6 +129,19 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
         dir: models_dir.to_owned(),
         known,
     })
+}
+
+/// The directory of the model called `what`: a path that leads to one, or else a name below `models_dir`.
+/// Errors: those of [`find`], `NotAModel`.
+pub fn locate(models_dir: &Path, what: &str) -> Result<PathBuf, RegistryError> {
+    let given = Path::new(what);
+    if given.join(MANIFEST_FILE).is_file() {
+        return Ok(given.to_owned());
+    }
+    if !is_valid_name(what) && (what.contains('/') || given.exists()) {
+        return Err(RegistryError::NotAModel(given.to_owned()));
+    }
+    find(models_dir, what)
 }
 
 /// Writes weights (as f16) and manifest into `model_dir`, the manifest last and with the weights' hash filled in.

@@ -1,5 +1,7 @@
 //! Values that every module speaks of: seeds, horizons, actions and states, validated once when they are made.
 
+use std::fmt;
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -113,6 +115,13 @@ impl Channel {
             name: name.to_owned(),
             unit: unit.to_owned(),
         }
+    }
+}
+
+impl fmt::Display for Channel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let space = if self.unit.is_empty() { "" } else { " " };
+        write!(f, "{}{space}{}", self.name, self.unit)
     }
 }
 

@@ -1,12 +1,18 @@
 //! `foreframe collect`
 
-use std::path::PathBuf;
-use std::sync::atomic::Ordering;
+use std::path::{Path, PathBuf};
 
-use super::{CliError, interrupt, progress::Progress, say};
+use clap::value_parser;
+
+use super::{CliError, DATASETS_DIR, interrupt, progress::Progress, say};
+use crate::dataset::DatasetError;
 use crate::dataset::collect::{CollectConfig, collect};
+use crate::jobs::spec::MAX_TRIALS;
 use crate::sim::{Scenario, WorldConfig};
 use crate::types::Seed;
+
+/// More would only wait for each other.
+const MAX_THREADS: i64 = 256;
 
 /// Simulate trials and store their frames, actions and states.
 ///
@@ -20,17 +26,17 @@ pub(super) struct Args {
     #[arg(long, default_value = "static-observer")]
     scenario: Scenario,
     /// How many trials to simulate
-    #[arg(long, default_value_t = 1000)]
+    #[arg(long, default_value_t = 1000, value_parser = value_parser!(u64).range(1..=MAX_TRIALS))]
     trials: u64,
     /// The origin of all randomness: the same seed gives the same bytes
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// The data set's directory [default: data/SCENARIO]
+    /// The data set's directory [default: data/datasets/SCENARIO]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Threads to simulate on [default: one a core]
-    #[arg(long)]
-    threads: Option<usize>,
+    #[arg(long, value_parser = value_parser!(u16).range(1..=MAX_THREADS))]
+    threads: Option<u16>,
     /// Width and height of the frames, in pixels
     #[arg(long, value_name = "PX", default_value_t = WorldConfig::default().frame_width_px)]
     frame_size: u32,
@@ -40,23 +46,15 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: Args) -> Result<(), CliError> {
-    if args.trials == 0 {
-        return Err(CliError::Usage("--trials is 0; a data set takes at least 1".to_owned()));
-    }
     let out = args
         .out
-        .unwrap_or_else(|| PathBuf::from("data").join(args.scenario.to_string()));
+        .unwrap_or_else(|| Path::new(DATASETS_DIR).join(args.scenario.to_string()));
     let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), &out);
     config.world.frame_width_px = args.frame_size;
     config.world.frame_height_px = args.frame_size;
     config.world.camera.noise_std = args.noise;
-    config
-        .world
-        .validate()
-        .map_err(|error| CliError::Usage(error.to_string()))?;
-    if let Some(threads) = args.threads {
-        config.threads = threads;
-    }
+    config.threads = args.threads.unwrap_or_default().into();
+    config.validate()?;
     let (cancelled, progress) = (interrupt::flag()?, Progress::new("trials"));
     progress.start(&format!("collecting {}", config.scenario), 0, config.trials);
     let collected = collect(
@@ -76,9 +74,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
             info.content_hash,
             out.display(),
         )),
-        Err(_) if cancelled.load(Ordering::Relaxed) => Err(CliError::Interrupted(
-            "stopped; finished trials are kept, the same command goes on from there".to_owned(),
-        )),
-        Err(error) => Err(CliError::failed(error)),
+        Err(stopped @ DatasetError::Cancelled { .. }) => Err(CliError::Interrupted(stopped.to_string())),
+        Err(error) => Err(error.into()),
     }
 }

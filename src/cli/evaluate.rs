@@ -4,10 +4,9 @@ use std::path::PathBuf;
 
 use serde_json::{Map, Value, json};
 
-use super::{CliError, command_line, load_model, progress::Progress, say};
-use crate::dataset::Dataset;
-use crate::evaluation::{self, EvaluateConfig, EvaluationError, Report, Stage};
-use crate::registry;
+use super::{CliError, command_line, load_model, open_dataset, progress::Progress, say};
+use crate::evaluation::{self, EvaluateConfig, Report, Stage};
+use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
 /// Measure a model on held-out trials: report, figures, GIF.
@@ -15,14 +14,14 @@ use crate::types::Seed;
 /// Two test sets: trials that training never saw, and start/goal pairs and controller gains that it never saw. The skill is
 /// the share of the best trivial baseline's error that the model takes away.
 #[derive(clap::Args)]
-#[command(after_help = "Example: foreframe evaluate --model paper --dataset data/static-observer --out reports/paper")]
+#[command(after_help = "Example: foreframe evaluate --model paper --dataset static-observer --out reports/paper")]
 pub(super) struct Args {
     /// A model's name or directory
     #[arg(long)]
     model: String,
-    /// The data set's directory
-    #[arg(long, value_name = "DIR")]
-    dataset: PathBuf,
+    /// The data set's directory, or its name in data/datasets [default: that of the scenario the model was trained on]
+    #[arg(long, value_name = "DATASET")]
+    dataset: Option<PathBuf>,
     /// The directory to write report.md, report.json and figures into [default: reports/MODEL]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -57,8 +56,8 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
         .out
         .clone()
         .unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
+    let (_, dataset) = open_dataset(&args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?)?;
     evaluation::prepare(&out)?;
-    let dataset = Dataset::open(&args.dataset).map_err(CliError::failed)?;
     let config = EvaluateConfig {
         max_windows: args.windows,
         bootstrap_samples: args.resamples,
@@ -87,6 +86,17 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     say(markdown.display())
 }
 
+/// The scenario that the model was trained on, which is its data set's name unless another was given.
+fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
+    let manifest = &loaded.manifest;
+    manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
+        CliError::Usage(format!(
+            "--dataset is missing; model {:?} was trained on {:?}, which no scenario made",
+            manifest.name, manifest.dataset.name
+        ))
+    })
+}
+
 /// The report's headline, for the manifest.
 fn metrics(report: &Report) -> Value {
     let mut metrics = Map::new();
@@ -107,13 +117,4 @@ fn metrics(report: &Report) -> Value {
         metrics.insert(set.split.clone(), summary);
     }
     Value::Object(metrics)
-}
-
-impl From<EvaluationError> for CliError {
-    fn from(error: EvaluationError) -> Self {
-        match error {
-            EvaluationError::Setting { .. } | EvaluationError::OutputExists(_) => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
 }

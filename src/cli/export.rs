@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use clap::value_parser;
 use serde_json::json;
 
-use super::{CliError, say};
-use crate::dataset::Dataset;
+use super::{CliError, open_dataset, say};
+use crate::evaluation;
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
 
@@ -13,50 +14,51 @@ use crate::frame::{Frame, codec};
 ///
 /// The directory then serves `foreframe predict`: frames in order, and the actions that were taken from each on.
 #[derive(clap::Args)]
-#[command(after_help = "Example: foreframe export --dataset data/moving-observer --episode 3 --out look")]
+#[command(after_help = "Example: foreframe export --dataset moving-observer --episode 3 --out look")]
 pub(super) struct Args {
-    /// The data set's directory
-    #[arg(long, value_name = "DIR")]
+    /// The data set's directory, or its name in data/datasets
+    #[arg(long, value_name = "DATASET")]
     dataset: PathBuf,
     /// The episode's number
     #[arg(long, default_value_t = 0)]
     episode: usize,
-    /// The directory to write into
+    /// A new directory to write into
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// The first frame of the episode that is written
     #[arg(long, default_value_t = 0)]
     first: usize,
     /// How many frames are written [default: all that follow]
-    #[arg(long)]
-    count: Option<usize>,
+    #[arg(long, value_parser = value_parser!(u32).range(1..))]
+    count: Option<u32>,
 }
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
-    let dataset = Dataset::open(&args.dataset).map_err(CliError::failed)?;
+    let (dir, dataset) = open_dataset(&args.dataset)?;
     let episode = dataset
         .episodes()
         .iter()
         .find(|episode| episode.index == args.episode)
         .ok_or_else(|| {
             CliError::Usage(format!(
-                "there is no episode {} in {}; it has {} of them",
+                "--episode is {}; {} has {} episodes, counted from 0",
                 args.episode,
-                args.dataset.display(),
+                dir.display(),
                 dataset.episodes().len()
             ))
         })?;
     if args.first >= episode.frame_count {
         return Err(CliError::Usage(format!(
-            "--first is {}; episode {} has {} frames",
+            "--first is {}; episode {} has {} frames, counted from 0",
             args.first, args.episode, episode.frame_count
         )));
     }
-    let end = episode
-        .frame_count
-        .min(args.count.map_or(usize::MAX, |count| args.first.saturating_add(count)));
+    let end = episode.frame_count.min(
+        args.count
+            .map_or(usize::MAX, |count| args.first.saturating_add(count as usize)),
+    );
     let range = episode.first_frame + args.first..episode.first_frame + end;
-    std::fs::create_dir_all(&args.out).map_err(|error| CliError::io("make", &args.out, &error))?;
+    evaluation::prepare(&args.out)?;
     let info = dataset.info();
     let frames = range
         .clone()

@@ -2,19 +2,19 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{CliError, load_model, say};
-use crate::dataset::Dataset;
-use crate::nn::ModelSpec;
-use crate::registry::Manifest;
-use crate::types::Channel;
+use super::{CliError, DATASETS_DIR, say};
+use crate::dataset::{self, Dataset};
+use crate::nn::{ChannelScale, ModelSpec, costs};
+use crate::registry::{self, Manifest};
+use crate::wording::{listed, those};
 
 /// Describe a model or a data set.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe inspect paper
-  foreframe inspect data/static-observer")]
+  foreframe inspect static-observer")]
 pub(super) struct Args {
-    /// A model's name or directory, or a data set's directory
+    /// A model's name or directory, or a data set's name or directory
     what: String,
     /// Where models are looked for by name
     #[arg(long, value_name = "DIR", default_value = "models")]
@@ -22,12 +22,21 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
-    let dir = Path::new(&args.what);
-    if dir.join("meta").is_dir() {
-        return describe_dataset(dir);
+    let (models, datasets) = (args.models.as_path(), Path::new(DATASETS_DIR));
+    if let Ok(dir) = registry::locate(models, &args.what) {
+        return describe_model(&dir, &registry::load(&dir)?.manifest);
     }
-    let (dir, loaded) = load_model(&args.what, &args.models)?;
-    describe_model(&dir, &loaded.manifest)
+    if let Ok(dir) = dataset::find(datasets, Path::new(&args.what)) {
+        return describe_dataset(&dir);
+    }
+    let names: Vec<String> = registry::list(models)?.into_iter().map(|(name, _)| name).collect();
+    Err(CliError::Usage(format!(
+        "there is no model or data set {:?}; in {} there {}; in {DATASETS_DIR} there {}",
+        args.what,
+        models.display(),
+        those(&names),
+        those(&dataset::list(datasets)?)
+    )))
 }
 
 fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
@@ -60,11 +69,7 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
             "not inverted"
         },
     ))?;
-    say(format!("  parameters  {}", manifest.parameters))?;
-    say(format!(
-        "  cost        {} multiply–adds a predicted frame",
-        manifest.multiply_adds_per_frame
-    ))?;
+    say_costs(manifest)?;
     say(format!(
         "  trained on  {} windows of {} (content {})",
         manifest.dataset.windows, manifest.dataset.name, manifest.dataset.content_hash
@@ -76,11 +81,29 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
     say(format!("  metrics     {}", metrics.replace('\n', "\n              ")))
 }
 
+/// The model's cost and, for the same frames, that of the networks which the paper sets itself against.
+fn say_costs(manifest: &Manifest) -> Result<(), CliError> {
+    let own = manifest.multiply_adds_per_frame;
+    say(format!("  parameters  {}", manifest.parameters))?;
+    say(format!(
+        "  cost        {own} multiply–adds a predicted frame; on the same frames"
+    ))?;
+    for (name, cost) in [
+        ("ConvLSTM (Shi et al. 2015)", costs::conv_lstm(&manifest.spec)),
+        ("CDNA (Finn et al. 2016)", costs::cdna(&manifest.spec)),
+    ] {
+        say(format!(
+            "              {name} takes {}, {:.0} times as many, with {} parameters",
+            cost.multiply_adds_per_frame,
+            cost.multiply_adds_per_frame as f64 / own as f64,
+            cost.parameters
+        ))?;
+    }
+    Ok(())
+}
+
 fn conditions(spec: &ModelSpec) -> String {
-    let list = |what: &str, channels: &[crate::nn::ChannelScale]| {
-        let names: Vec<String> = channels.iter().map(|c| label(&c.name, &c.unit)).collect();
-        format!("; {what} [{}]", names.join(", "))
-    };
+    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", listed(channels));
     let mut text = String::new();
     if spec.state_inputs().is_some() {
         text += &list("the state", &spec.states);
@@ -91,32 +114,17 @@ fn conditions(spec: &ModelSpec) -> String {
     text
 }
 
-fn label(name: &str, unit: &str) -> String {
-    if unit.is_empty() {
-        name.to_owned()
-    } else {
-        format!("{name} {unit}")
-    }
-}
-
 fn describe_dataset(dir: &Path) -> Result<(), CliError> {
-    let dataset = Dataset::open(dir).map_err(CliError::failed)?;
+    let dataset = Dataset::open(dir)?;
     let info = dataset.info();
-    let list = |channels: &[Channel]| {
-        channels
-            .iter()
-            .map(|c| label(&c.name, &c.unit))
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
     say(format!("{} ({})", dir.display(), info.name))?;
     say(format!(
         "  frames      {} of {}×{} px, {} s apart",
         info.frame_count, info.frame_width_px, info.frame_height_px, info.frame_period_s
     ))?;
     say(format!("  episodes    {}", info.episode_count))?;
-    say(format!("  action      [{}]", list(&info.action_channels)))?;
-    say(format!("  state       [{}]", list(&info.state_channels)))?;
+    say(format!("  action      [{}]", listed(&info.action_channels)))?;
+    say(format!("  state       [{}]", listed(&info.state_channels)))?;
     say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
     say(format!(
         "  scenario    {}",

@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::{CliError, load_model, say};
-use crate::evaluation::figures::montage;
+use crate::evaluation::{self, figures::montage};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
 use crate::types::{Action, RobotState};
+use crate::wording;
 
 /// Predict the frames that follow those in a directory.
 ///
@@ -24,7 +25,7 @@ use crate::types::{Action, RobotState};
   {\"states\": [[…], …], \"actions\": [[…], …]}
 The action of a frame acts from it to the next. A model that is told the state takes that of the last frame it sees.
 
-Example: foreframe export --dataset data/moving-observer --episode 3 --out look
+Example: foreframe export --dataset moving-observer --episode 3 --out look
          foreframe predict --model moving --frames look --actions look/actions.json --out seen"
 )]
 pub(super) struct Args {
@@ -37,7 +38,7 @@ pub(super) struct Args {
     /// What the robot did and will do; needed by models that are told actions
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
-    /// The directory to write into
+    /// A new directory to write into
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Where models are looked for by name
@@ -46,7 +47,7 @@ pub(super) struct Args {
 }
 
 /// The actions file.
-#[derive(Default, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Trace {
     #[serde(default)]
@@ -56,22 +57,31 @@ struct Trace {
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
     let (_, loaded) = load_model(&args.model, &args.models)?;
-    let spec = loaded.model.spec();
-    let frames = read_frames(&args.frames)?;
+    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
+    let frames = read_frames(&args.frames, name, spec)?;
     if frames.len() < spec.context {
-        return Err(CliError::Failed(format!(
-            "{} holds {} frames; model {:?} takes {}",
+        return Err(CliError::Usage(format!(
+            "{} holds {} PNG or JPEG frames; model {name:?} takes {}",
             args.frames.display(),
             frames.len(),
-            loaded.manifest.name,
             spec.context
         )));
     }
     let (seen, truth) = frames.split_at(spec.context);
-    let input = input(spec, seen, args.actions.as_deref())?;
-    let predicted = serving::predict(&loaded, &[&input])
-        .map_err(CliError::failed)?
-        .remove(0);
+    let mut input = PredictionInput {
+        frames: seen.to_vec(),
+        ..PredictionInput::default()
+    };
+    if let Some(path) = &args.actions {
+        read_trace(path)?.enter(&mut input, path, name, spec)?;
+    } else if spec.action_inputs().is_some() {
+        return Err(CliError::Usage(format!(
+            "--actions is missing; model {name:?} takes {}",
+            wording::listed(&spec.actions)
+        )));
+    }
+    let predicted = serving::predict(&loaded, &[&input])?.remove(0);
+    evaluation::prepare(&args.out)?;
     write(&args.out, &loaded, seen, &predicted, truth)?;
     say(format!(
         "{}: {} predicted frames, contact-sheet.png, prediction.gif",
@@ -80,30 +90,48 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     ))
 }
 
-fn input(spec: &ModelSpec, seen: &[Frame], actions: Option<&Path>) -> Result<PredictionInput, CliError> {
-    let trace = actions.map(read_trace).transpose()?.unwrap_or_default();
-    let last = spec.context - 1;
-    let future: Vec<Action> = trace.actions.iter().skip(last).take(spec.horizon).cloned().collect();
-    Ok(PredictionInput {
-        frames: seen.to_vec(),
-        actions: trace.actions.iter().take(spec.context).cloned().collect(),
-        state: trace.states.get(last).cloned(),
-        future_actions: (spec.action_inputs().is_some() && actions.is_some()).then_some(future),
-    })
+impl Trace {
+    /// Takes what the model is told: the state of the last frame seen, and the actions from there on.
+    fn enter(self, input: &mut PredictionInput, path: &Path, model: &str, spec: &ModelSpec) -> Result<(), CliError> {
+        let last = spec.context - 1;
+        let needed = [
+            (
+                "actions",
+                self.actions.len(),
+                spec.action_inputs().map(|_| last + spec.horizon),
+            ),
+            ("states", self.states.len(), spec.state_inputs().map(|_| spec.context)),
+        ];
+        for (what, found, needed) in needed {
+            if let Some(needed) = needed.filter(|&needed| found < needed) {
+                return Err(CliError::Usage(format!(
+                    "{} holds {found} {what}; model {model:?} sees {} frames and predicts {}, which takes {needed}",
+                    path.display(),
+                    spec.context,
+                    spec.horizon
+                )));
+            }
+        }
+        input.state = self.states.into_iter().nth(last);
+        let future = self.actions.into_iter().skip(last).take(spec.horizon);
+        input.future_actions = spec.action_inputs().map(|_| future.collect());
+        Ok(())
+    }
 }
 
 fn read_trace(path: &Path) -> Result<Trace, CliError> {
     let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
     serde_json::from_slice(&bytes).map_err(|error| {
-        CliError::Failed(format!(
-            "{} is no actions file ({error}); see foreframe predict --help",
+        CliError::Usage(format!(
+            "{} is no actions file: {error}; it is JSON of finite numbers, \
+             {{\"states\": [[…], …], \"actions\": [[…], …]}}",
             path.display()
         ))
     })
 }
 
-/// The images of a directory, in the order of their names.
-fn read_frames(dir: &Path) -> Result<Vec<Frame>, CliError> {
+/// The images of a directory, in the order of their names, all of the model's size.
+fn read_frames(dir: &Path, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, CliError> {
     let unreadable = |error| CliError::io("read", dir, &error);
     let mut paths = std::fs::read_dir(dir)
         .map_err(unreadable)?
@@ -115,13 +143,24 @@ fn read_frames(dir: &Path) -> Result<Vec<Frame>, CliError> {
         ["png", "jpg", "jpeg"].iter().any(|known| extension == *known)
     });
     paths.sort();
-    paths
-        .iter()
-        .map(|path| {
-            let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
-            codec::decode(&bytes).map_err(|error| CliError::Failed(format!("{}: {error}", path.display())))
-        })
-        .collect()
+    paths.iter().map(|path| read_frame(path, model, spec)).collect()
+}
+
+fn read_frame(path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
+    let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
+    let frame = codec::decode(&bytes)
+        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), wording::sentence(&error))))?;
+    if (frame.width(), frame.height()) != (spec.frame_width_px, spec.frame_height_px) {
+        return Err(CliError::Usage(format!(
+            "{} is {}×{} px; model {model:?} takes {}×{}",
+            path.display(),
+            frame.width(),
+            frame.height(),
+            spec.frame_width_px,
+            spec.frame_height_px
+        )));
+    }
+    Ok(frame)
 }
 
 fn write(
@@ -131,7 +170,6 @@ fn write(
     predicted: &[Frame],
     truth: &[Frame],
 ) -> Result<(), CliError> {
-    std::fs::create_dir_all(out).map_err(|error| CliError::io("make", out, &error))?;
     let save = |name: String, bytes: &[u8]| {
         let path = out.join(name);
         write_atomically(&path, bytes).map_err(|error| CliError::io("write", &path, &error))

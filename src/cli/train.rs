@@ -2,8 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{CliError, command_line, interrupt, progress::Progress, say};
-use crate::dataset::Dataset;
+use super::{CliError, command_line, interrupt, open_dataset, progress::Progress, say};
 use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
 
 /// Train a model on a data set.
@@ -13,15 +12,15 @@ use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
 /// it had never stopped.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  foreframe train --preset paper --dataset data/static-observer
+  foreframe train --preset paper --dataset static-observer
   foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
   foreframe train --preset paper --print-config > mine.toml   # every field, to edit and pass with --config")]
 pub(super) struct Args {
     /// paper (1000 windows), static (all windows) or moving (told the robot's state and actions)
     #[arg(long, default_value = "paper")]
     preset: String,
-    /// The data set's directory [default: data/static-observer or, for moving, data/moving-observer]
-    #[arg(long, value_name = "DIR")]
+    /// The data set's directory, or its name in data/datasets [default: static-observer or, for moving, moving-observer]
+    #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
     /// The run's directory: configuration, checkpoint and at the end the model [default: runs/NAME]
     #[arg(long, value_name = "DIR")]
@@ -43,8 +42,8 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     if args.print_config {
         return say(config.to_toml()?.trim_end());
     }
-    let dataset_dir = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
-    let dataset = Dataset::open(&dataset_dir).map_err(CliError::failed)?;
+    let dataset = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
+    let (dataset_dir, dataset) = open_dataset(&dataset)?;
     let run_dir = args
         .out
         .clone()
@@ -82,7 +81,7 @@ fn read_config(path: &Path) -> Result<String, CliError> {
 }
 
 fn default_dataset(preset: &str) -> PathBuf {
-    Path::new("data").join(if preset == "moving" {
+    PathBuf::from(if preset == "moving" {
         "moving-observer"
     } else {
         "static-observer"

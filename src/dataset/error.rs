@@ -80,7 +80,7 @@ pub enum DatasetError {
         kind: &'static str,
         /// Components there are.
         found: usize,
-        /// Their names.
+        /// Their names and units.
         names: String,
         /// Components needed.
         wanted: usize,
@@ -168,8 +168,25 @@ pub enum DatasetError {
         /// Hash found.
         found: String,
     },
+    /// There is no data set of that name.
+    #[error(
+        "there is no data set {name:?} in {dir}; there {those}; `foreframe collect` makes one",
+        dir = dir.display(),
+        those = crate::wording::those(known)
+    )]
+    Unknown {
+        /// The name asked for.
+        name: String,
+        /// Where it was looked for.
+        dir: PathBuf,
+        /// The names there are.
+        known: Vec<String>,
+    },
     /// The directory holds no data set.
-    #[error("{path} holds no data set: meta/info.json is missing", path = path.display())]
+    #[error(
+        "{path} holds no data set (meta/info.json is missing); name one that `foreframe collect` made",
+        path = path.display()
+    )]
     NotADataset {
         /// The directory.
         path: PathBuf,

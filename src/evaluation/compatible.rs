@@ -2,9 +2,10 @@
 
 use super::EvaluationError;
 use crate::dataset::{Dataset, DatasetInfo};
-use crate::nn::{ChannelScale, ModelSpec};
+use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
-use crate::types::{Channel, Seed};
+use crate::types::Seed;
+use crate::wording::listed;
 
 /// Periods that differ by less than this share of themselves are the same.
 const PERIOD_TOLERANCE: f64 = 0.01;
@@ -43,29 +44,18 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
         if used.is_none() {
             continue;
         }
-        let scales_name = |scale: &ChannelScale| described(&scale.name, &scale.unit);
-        let channels_name = |channel: &Channel| described(&channel.name, &channel.unit);
-        let wanted: Vec<String> = wanted.iter().map(scales_name).collect();
-        let found: Vec<String> = found.iter().map(channels_name).collect();
+        let (wanted, found) = (listed(wanted), listed(found));
         if wanted != found {
             return Err(EvaluationError::Channels {
                 dataset: info.name.clone(),
                 kind,
-                found: found.join(", "),
+                found,
                 model: model.to_owned(),
-                wanted: wanted.join(", "),
+                wanted,
             });
         }
     }
     Ok(())
-}
-
-fn described(name: &str, unit: &str) -> String {
-    if unit.is_empty() {
-        name.to_owned()
-    } else {
-        format!("{name} {unit}")
-    }
 }
 
 /// The seed of the split to test with: that of the model's training unless another is asked for.

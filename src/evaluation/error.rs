@@ -105,8 +105,8 @@ pub enum EvaluationError {
         /// First frame of the window.
         frame: usize,
     },
-    /// The output directory holds something.
-    #[error("{} exists and is not empty; name a new directory", .0.display())]
+    /// The output directory holds something, or is a file.
+    #[error("{} exists and is not an empty directory; name a new one", .0.display())]
     OutputExists(PathBuf),
     /// A file could not be written.
     #[error("could not write {}: {source}", path.display())]

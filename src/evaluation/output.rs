@@ -7,12 +7,15 @@ use super::{EvaluationError, Report};
 use crate::files::write_atomically;
 
 /// Makes the output directory, to be called before anything is computed.
-/// Errors: `OutputExists` if there is something in it, `Io`.
+/// Errors: `OutputExists` if there is something in it or it is a file, `Io`.
 pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
     let failed = |source| EvaluationError::Io {
         path: dir.to_owned(),
         source,
     };
+    if dir.is_file() {
+        return Err(EvaluationError::OutputExists(dir.to_owned()));
+    }
     std::fs::create_dir_all(dir).map_err(failed)?;
     match std::fs::read_dir(dir).map_err(failed)?.next() {
         Some(_) => Err(EvaluationError::OutputExists(dir.to_owned())),

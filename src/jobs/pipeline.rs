@@ -12,6 +12,7 @@ use crate::files::write_atomically;
 use crate::registry;
 use crate::serving::Predictor;
 use crate::training::{self, Event, Outcome, Stage, Training};
+use crate::wording;
 
 /// Collects and trains below `data_dir`: `datasets/NAME`, `runs/NAME`, `models/NAME`.
 pub struct Pipeline {
@@ -127,17 +128,6 @@ fn command(spec: &TrainSpec) -> String {
     format!("POST /v1/jobs {}", serde_json::to_string(&body).unwrap_or_default())
 }
 
-/// The error and what caused it, in one sentence.
 fn failed(error: &dyn Error) -> Failure {
-    let mut sentence = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
-        let cause_text = cause.to_string();
-        // Some errors tell their cause themselves.
-        if !sentence.contains(&cause_text) {
-            sentence = format!("{sentence}: {cause_text}");
-        }
-        source = cause.source();
-    }
-    Failure::Failed(sentence)
+    Failure::Failed(wording::sentence(error))
 }

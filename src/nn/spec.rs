@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::NnError;
 use crate::frame::preprocess::Preprocess;
+use crate::types::Channel;
 
 /// Greatest side of a frame that a model takes, in pixels.
 pub const MAX_MODEL_SIDE_PX: u32 = 512;
@@ -94,6 +95,12 @@ pub struct ChannelScale {
     pub mean: f32,
     /// Standard deviation over the training data, in that unit; taken as [`MIN_CHANNEL_STD`] where less.
     pub std: f32,
+}
+
+impl fmt::Display for ChannelScale {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        Channel::new(&self.name, &self.unit).fmt(f)
+    }
 }
 
 /// All dimensions of a model, and what its numbers mean.

@@ -31,21 +31,35 @@ impl TrainConfig {
             .iter()
             .find(|(name, _)| *name == preset)
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
-        let mut table: Table = text.parse().map_err(|error| describe(&error))?;
+        let mut table = parse(text)?;
         if let Some(file) = file {
-            merge(&mut table, file.parse().map_err(|error| describe(&error))?);
+            merge(&mut table, parse(file)?);
         }
         for setting in settings {
             merge(&mut table, parse_setting(setting)?);
         }
-        let config: Self = table.try_into().map_err(|error| describe(&error))?;
+        let config: Self = table
+            .try_into()
+            .map_err(|error| TrainError::Config(with_field(&error)))?;
         config.validate()?;
         Ok(config)
     }
 }
 
-fn describe(error: &toml::de::Error) -> TrainError {
-    TrainError::Config(error.message().to_owned())
+fn parse(text: &str) -> Result<Table, TrainError> {
+    text.parse().map_err(|error: toml::de::Error| {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        let line = before.matches('\n').count() + 1;
+        TrainError::Config(format!(
+            "the configuration is no TOML in line {line}: {}",
+            error.message()
+        ))
+    })
+}
+
+/// The error's message, and the field that it tells in a line of its own.
+fn with_field(error: &toml::de::Error) -> String {
+    error.to_string().trim().replace('\n', " ")
 }
 
 /// `fit.steps=3000` as the table it stands for; a value that is no TOML is taken as a string.
@@ -59,7 +73,7 @@ fn parse_setting(setting: &str) -> Result<Table, TrainError> {
     format!("{key} = {value}")
         .parse()
         .or_else(|_| format!("{key} = {value:?}").parse())
-        .map_err(|error| describe(&error))
+        .map_err(|_| TrainError::Config(format!("{key:?} is no field; --print-config shows them all")))
 }
 
 /// Lays `over` upon `base`, table by table.
@@ -118,6 +132,18 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(error.contains("unknown field `stepz`"), "{error}");
+    }
+
+    #[test]
+    fn a_value_of_another_kind_is_refused_with_its_field_and_a_damaged_file_with_its_line() {
+        let message =
+            |file, settings: &[String]| TrainConfig::layered("paper", file, settings).unwrap_err().to_string();
+        assert_eq!(
+            message(None, &["fit.steps=many".to_owned()]),
+            "invalid type: string \"many\", expected usize in `fit.steps`"
+        );
+        assert!(message(Some("seed = 5\n[fit\n"), &[]).starts_with("the configuration is no TOML in line 2: "));
+        assert!(message(None, &["fit steps=3".to_owned()]).starts_with("\"fit steps\" is no field"));
     }
 
     #[test]

@@ -7,21 +7,22 @@ use std::path::{Path, PathBuf};
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
     ("files", &[]),
+    ("wording", &[]),
     ("frame", &["types"]),
     ("nn", &["types", "frame"]),
     ("sim", &["types", "frame"]),
-    ("dataset", &["types", "files", "frame", "sim"]),
-    ("registry", &["types", "files", "nn"]),
+    ("dataset", &["types", "files", "wording", "frame", "sim"]),
+    ("registry", &["types", "files", "wording", "nn"]),
     ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
-        &["types", "files", "frame", "nn", "sim", "dataset", "registry"],
+        &["types", "files", "wording", "frame", "nn", "sim", "dataset", "registry"],
     ),
     ("serving", &["types", "frame", "nn", "registry"]),
     (
         "jobs",
         &[
-            "types", "files", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
+            "types", "files", "wording", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
         ],
     ),
     (

@@ -285,6 +285,6 @@ fn a_directory_without_a_data_set_is_refused() {
     assert!(
         error
             .to_string()
-            .ends_with("holds no data set: meta/info.json is missing")
+            .contains("holds no data set (meta/info.json is missing)")
     );
 }

@@ -225,6 +225,6 @@ fn a_data_set_of_another_shape_is_named_with_both_shapes() {
     );
     assert_eq!(
         dataset.require_action_count(2).unwrap_err().to_string(),
-        "the data set \"made-up\" has actions of 1 components (linear); 2 are needed"
+        "the data set \"made-up\" has actions of 1 components (linear m/s); 2 are needed"
     );
 }

@@ -194,7 +194,7 @@ fn report_and_figures_are_written_and_read_back() {
     );
     let again = evaluation::prepare(&out).unwrap_err().to_string();
     assert!(
-        again.ends_with("exists and is not empty; name a new directory"),
+        again.ends_with("exists and is not an empty directory; name a new one"),
         "{again}"
     );
 }

@@ -4,6 +4,7 @@
 
 mod architecture;
 mod browser;
+mod cli;
 mod dataset_collect;
 mod dataset_sampler;
 mod environments;

@@ -1,0 +1,143 @@
+//! What a subcommand fails with, and whether the user's question or the world was at fault.
+
+use std::error::Error;
+use std::io::{self, ErrorKind};
+use std::path::Path;
+use std::process::ExitCode;
+
+use crate::dataset::DatasetError;
+use crate::evaluation::EvaluationError;
+use crate::nn::NnError;
+use crate::registry::RegistryError;
+use crate::serving::ServingError;
+use crate::sim::SimError;
+use crate::training::TrainError;
+use crate::wording;
+
+/// What a subcommand fails with: a sentence for the user.
+pub(super) enum CliError {
+    /// It was asked wrongly.
+    Usage(String),
+    /// It went wrong.
+    Failed(String),
+    /// It was interrupted; what was finished is kept.
+    Interrupted(String),
+}
+
+impl CliError {
+    /// It went wrong, and why.
+    pub(super) fn failed(error: impl Error) -> Self {
+        Self::Failed(wording::sentence(&error))
+    }
+
+    /// A file that can't be used: asked wrongly where the path leads to nothing of the kind.
+    pub(super) fn io(action: &str, path: &Path, source: &io::Error) -> Self {
+        let sentence = format!("could not {action} {}: {source}", path.display());
+        match source.kind() {
+            ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory | ErrorKind::AlreadyExists => {
+                Self::Usage(sentence)
+            }
+            _ => Self::Failed(sentence),
+        }
+    }
+
+    /// The line for standard error and the exit code: 2 for what was asked wrongly, 130 for an interruption, 1 otherwise.
+    pub(super) fn told(&self) -> (String, ExitCode) {
+        match self {
+            Self::Usage(sentence) => (format!("error: {sentence}"), ExitCode::from(2)),
+            Self::Failed(sentence) => (format!("error: {sentence}"), ExitCode::from(1)),
+            Self::Interrupted(sentence) => (sentence.clone(), ExitCode::from(130)),
+        }
+    }
+}
+
+/// An error that knows whether another question would have been answered.
+pub(super) trait Blame: Error {
+    /// Whether the arguments were wrong, or what they name does not fit together.
+    fn is_usage(&self) -> bool;
+}
+
+impl<E: Blame> From<E> for CliError {
+    fn from(error: E) -> Self {
+        let sentence = wording::sentence(&error);
+        if error.is_usage() {
+            Self::Usage(sentence)
+        } else {
+            Self::Failed(sentence)
+        }
+    }
+}
+
+impl Blame for SimError {
+    fn is_usage(&self) -> bool {
+        matches!(
+            self,
+            Self::UnknownScenario { .. } | Self::FrameSize { .. } | Self::Setting { .. }
+        )
+    }
+}
+
+impl Blame for DatasetError {
+    fn is_usage(&self) -> bool {
+        match self {
+            Self::World(error) => error.is_usage(),
+            Self::Zero { .. }
+            | Self::OutExists { .. }
+            | Self::OtherArguments { .. }
+            | Self::Unknown { .. }
+            | Self::NotADataset { .. }
+            | Self::Unfinished { .. }
+            | Self::FrameSize { .. }
+            | Self::Channels { .. }
+            | Self::WindowTooLong { .. }
+            | Self::TooFewWindows { .. } => true,
+            _ => false,
+        }
+    }
+}
+
+impl Blame for RegistryError {
+    fn is_usage(&self) -> bool {
+        matches!(self, Self::Unknown { .. } | Self::Name(_) | Self::NotAModel(_))
+    }
+}
+
+impl Blame for TrainError {
+    fn is_usage(&self) -> bool {
+        match self {
+            Self::UnknownPreset(_)
+            | Self::Config(_)
+            | Self::NotARun(_)
+            | Self::OtherRun { .. }
+            | Self::NoValidation { .. } => true,
+            Self::Dataset(error) => error.is_usage(),
+            Self::Registry(error) => error.is_usage(),
+            // The network's sizes come from the settings.
+            Self::Network(error) => matches!(error, NnError::OutOfRange { .. } | NnError::NoChannels { .. }),
+            _ => false,
+        }
+    }
+}
+
+impl Blame for EvaluationError {
+    fn is_usage(&self) -> bool {
+        match self {
+            Self::FrameSize { .. }
+            | Self::FramePeriod { .. }
+            | Self::Channels { .. }
+            | Self::SplitSeed { .. }
+            | Self::Twin { .. }
+            | Self::Setting { .. }
+            | Self::NothingHeldOut { .. }
+            | Self::OutputExists(_) => true,
+            Self::Dataset(error) => error.is_usage(),
+            _ => false,
+        }
+    }
+}
+
+impl Blame for ServingError {
+    fn is_usage(&self) -> bool {
+        matches!(self, Self::Input(_))
+    }
+}

@@ -1,0 +1,72 @@
+//! Data sets by name, in the directory that keeps them.
+
+use std::path::{Path, PathBuf};
+
+use super::DatasetError;
+use super::layout::INFO;
+
+/// Names of the finished data sets in a directory, sorted; an absent one holds none. Errors: `Io`.
+pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
+    if !datasets_dir.exists() {
+        return Ok(Vec::new());
+    }
+    let unlisted = DatasetError::io("list", datasets_dir);
+    let entries = std::fs::read_dir(datasets_dir).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let mut names: Vec<String> = entries
+        .map_err(unlisted)?
+        .into_iter()
+        .filter(|entry| entry.path().join(INFO).is_file())
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .collect();
+    names.sort();
+    Ok(names)
+}
+
+/// The directory of the data set called `what`: a path that leads to one, or else a name below `datasets_dir`. It may be
+/// unfinished. Errors: `Unknown` with the names there are, `NotADataset`, `Io`.
+pub fn find(datasets_dir: &Path, what: &Path) -> Result<PathBuf, DatasetError> {
+    if what.join("meta").is_dir() {
+        return Ok(what.to_owned());
+    }
+    let is_name = what.file_name() == Some(what.as_os_str());
+    let named = datasets_dir.join(what);
+    if is_name && named.is_dir() {
+        return Ok(named);
+    }
+    if !is_name || what.exists() {
+        return Err(DatasetError::NotADataset { path: what.to_owned() });
+    }
+    Err(DatasetError::Unknown {
+        name: what.display().to_string(),
+        dir: datasets_dir.to_owned(),
+        known: list(datasets_dir)?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_data_set_is_found_by_path_before_name_and_an_unknown_one_answered_with_those_there_are() {
+        let dir = tempfile::tempdir().unwrap();
+        let datasets = dir.path().join("datasets");
+        for name in ["b", "a", "unfinished"] {
+            std::fs::create_dir_all(datasets.join(name).join("meta")).unwrap();
+        }
+        for name in ["b", "a"] {
+            std::fs::write(datasets.join(name).join(INFO), "{}").unwrap();
+        }
+        let found = |what: &Path| find(&datasets, what).map_err(|error| error.to_string());
+        assert_eq!(found(Path::new("a")), Ok(datasets.join("a")));
+        assert_eq!(found(&datasets.join("b")), Ok(datasets.join("b")));
+        assert_eq!(found(Path::new("unfinished")), Ok(datasets.join("unfinished")));
+        let unknown = found(Path::new("c")).unwrap_err();
+        assert!(
+            unknown.contains("no data set \"c\"") && unknown.contains("there are: a, b"),
+            "{unknown}"
+        );
+        let empty = found(dir.path()).unwrap_err();
+        assert!(empty.contains("holds no data set"), "{empty}");
+    }
+}
