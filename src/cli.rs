@@ -90,7 +90,7 @@ impl From<RegistryError> for CliError {
 /// Runs the program with the process's arguments and says how it ended.
 #[must_use]
 pub fn main() -> ExitCode {
-    telemetry::init();
+    let _ = telemetry::init(telemetry::LogFormat::Text, None);
     let result = match Cli::parse().command {
         Some(Command::Collect(args)) => collect::run(args),
         Some(Command::Train(args)) => train::run(&args),

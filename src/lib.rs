@@ -6,6 +6,8 @@ pub mod types;
 
 pub mod files;
 
+pub mod telemetry;
+
 pub mod frame;
 
 pub mod nn;
@@ -25,7 +27,5 @@ pub mod serving;
 pub mod jobs;
 
 pub mod server;
-
-pub mod telemetry;
 
 pub mod cli;

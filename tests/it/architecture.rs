@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
     ("files", &[]),
+    ("telemetry", &[]),
     ("frame", &["types"]),
     ("nn", &["types", "frame"]),
     ("sim", &["types", "frame"]),
@@ -17,17 +18,18 @@ const MAY_USE: &[(&str, &[&str])] = &[
         "evaluation",
         &["types", "files", "frame", "nn", "sim", "dataset", "registry"],
     ),
-    ("serving", &["types", "frame", "nn", "registry"]),
+    ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     (
         "jobs",
         &[
-            "types", "files", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
+            "types", "files", "telemetry", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
         ],
     ),
     (
         "server",
         &[
             "types",
+            "telemetry",
             "frame",
             "nn",
             "sim",
@@ -39,7 +41,6 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "jobs",
         ],
     ),
-    ("telemetry", &[]),
 ];
 
 /// Where a crate may be used, by path prefixes under `src/`.
