@@ -1,13 +1,16 @@
 //! The command line: one file a subcommand. Exit code 2 for what was asked wrongly, 1 for what went wrong.
 
 mod collect;
+mod config;
 mod evaluate;
 mod export;
+mod healthcheck;
 mod inspect;
 mod interrupt;
 mod predict;
 mod progress;
 mod serve;
+mod settings;
 mod train;
 
 use std::fmt::Display;
@@ -18,7 +21,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use crate::registry::{self, LoadedModel, RegistryError};
-use crate::telemetry;
+use crate::telemetry::{self, LogFormat, TelemetryError};
 use crate::training::TrainError;
 
 /// Sees a few moments ahead for robots: predicts the camera frames to come from frames, actions and state.
@@ -43,6 +46,10 @@ enum Command {
     Predict(predict::Args),
     /// Serve models over HTTP and WebSocket (the default)
     Serve(serve::Args),
+    /// Print every setting with where it comes from
+    Config(config::Args),
+    /// Ask a running server whether it is ready
+    Healthcheck(healthcheck::Args),
     /// Describe a model or a data set
     Inspect(inspect::Args),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -78,6 +85,12 @@ impl From<TrainError> for CliError {
     }
 }
 
+impl From<TelemetryError> for CliError {
+    fn from(error: TelemetryError) -> Self {
+        Self::Usage(error.to_string())
+    }
+}
+
 impl From<RegistryError> for CliError {
     fn from(error: RegistryError) -> Self {
         match error {
@@ -90,22 +103,32 @@ impl From<RegistryError> for CliError {
 /// Runs the program with the process's arguments and says how it ended.
 #[must_use]
 pub fn main() -> ExitCode {
-    let _ = telemetry::init(telemetry::LogFormat::Text, None);
-    let result = match Cli::parse().command {
-        Some(Command::Collect(args)) => collect::run(args),
-        Some(Command::Train(args)) => train::run(&args),
-        Some(Command::Evaluate(args)) => evaluate::run(&args),
-        Some(Command::Predict(args)) => predict::run(&args),
-        Some(Command::Serve(args)) => serve::run(&args),
-        Some(Command::Inspect(args)) => inspect::run(&args),
-        Some(Command::Export(args)) => export::run(&args),
-        None => serve::run(&serve::Args::default()),
-    };
+    let result = run(Cli::parse().command);
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(CliError::Usage(message)) => stop(&format!("error: {message}"), 2),
         Err(CliError::Failed(message)) => stop(&format!("error: {message}"), 1),
         Err(CliError::Interrupted(message)) => stop(&message, 130),
+    }
+}
+
+fn run(command: Option<Command>) -> Result<(), CliError> {
+    let command = command.unwrap_or_else(|| Command::Serve(serve::Args::default()));
+    // Only the server's logs have settings.
+    let _telemetry = match &command {
+        Command::Serve(_) => None,
+        _ => Some(telemetry::init(LogFormat::Text, None)?),
+    };
+    match command {
+        Command::Collect(args) => collect::run(args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Predict(args) => predict::run(&args),
+        Command::Serve(args) => serve::run(&args),
+        Command::Config(args) => config::run(&args),
+        Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Export(args) => export::run(&args),
     }
 }
 

@@ -28,4 +28,6 @@ pub mod jobs;
 
 pub mod server;
 
+pub mod config;
+
 pub mod cli;

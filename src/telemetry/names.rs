@@ -44,7 +44,7 @@ names! {
         "Predictions dropped because their reader was slow or their computation failed.";
 
     describe_gauge JOBS = "foreframe_jobs" in Count: "Jobs, by state.";
-    describe_counter JOBS_ENDED = "foreframe_jobs_ended_total" in Count: "Jobs that this process ended, by kind and outcome.";
+    describe_counter JOBS_ENDED = "foreframe_jobs_ended_total" in Count: "Jobs that this process ended, by outcome.";
     describe_gauge TRAINING_LOSS = "foreframe_training_loss" in Count:
         "Latest loss of the training that runs here, by split: train or validation.";
 

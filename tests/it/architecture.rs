@@ -22,7 +22,16 @@ const MAY_USE: &[(&str, &[&str])] = &[
     (
         "jobs",
         &[
-            "types", "files", "telemetry", "frame", "nn", "sim", "dataset", "registry", "training", "serving",
+            "types",
+            "files",
+            "telemetry",
+            "frame",
+            "nn",
+            "sim",
+            "dataset",
+            "registry",
+            "training",
+            "serving",
         ],
     ),
     (
@@ -41,12 +50,16 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "jobs",
         ],
     ),
+    ("config", &["telemetry", "server"]),
 ];
 
 /// Where a crate may be used, by path prefixes under `src/`.
 const ROOMS: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
+    ("hyper", &["server"]),
+    ("figment", &["config"]),
+    ("metrics_exporter_prometheus", &["telemetry"]),
     ("image::", &["frame"]),
     ("tokio", &["server", "jobs", "serving", "cli"]),
     ("rapier3d", &["sim"]),
