@@ -22,6 +22,8 @@ pub mod evaluation;
 
 pub mod serving;
 
+pub mod store;
+
 pub mod jobs;
 
 pub mod server;

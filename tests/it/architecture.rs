@@ -18,6 +18,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         &["types", "files", "frame", "nn", "sim", "dataset", "registry"],
     ),
     ("serving", &["types", "frame", "nn", "registry"]),
+    ("store", &["types", "files"]),
     (
         "jobs",
         &[
@@ -47,7 +48,9 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
     ("image::", &["frame"]),
-    ("tokio", &["server", "jobs", "serving", "cli"]),
+    ("tokio", &["server", "jobs", "store", "serving", "cli"]),
+    ("sqlx", &["store"]),
+    ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),
 ];
