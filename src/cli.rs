@@ -7,6 +7,7 @@ mod export;
 mod healthcheck;
 mod inspect;
 mod interrupt;
+mod keys;
 mod predict;
 mod progress;
 mod serve;
@@ -46,6 +47,8 @@ enum Command {
     Predict(predict::Args),
     /// Serve models over HTTP and WebSocket (the default)
     Serve(serve::Args),
+    /// Make, list and revoke API keys
+    Keys(keys::Args),
     /// Print every setting with where it comes from
     Config(config::Args),
     /// Ask a running server whether it is ready
@@ -125,6 +128,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),
         Command::Serve(args) => serve::run(&args),
+        Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
         Command::Inspect(args) => inspect::run(&args),

@@ -24,6 +24,8 @@ pub mod evaluation;
 
 pub mod serving;
 
+pub mod store;
+
 pub mod jobs;
 
 pub mod server;

@@ -22,6 +22,7 @@ mod session;
 mod stream;
 mod streams;
 
+pub mod keys;
 pub mod openapi;
 pub mod protocol;
 pub mod shutdown;
@@ -42,6 +43,7 @@ use connections::Connections;
 use error::ApiError;
 pub use error::Problem;
 pub use images::ImageFormat;
+use keys::Keys;
 use listener::BoundedListener;
 use middleware::RequestIds;
 use streams::Streams;
@@ -81,6 +83,7 @@ const GRACE: Duration = Duration::from_millis(200);
 #[derive(Clone)]
 pub struct App {
     shared: Arc<Shared>,
+    keys: Arc<Keys>,
 }
 
 struct Shared {
@@ -120,6 +123,16 @@ impl App {
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
+            keys: Arc::new(Keys::open()),
+        }
+    }
+
+    /// The same with these keys; without, everybody may call.
+    #[must_use]
+    pub fn with_keys(self, keys: Keys) -> Self {
+        Self {
+            keys: Arc::new(keys),
+            ..self
         }
     }
 
@@ -139,6 +152,10 @@ impl App {
     #[must_use]
     pub fn config(&self) -> &ServerConfig {
         &self.shared.config
+    }
+
+    fn keys(&self) -> &Keys {
+        &self.keys
     }
 
     fn streams(&self) -> &Streams {
@@ -182,7 +199,7 @@ pub fn router(app: App) -> Router {
 }
 
 /// The routes that need a key where keys are asked for.
-fn api(_app: &App) -> Router<App> {
+fn api(app: &App) -> Router<App> {
     Router::new()
         .route("/v1/models", get(models::list))
         .route("/v1/models/{model}", get(models::get))
@@ -192,6 +209,7 @@ fn api(_app: &App) -> Router<App> {
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
+        .route_layer(axum::middleware::from_fn_with_state(app.clone(), keys::check))
 }
 
 /// Answers on the listener until `shutdown` completes. Then it is not ready but goes on for `drain_ms`; takes no more

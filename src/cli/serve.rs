@@ -1,12 +1,16 @@
 //! `foreframe serve`
 
+use std::time::Duration;
+
 use tokio::net::TcpListener;
 use tracing::info;
 
-use super::settings::Settings;
+use super::settings::{Settings, open_store};
 use super::{CliError, say};
 use crate::config::Config;
+use crate::server::keys::Keys;
 use crate::server::{self, App};
+use crate::store::Store;
 use crate::{serving, telemetry};
 
 /// Serve models over HTTP and WebSocket.
@@ -36,15 +40,8 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config) -> Result<(), CliError> {
-    // Before the models are loaded, so that a signal then is not the system's to answer.
-    let shutdown = server::shutdown::requested();
-    if config.is_exposed() && !config.insecure {
-        return Err(CliError::Usage(format!(
-            "{} can be reached from other machines and there is no key to ask for; make one by foreframe keys create \
-             NAME, bind a loopback address, or say --insecure",
-            config.bind
-        )));
-    }
+    let store = open_store(&config).await?;
+    let keys = keys(&config, store).await?;
     let published = config.server.data_dir.join("models");
     let models = serving::load_models(&[config.models_dir.as_path(), published.as_path()])?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
@@ -61,8 +58,33 @@ async fn listen(config: Config) -> Result<(), CliError> {
     if models.is_empty() {
         info!(directory = %config.models_dir.display(), "no models there; train one by POST /v1/jobs or foreframe train");
     }
-    let app = App::start(config.server, models).map_err(CliError::failed)?;
+    let app = App::start(config.server, models)
+        .map_err(CliError::failed)?
+        .with_keys(keys);
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
-    server::serve(listener, app, shutdown).await;
+    server::serve(listener, app, server::shutdown::requested()).await;
     Ok(())
+}
+
+/// Who may call. Errors: `Usage` if other machines can, and there is no key to ask them for.
+async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
+    let is_required = config.is_exposed() && !config.insecure;
+    let mut valid = store.list_keys().await?;
+    valid.retain(|key| key.revoked_s.is_none());
+    if is_required && valid.is_empty() {
+        return Err(CliError::Usage(format!(
+            "{} can be reached from other machines and there is no key to ask for; make one by foreframe keys create \
+             NAME, bind a loopback address, or say --insecure",
+            config.bind
+        )));
+    }
+    info!(
+        keys = valid.len(),
+        "whoever has a key may call; without keys, everybody"
+    );
+    Ok(Keys::of(
+        store,
+        is_required,
+        Duration::from_millis(config.server.key_cache_ms),
+    ))
 }

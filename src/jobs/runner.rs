@@ -200,7 +200,8 @@ fn outcome(event: Event) -> &'static str {
     match event {
         Event::Cancel => "cancelled",
         Event::Fail => "failed",
-        Event::Start | Event::Succeed => "succeeded",
+        Event::Succeed => "succeeded",
+        Event::Start | Event::Leave | Event::Resume => "left",
     }
 }
 

@@ -19,6 +19,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         &["types", "files", "frame", "nn", "sim", "dataset", "registry"],
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
+    ("store", &["types", "files"]),
     (
         "jobs",
         &[
@@ -47,6 +48,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "training",
             "evaluation",
             "serving",
+            "store",
             "jobs",
         ],
     ),
@@ -61,7 +63,9 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("figment", &["config"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
     ("image::", &["frame"]),
-    ("tokio", &["server", "jobs", "serving", "cli"]),
+    ("tokio", &["server", "jobs", "store", "serving", "cli"]),
+    ("sqlx", &["store"]),
+    ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),
 ];

@@ -3,15 +3,19 @@
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
+mod config;
+mod connections;
 mod dataset_collect;
 mod dataset_sampler;
 mod evaluation;
 mod jobs;
+mod keys;
 mod nn_cell;
 mod nn_common;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
+mod program;
 mod server;
 mod service;
 mod sim;
