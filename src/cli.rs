@@ -1,14 +1,18 @@
 //! The command line: one file a subcommand. Exit code 2 for what was asked wrongly, 1 for what went wrong.
 
 mod collect;
+mod config;
 mod error;
 mod evaluate;
 mod export;
+mod healthcheck;
 mod inspect;
 mod interrupt;
+mod keys;
 mod predict;
 mod progress;
 mod serve;
+mod settings;
 mod train;
 
 use std::fmt::Display;
@@ -21,7 +25,7 @@ use clap::{Parser, Subcommand};
 use self::error::CliError;
 use crate::dataset::{self, Dataset};
 use crate::registry::{self, LoadedModel};
-use crate::telemetry;
+use crate::telemetry::{self, LogFormat};
 
 /// Where data sets are kept: also the server's jobs find them there.
 const DATASETS_DIR: &str = "data/datasets";
@@ -48,6 +52,12 @@ enum Command {
     Predict(predict::Args),
     /// Serve models over HTTP and WebSocket (the default)
     Serve(serve::Args),
+    /// Make, list and revoke API keys
+    Keys(keys::Args),
+    /// Print every setting with where it comes from
+    Config(config::Args),
+    /// Ask a running server whether it is ready
+    Healthcheck(healthcheck::Args),
     /// Describe a model or a data set
     Inspect(inspect::Args),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -57,22 +67,34 @@ enum Command {
 /// Runs the program with the process's arguments and says how it ended.
 #[must_use]
 pub fn main() -> ExitCode {
-    telemetry::init();
-    let result = match Cli::parse().command {
-        Some(Command::Collect(args)) => collect::run(args),
-        Some(Command::Train(args)) => train::run(&args),
-        Some(Command::Evaluate(args)) => evaluate::run(&args),
-        Some(Command::Predict(args)) => predict::run(&args),
-        Some(Command::Serve(args)) => serve::run(&args),
-        Some(Command::Inspect(args)) => inspect::run(&args),
-        Some(Command::Export(args)) => export::run(&args),
-        None => serve::run(&serve::Args::default()),
+    let Err(error) = run(Cli::parse().command) else {
+        return ExitCode::SUCCESS;
     };
-    let Err(error) = result else { return ExitCode::SUCCESS };
     let (sentence, code) = error.told();
     // Nothing is left to do if even standard error is closed.
     let _ = writeln!(std::io::stderr(), "{sentence}");
     code
+}
+
+fn run(command: Option<Command>) -> Result<(), CliError> {
+    let command = command.unwrap_or_else(|| Command::Serve(serve::Args::default()));
+    // Only the server's logs have settings.
+    let _telemetry = match &command {
+        Command::Serve(_) => None,
+        _ => Some(telemetry::init(LogFormat::Text, None)?),
+    };
+    match command {
+        Command::Collect(args) => collect::run(args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Predict(args) => predict::run(&args),
+        Command::Serve(args) => serve::run(&args),
+        Command::Keys(args) => keys::run(&args),
+        Command::Config(args) => config::run(&args),
+        Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Export(args) => export::run(&args),
+    }
 }
 
 /// Writes a line of the command's answer to standard output.

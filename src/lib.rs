@@ -7,6 +7,7 @@ pub mod types;
 pub mod files;
 
 pub mod wording;
+pub mod telemetry;
 
 pub mod frame;
 
@@ -24,10 +25,12 @@ pub mod evaluation;
 
 pub mod serving;
 
+pub mod store;
+
 pub mod jobs;
 
 pub mod server;
 
-pub mod telemetry;
+pub mod config;
 
 pub mod cli;

@@ -2,7 +2,9 @@
 //! the handlers share, [`protocol`] the stream's messages, [`openapi`] the contract.
 
 mod config;
+mod connections;
 mod dashboard;
+mod docs;
 mod environments;
 mod error;
 mod extract;
@@ -10,8 +12,10 @@ mod health;
 mod images;
 mod jobs;
 mod listener;
+mod metrics;
 mod middleware;
 mod models;
+mod origin;
 mod picture;
 mod predict;
 mod preview;
@@ -19,24 +23,29 @@ mod session;
 mod stream;
 mod streams;
 
+pub mod keys;
 pub mod openapi;
 pub mod protocol;
 pub mod shutdown;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
+use tokio::time::{timeout, timeout_at};
 use tracing::{info, warn};
 
 pub use config::ServerConfig;
+use connections::Connections;
 use environments::Environments;
 use error::ApiError;
 pub use error::Problem;
 pub use images::ImageFormat;
+use keys::Keys;
 use listener::BoundedListener;
 use middleware::RequestIds;
 use streams::Streams;
@@ -67,18 +76,16 @@ pub enum ServerError {
     /// The job runner could not start.
     #[error(transparent)]
     Jobs(#[from] JobError),
-    /// The listener failed.
-    #[error("could not listen for connections")]
-    Listen(#[source] std::io::Error),
 }
 
-/// What [`finish`] may take past the deadline to say what did not end.
+/// What [`serve`] may take past the deadline to say what did not end.
 const GRACE: Duration = Duration::from_millis(200);
 
 /// What the handlers share; clones are the same.
 #[derive(Clone)]
 pub struct App {
     shared: Arc<Shared>,
+    keys: Arc<Keys>,
 }
 
 struct Shared {
@@ -87,6 +94,7 @@ struct Shared {
     jobs: Jobs,
     streams: Streams,
     environments: Environments,
+    draining: AtomicBool,
     request_ids: RequestIds,
     contract: String,
 }
@@ -117,9 +125,20 @@ impl App {
                 jobs,
                 streams,
                 environments,
+                draining: AtomicBool::new(false),
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
+            keys: Arc::new(Keys::open()),
+        }
+    }
+
+    /// The same with these keys; without, everybody may call.
+    #[must_use]
+    pub fn with_keys(self, keys: Keys) -> Self {
+        Self {
+            keys: Arc::new(keys),
+            ..self
         }
     }
 
@@ -141,12 +160,25 @@ impl App {
         &self.shared.config
     }
 
+    fn keys(&self) -> &Keys {
+        &self.keys
+    }
+
     fn streams(&self) -> &Streams {
         &self.shared.streams
     }
 
     fn environments(&self) -> &Environments {
         &self.shared.environments
+    }
+
+    /// Whether the server is about to end: it answers, and wants no more.
+    fn is_draining(&self) -> bool {
+        self.shared.draining.load(Ordering::Acquire)
+    }
+
+    fn drain(&self) {
+        self.shared.draining.store(true, Ordering::Release);
     }
 
     fn request_ids(&self) -> &RequestIds {
@@ -166,7 +198,21 @@ pub fn router(app: App) -> Router {
         .route("/dashboard.css", get(dashboard::style))
         .route("/livez", get(health::livez))
         .route("/readyz", get(health::readyz))
+        .route("/metrics", get(metrics::metrics))
         .route("/openapi.json", get(openapi::openapi_json))
+        .merge(docs::router())
+        .merge(api(&app))
+        .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
+        .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
+        .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), origin::check))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), middleware::trace))
+        .with_state(app)
+}
+
+/// The routes that need a key where keys are asked for.
+fn api(app: &App) -> Router<App> {
+    Router::new()
         .route("/v1/models", get(models::list))
         .route("/v1/models/{model}", get(models::get))
         .route("/v1/models/{model}/predict", post(predict::predict))
@@ -179,62 +225,35 @@ pub fn router(app: App) -> Router {
         .route("/v1/environments/{id}", delete(environments::delete))
         .route("/v1/environments/{id}/reset", post(environments::reset))
         .route("/v1/environments/{id}/step", post(environments::step))
-        .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
-        .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
-        .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
-        .layer(axum::middleware::from_fn_with_state(app.clone(), middleware::trace))
-        .with_state(app)
+        .route_layer(axum::middleware::from_fn_with_state(app.clone(), keys::check))
 }
 
-/// Answers on the listener until `shutdown` completes; then takes no more connections, answers the requests it has,
-/// closes every stream with 1001, cancels the jobs, and returns when all have ended or the deadline has passed.
-/// Errors: `Listen`.
-pub async fn serve(
-    listener: TcpListener,
-    app: App,
-    shutdown: impl Future<Output = ()> + Send + 'static,
-) -> Result<(), ServerError> {
-    let limit = Duration::from_millis(app.config().shutdown_deadline_ms);
-    let (told, mut deadline) = tokio::sync::watch::channel(None::<Instant>);
-    let listener = BoundedListener::new(listener, app.config().max_connections);
-    let of_signal = app.clone();
-    let signal = async move {
-        shutdown.await;
-        info!("stopping");
-        of_signal.streams().stop();
-        of_signal.jobs().begin_stop();
-        told.send_replace(Some(Instant::now() + limit));
-    };
-    let server = axum::serve(listener, router(app.clone())).with_graceful_shutdown(signal);
-    let at_end = deadline.clone();
-    let work = async {
-        server.await.map_err(ServerError::Listen)?;
-        let deadline = at_end.borrow().unwrap_or_else(Instant::now);
-        finish(app, deadline).await;
-        Ok(())
-    };
-    let over = async {
-        // The sender lives until it has sent.
-        let deadline = deadline
-            .wait_for(Option::is_some)
-            .await
-            .ok()
-            .and_then(|deadline| *deadline);
-        tokio::time::sleep_until((deadline.unwrap_or_else(Instant::now) + GRACE).into()).await;
-    };
+/// Answers on the listener until `shutdown` completes. Then it is not ready but goes on for `drain_ms`; takes no more
+/// connections, answers the requests it has, closes every stream with 1001, cancels the jobs, and returns when all have
+/// ended or the deadline has passed.
+pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
+    let config = app.config();
+    let limit = Duration::from_millis(config.shutdown_deadline_ms);
+    let drain = Duration::from_millis(config.drain_ms);
+    let listener = BoundedListener::new(listener, config);
+    let mut connections = Connections::new(&app);
     tokio::select! {
-        result = work => result,
-        () = over => {
-            warn!("some requests were not answered within the deadline");
-            Ok(())
-        }
+        never = connections.accept(&listener) => match never {},
+        never = metrics::keep_folded() => match never {},
+        () = shutdown => {}
     }
-}
-
-/// Waits for the streams, the running job and the predictor to end.
-async fn finish(app: App, deadline: Instant) {
-    let streams = tokio::time::timeout_at(deadline.into(), app.streams().ended());
-    if streams.await.is_err() {
+    info!("stopping");
+    let deadline = Instant::now() + limit;
+    app.drain();
+    app.jobs().begin_stop();
+    // Even without time to drain, connections that are established are taken: their clients wait for an answer.
+    let Err(_) = timeout(drain, connections.accept(&listener)).await;
+    drop(listener);
+    app.streams().stop();
+    if timeout_at(deadline.into(), connections.ended()).await.is_err() {
+        warn!("some requests were not answered within the deadline");
+    }
+    if timeout_at(deadline.into(), app.streams().ended()).await.is_err() {
         warn!("some streams did not end within the deadline");
     }
     let ended = blocking(move || {
@@ -242,8 +261,9 @@ async fn finish(app: App, deadline: Instant) {
         app.predictor().stop();
         ended
     });
-    if ended.await == Ok(true) {
-        info!("stopped");
+    match timeout_at((deadline + GRACE).into(), ended).await {
+        Ok(Ok(true)) => info!("stopped"),
+        _ => warn!("a computation did not end within the deadline"),
     }
 }
 

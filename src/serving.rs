@@ -4,6 +4,7 @@
 mod catalog;
 mod compute;
 mod input;
+mod meter;
 mod queue;
 mod worker;
 

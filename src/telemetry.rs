@@ -1,13 +1,71 @@
-//! Logs: to standard error, `info` and above unless `RUST_LOG` says otherwise.
+//! What the program says of itself: logs to standard error, `info` and above unless `RUST_LOG` says otherwise; metrics by
+//! [`names`], recorded from [`record`] on and given to Prometheus by [`render`]; with the feature `otlp`, traces.
 
-use tracing_subscriber::EnvFilter;
+pub mod names;
 
-/// Installs the subscriber for the process. A second call changes nothing.
-pub fn init() {
+#[cfg(feature = "otlp")]
+mod otlp;
+mod prometheus;
+
+use serde::{Deserialize, Serialize};
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _, fmt};
+
+pub use prometheus::{fold, record, render};
+
+/// How log lines look.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// For people.
+    #[default]
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// Why traces cannot be sent.
+#[derive(Debug, thiserror::Error)]
+pub enum TelemetryError {
+    /// The program cannot send traces.
+    #[error("otlp_endpoint is set, and this program was built without the feature otlp; build it with --features otlp")]
+    NoOtlp,
+    /// The exporter could not be made.
+    #[error("otlp_endpoint: {0}")]
+    Otlp(String),
+}
+
+/// Sends the traces that wait when it is dropped.
+#[must_use]
+pub struct Telemetry {
+    #[cfg(feature = "otlp")]
+    _traces: Option<otlp::Traces>,
+}
+
+/// Installs the subscriber for the process; a second call changes nothing. Spans go to `otlp_endpoint`, for example
+/// `http://127.0.0.1:4318`, if one is given. Errors: `NoOtlp`, `Otlp`.
+pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry, TelemetryError> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    // Only fails if one is installed already, as in tests.
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .try_init();
+    let lines = fmt::layer().with_writer(std::io::stderr);
+    let lines = match format {
+        LogFormat::Text => lines.boxed(),
+        LogFormat::Json => lines.json().flatten_event(true).boxed(),
+    };
+    let registry = tracing_subscriber::registry().with(lines).with(filter);
+    #[cfg(feature = "otlp")]
+    {
+        let traces = otlp_endpoint.map(otlp::Traces::to).transpose()?;
+        // Only fails if one is installed already, as in tests.
+        let _ = registry.with(traces.as_ref().map(otlp::Traces::layer)).try_init();
+        Ok(Telemetry { _traces: traces })
+    }
+    #[cfg(not(feature = "otlp"))]
+    {
+        if otlp_endpoint.is_some() {
+            return Err(TelemetryError::NoOtlp);
+        }
+        let _ = registry.try_init();
+        Ok(Telemetry {})
+    }
 }

@@ -11,6 +11,7 @@ use crate::nn::NnError;
 use crate::registry::RegistryError;
 use crate::serving::ServingError;
 use crate::sim::SimError;
+use crate::telemetry::TelemetryError;
 use crate::training::TrainError;
 use crate::wording;
 
@@ -65,6 +66,12 @@ impl<E: Blame> From<E> for CliError {
         } else {
             Self::Failed(sentence)
         }
+    }
+}
+
+impl Blame for TelemetryError {
+    fn is_usage(&self) -> bool {
+        true
     }
 }
 

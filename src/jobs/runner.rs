@@ -5,7 +5,10 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
+use metrics::{counter, gauge};
 use tracing::{info, warn};
+
+use crate::telemetry::names;
 
 use super::{Event, Job, JobError, JobSpec, JobState, JobTable, Losses, TableLimits};
 
@@ -48,6 +51,11 @@ impl Report<'_> {
 
     /// Notes the latest losses.
     pub fn losses(&self, losses: Losses) {
+        for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
+            if let Some(loss) = loss {
+                gauge!(names::TRAINING_LOSS, "split" => split).set(loss);
+            }
+        }
         self.shared.table().note_losses(self.id, losses);
     }
 }
@@ -177,6 +185,7 @@ fn run(shared: &Shared) {
             Err(Failure::Cancelled) => (Event::Cancel, None),
             Err(Failure::Failed(reason)) => (Event::Fail, Some(reason)),
         };
+        counter!(names::JOBS_ENDED, "outcome" => outcome(event)).increment(1);
         match &error {
             None => info!(job.id = %id, job.outcome = ?event, "job ended"),
             Some(reason) => warn!(job.id = %id, reason, "job failed"),
@@ -184,6 +193,15 @@ fn run(shared: &Shared) {
         // A running job can succeed, fail and be cancelled: every event here is legal.
         let _ = shared.table().end(&id, event, error, unix_s());
         shared.changed.notify_all();
+    }
+}
+
+fn outcome(event: Event) -> &'static str {
+    match event {
+        Event::Cancel => "cancelled",
+        Event::Fail => "failed",
+        Event::Succeed => "succeeded",
+        Event::Start | Event::Leave | Event::Resume => "left",
     }
 }
 

@@ -1,6 +1,7 @@
 //! The states of a job and the steps between them, as a pure function.
 
 use std::fmt;
+use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
@@ -23,7 +24,7 @@ pub enum JobState {
 /// What can happen to a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event {
-    /// The runner takes it up.
+    /// A runner takes it up.
     Start,
     /// The work is done.
     Succeed,
@@ -31,9 +32,22 @@ pub enum Event {
     Fail,
     /// The work ended before its end because that was asked.
     Cancel,
+    /// The runner stopped; another, or the same at its next start, goes on.
+    Leave,
+    /// Someone wants it to go on after all.
+    Resume,
 }
 
 impl JobState {
+    /// Every state.
+    pub const ALL: [Self; 5] = [
+        Self::Queued,
+        Self::Running,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Cancelled,
+    ];
+
     /// The state after the event, or `None` where the event cannot happen in this state.
     #[must_use]
     pub fn after(self, event: Event) -> Option<Self> {
@@ -42,14 +56,38 @@ impl JobState {
             (Self::Running, Event::Succeed) => Some(Self::Succeeded),
             (Self::Running, Event::Fail) => Some(Self::Failed),
             (Self::Queued | Self::Running, Event::Cancel) => Some(Self::Cancelled),
+            (Self::Running, Event::Leave) | (Self::Failed | Self::Cancelled, Event::Resume) => Some(Self::Queued),
             _ => None,
         }
     }
 
-    /// Whether nothing can happen to it any more.
+    /// Whether nothing more happens to it by itself.
     #[must_use]
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
+    }
+
+    /// Its name on the wire and in the store.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Queued => "queued",
+            Self::Running => "running",
+            Self::Succeeded => "succeeded",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+        }
+    }
+}
+
+impl FromStr for JobState {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL.into_iter().find(|state| state.name() == text).ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            format!("\"{}\" is no state; there are: {known}", text.escape_default())
+        })
     }
 }
 
@@ -72,6 +110,8 @@ impl fmt::Display for Event {
             Self::Succeed => "succeed",
             Self::Fail => "fail",
             Self::Cancel => "be cancelled",
+            Self::Leave => "be left",
+            Self::Resume => "be resumed",
         })
     }
 }
@@ -82,26 +122,41 @@ mod tests {
 
     use super::*;
 
-    const EVENTS: [Event; 4] = [Event::Start, Event::Succeed, Event::Fail, Event::Cancel];
+    const EVENTS: [Event; 6] = [
+        Event::Start,
+        Event::Succeed,
+        Event::Fail,
+        Event::Cancel,
+        Event::Leave,
+        Event::Resume,
+    ];
 
     proptest! {
         #[test]
-        fn a_final_state_never_changes_and_success_needs_a_start(events in proptest::collection::vec(0usize..4, 0..12)) {
+        fn success_is_for_ever_and_only_a_resume_leaves_another_end(events in proptest::collection::vec(0usize..6, 0..24)) {
             let (mut state, mut started) = (JobState::Queued, false);
             for event in events.into_iter().map(|i| EVENTS[i]) {
-                match state.after(event) {
-                    Some(next) => {
-                        prop_assert!(!state.is_final());
-                        prop_assert_ne!(next, state);
-                        started |= next == JobState::Running;
-                        state = next;
-                    }
-                    None => prop_assert!(state.is_final() || event != Event::Cancel),
+                if let Some(next) = state.after(event) {
+                    prop_assert_ne!(state, JobState::Succeeded);
+                    prop_assert!(!state.is_final() || event == Event::Resume);
+                    prop_assert_ne!(next, state);
+                    started |= next == JobState::Running;
+                    state = next;
+                } else {
+                    prop_assert!(state.is_final() || event != Event::Cancel);
                 }
                 if matches!(state, JobState::Succeeded | JobState::Failed) {
                     prop_assert!(started);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_state_is_read_by_the_name_it_is_written_with() {
+        for state in JobState::ALL {
+            assert_eq!(state.name().parse(), Ok(state));
+            assert_eq!(serde_json::to_value(state).unwrap(), state.name());
         }
     }
 }

@@ -1,5 +1,6 @@
 //! The server's bounds. Every one is checked before the server starts and has a test that is refused by it.
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -11,7 +12,7 @@ use crate::serving::PredictorConfig;
 
 /// All settings of the server, with their defaults.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(default)]
 pub struct ServerConfig {
     /// Where jobs write: `datasets`, `runs` and `models` below it.
     pub data_dir: PathBuf,
@@ -43,9 +44,25 @@ pub struct ServerConfig {
     pub stream_idle_ms: u64,
     /// How long a client may take to read a message of its stream, in milliseconds.
     pub stream_send_ms: u64,
-    /// How long stopping may take, in milliseconds.
+    /// Bytes of a request's head at most; more are answered 431.
+    pub max_header_bytes: usize,
+    /// How long a request's head may take to arrive, from the connection's opening or the answer before it: so also how
+    /// long a connection may be idle, in milliseconds.
+    pub header_read_ms: u64,
+    /// How long a client may read nothing of what is written to it, in milliseconds.
+    pub write_stall_ms: u64,
+    /// How long the server, told to stop, goes on taking requests while `/readyz` says 503, in milliseconds.
+    pub drain_ms: u64,
+    /// How long stopping may take, draining and all, in milliseconds.
     pub shutdown_deadline_ms: u64,
+    /// How long a revoked key may still be taken, in milliseconds.
+    pub key_cache_ms: u64,
+    /// Origins of other pages whose scripts may call this server, for example `https://robots.example`.
+    pub cors_origins: Vec<String>,
 }
+
+/// A field with its value and the range it must be in.
+type Bound = (&'static str, u64, RangeInclusive<u64>);
 
 impl Default for ServerConfig {
     fn default() -> Self {
@@ -65,7 +82,13 @@ impl Default for ServerConfig {
             environment_idle_ms: 600_000,
             stream_idle_ms: 60_000,
             stream_send_ms: 10_000,
+            max_header_bytes: 32 << 10,
+            header_read_ms: 30_000,
+            write_stall_ms: 30_000,
+            drain_ms: 0,
             shutdown_deadline_ms: 10_000,
+            key_cache_ms: 5_000,
+            cors_origins: Vec::new(),
         }
     }
 }
@@ -76,38 +99,54 @@ const MAX_DEADLINE_MS: u64 = 86_400_000;
 impl ServerConfig {
     /// Errors: `Config`, which names the field and its range.
     pub fn validate(&self) -> Result<(), ServerError> {
-        let deadlines = 1..=MAX_DEADLINE_MS;
-        for (field, value, range) in [
+        self.out_of_bounds().map_or(Ok(()), |(field, value, range)| {
+            Err(ServerError::Config {
+                field,
+                value,
+                least: *range.start(),
+                most: *range.end(),
+            })
+        })
+    }
+
+    /// The first field that is out of its range.
+    #[must_use]
+    pub fn out_of_bounds(&self) -> Option<Bound> {
+        let mut bounds = self.bounds().into_iter();
+        bounds.find(|(_, value, range)| !range.contains(value))
+    }
+
+    /// Every number with the range it must be in.
+    #[must_use]
+    pub fn bounds(&self) -> Vec<Bound> {
+        let deadline = 1..=MAX_DEADLINE_MS;
+        let count = 1..=1_000_000;
+        vec![
             ("max_body_bytes", self.max_body_bytes as u64, 1024..=1 << 30),
             ("max_frames", self.max_frames as u64, 1..=4096),
             (
                 "max_queued_predictions",
                 self.max_queued_predictions as u64,
-                1..=1_000_000,
+                count.clone(),
             ),
             ("max_batch", self.max_batch as u64, 1..=4096),
-            ("max_connections", self.max_connections as u64, 1..=1_000_000),
-            ("max_streams", self.max_streams as u64, 1..=1_000_000),
+            ("max_connections", self.max_connections as u64, count.clone()),
+            ("max_streams", self.max_streams as u64, count),
             ("max_environments", self.max_environments as u64, 1..=10_000),
             ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
-            ("prediction_deadline_ms", self.prediction_deadline_ms, deadlines.clone()),
-            ("request_deadline_ms", self.request_deadline_ms, deadlines.clone()),
-            ("environment_idle_ms", self.environment_idle_ms, deadlines.clone()),
-            ("stream_idle_ms", self.stream_idle_ms, deadlines.clone()),
-            ("stream_send_ms", self.stream_send_ms, deadlines.clone()),
-            ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadlines),
-        ] {
-            if !range.contains(&value) {
-                return Err(ServerError::Config {
-                    field,
-                    value,
-                    least: *range.start(),
-                    most: *range.end(),
-                });
-            }
-        }
-        Ok(())
+            ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
+            ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
+            ("request_deadline_ms", self.request_deadline_ms, deadline.clone()),
+            ("environment_idle_ms", self.environment_idle_ms, deadline.clone()),
+            ("stream_idle_ms", self.stream_idle_ms, deadline.clone()),
+            ("stream_send_ms", self.stream_send_ms, deadline.clone()),
+            ("header_read_ms", self.header_read_ms, deadline.clone()),
+            ("write_stall_ms", self.write_stall_ms, deadline.clone()),
+            ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadline),
+            ("drain_ms", self.drain_ms, 0..=self.shutdown_deadline_ms),
+            ("key_cache_ms", self.key_cache_ms, 0..=MAX_DEADLINE_MS),
+        ]
     }
 
     pub(super) fn predictor(&self) -> PredictorConfig {

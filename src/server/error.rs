@@ -38,6 +38,8 @@ pub struct Problem {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum ApiError {
     Malformed(String),
+    Unauthorized(&'static str),
+    Forbidden(String),
     NotFound(String),
     MethodNotAllowed,
     NotAcceptable(String),
@@ -62,6 +64,8 @@ impl ApiError {
     fn status(&self) -> (StatusCode, &'static str) {
         match self {
             Self::Malformed(_) => (StatusCode::BAD_REQUEST, "malformed"),
+            Self::Unauthorized(_) => (StatusCode::UNAUTHORIZED, "unauthorized"),
+            Self::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
             Self::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Self::MethodNotAllowed => (StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed"),
             Self::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable"),
@@ -79,6 +83,7 @@ impl ApiError {
     fn detail(self) -> String {
         match self {
             Self::Malformed(detail)
+            | Self::Forbidden(detail)
             | Self::NotFound(detail)
             | Self::NotAcceptable(detail)
             | Self::Timeout(detail)
@@ -87,6 +92,7 @@ impl ApiError {
             | Self::UnsupportedMedia(detail)
             | Self::Unprocessable(detail)
             | Self::Unavailable { detail, .. } => detail,
+            Self::Unauthorized(detail) => detail.to_owned(),
             Self::MethodNotAllowed => "this path does not take that method; see /openapi.json".to_owned(),
             Self::UpgradeRequired => "this path is a WebSocket; ask for an upgrade with its handshake".to_owned(),
             // The cause is in the log, under the request's id.
@@ -102,15 +108,19 @@ impl IntoResponse for ApiError {
             error!(cause, "request failed");
         }
         let (status, slug) = self.status();
-        let retry_after_s = match &self {
-            Self::Unavailable { retry_after_s, .. } => Some(*retry_after_s),
-            _ => None,
-        };
         let mut response = status.into_response();
-        if let Some(seconds) = retry_after_s {
-            response
-                .headers_mut()
-                .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        let headers = response.headers_mut();
+        match &self {
+            Self::Unavailable { retry_after_s, .. } => {
+                headers.insert(header::RETRY_AFTER, HeaderValue::from(*retry_after_s));
+            }
+            Self::Unauthorized(_) => {
+                headers.insert(
+                    header::WWW_AUTHENTICATE,
+                    HeaderValue::from_static("Bearer realm=\"foreframe\""),
+                );
+            }
+            _ => {}
         }
         response.extensions_mut().insert(Problem {
             kind: format!("urn:foreframe:problem:{slug}"),

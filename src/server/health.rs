@@ -25,7 +25,7 @@ pub(super) async fn livez() -> axum::Json<Health> {
     responses((status = 200, body = Health), (status = 503, description = "Not ready", body = Problem))
 )]
 pub(super) async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> {
-    if app.streams().is_stopping() {
+    if app.is_draining() {
         return Err(ApiError::unavailable("the server is stopping"));
     }
     if !app.predictor().is_ready() {

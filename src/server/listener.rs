@@ -1,44 +1,70 @@
 //! A listener that holds a bounded number of connections; those over it are told so and closed.
 
 use std::io;
-use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use axum::serve::Listener;
+use metrics::{counter, gauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::Sleep;
 use tracing::warn;
 
+use super::ServerConfig;
 use super::error::CONNECTIONS_FULL_RESPONSE;
+use crate::telemetry::names;
 
 /// Connections that are being refused at a time; more are closed without a word.
 const MAX_REFUSING: usize = 64;
 /// How long a refused client may take to hang up, so that it has read why.
 const REFUSAL_LIMIT: Duration = Duration::from_secs(1);
+/// How long to wait when the system has no descriptors left for a connection.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 pub(super) struct BoundedListener {
     inner: TcpListener,
     places: Arc<Semaphore>,
     refusing: Arc<Semaphore>,
+    write_stall: Duration,
 }
 
 impl BoundedListener {
-    pub(super) fn new(inner: TcpListener, limit: usize) -> Self {
+    pub(super) fn new(inner: TcpListener, config: &ServerConfig) -> Self {
         Self {
             inner,
-            places: Arc::new(Semaphore::new(limit)),
+            places: Arc::new(Semaphore::new(config.max_connections)),
             refusing: Arc::new(Semaphore::new(MAX_REFUSING)),
+            write_stall: Duration::from_millis(config.write_stall_ms),
         }
     }
-}
 
-impl BoundedListener {
+    /// The next connection that has a place. Nothing is lost when the future is dropped.
+    pub(super) async fn accept(&self) -> Connection {
+        loop {
+            let stream = match self.inner.accept().await {
+                Ok((stream, _)) => stream,
+                Err(error) => {
+                    pause_after(&error).await;
+                    continue;
+                }
+            };
+            // Answers are small and awaited: they must not wait to be joined with others.
+            if let Err(error) = stream.set_nodelay(true) {
+                warn!(%error, "could not set TCP_NODELAY");
+            }
+            match Arc::clone(&self.places).try_acquire_owned() {
+                Ok(place) => return Connection::new(stream, place, self.write_stall),
+                Err(_) => self.refuse(stream),
+            }
+        }
+    }
+
     fn refuse(&self, stream: TcpStream) {
         warn!("too many connections; one is refused");
+        counter!(names::HTTP_CONNECTIONS_REFUSED).increment(1);
         if let Ok(place) = Arc::clone(&self.refusing).try_acquire_owned() {
             tokio::spawn(async move {
                 // A client that is gone or slow has had its chance.
@@ -49,29 +75,14 @@ impl BoundedListener {
     }
 }
 
-impl Listener for BoundedListener {
-    type Io = Connection;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Connection, SocketAddr) {
-        loop {
-            let (stream, address) = Listener::accept(&mut self.inner).await;
-            // Answers are small and awaited: they must not wait to be joined with others.
-            if let Err(error) = stream.set_nodelay(true) {
-                warn!(%error, "could not set TCP_NODELAY");
-            }
-            match Arc::clone(&self.places).try_acquire_owned() {
-                Ok(place) => {
-                    let connection = Connection { stream, _place: place };
-                    return (connection, address);
-                }
-                Err(_) => self.refuse(stream),
-            }
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        self.inner.local_addr()
+async fn pause_after(error: &io::Error) {
+    let is_of_client = matches!(
+        error.kind(),
+        io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionAborted | io::ErrorKind::ConnectionReset
+    );
+    if !is_of_client {
+        warn!(%error, "no connection could be taken");
+        tokio::time::sleep(ACCEPT_PAUSE).await;
     }
 }
 
@@ -94,10 +105,44 @@ async fn tell_and_drain(stream: TcpStream) -> io::Result<()> {
     }
 }
 
-/// A connection that holds its place until it is dropped.
+/// A connection that holds its place until it is dropped, and fails when its client reads nothing for too long.
 pub(super) struct Connection {
     stream: TcpStream,
+    write_stall: Duration,
+    stalled: Option<Pin<Box<Sleep>>>,
     _place: OwnedSemaphorePermit,
+}
+
+impl Connection {
+    fn new(stream: TcpStream, place: OwnedSemaphorePermit, write_stall: Duration) -> Self {
+        gauge!(names::HTTP_CONNECTIONS).increment(1.0);
+        Self {
+            stream,
+            write_stall,
+            stalled: None,
+            _place: place,
+        }
+    }
+
+    /// Passes on how a write went; one that cannot go on has until the stall's limit.
+    fn watch<T>(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
+        if written.is_ready() {
+            self.stalled = None;
+            return written;
+        }
+        let limit = self.write_stall;
+        let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(limit)));
+        sleep
+            .as_mut()
+            .poll(cx)
+            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "the client reads nothing")))
+    }
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
+    }
 }
 
 impl AsyncRead for Connection {
@@ -108,7 +153,8 @@ impl AsyncRead for Connection {
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(cx, bytes)
+        let written = Pin::new(&mut self.stream).poll_write(cx, bytes);
+        self.watch(cx, written)
     }
 
     fn poll_write_vectored(
@@ -116,7 +162,8 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         bytes: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(cx, bytes)
+        let written = Pin::new(&mut self.stream).poll_write_vectored(cx, bytes);
+        self.watch(cx, written)
     }
 
     fn is_write_vectored(&self) -> bool {

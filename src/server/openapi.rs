@@ -5,7 +5,7 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use utoipa::OpenApi;
 
-use super::{App, dashboard, environments, error, health, jobs, models, predict, preview, stream};
+use super::{App, dashboard, environments, error, health, jobs, metrics, models, predict, preview, stream};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -18,6 +18,7 @@ use super::{App, dashboard, environments, error, health, jobs, models, predict, 
     paths(
         health::livez,
         health::readyz,
+        metrics::metrics,
         models::list,
         models::get,
         predict::predict,

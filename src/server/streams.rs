@@ -31,13 +31,14 @@ impl Streams {
             .map_err(|_| ApiError::unavailable(format!("{} streams are open already; try again later", self.limit)))
     }
 
+    /// How many are open.
+    pub(super) fn count(&self) -> usize {
+        (self.limit as usize).saturating_sub(self.places.available_permits())
+    }
+
     /// Becomes true when streams shall end.
     pub(super) fn stopping(&self) -> watch::Receiver<bool> {
         self.stop.subscribe()
-    }
-
-    pub(super) fn is_stopping(&self) -> bool {
-        *self.stop.borrow()
     }
 
     /// Tells every stream to end.

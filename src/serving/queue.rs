@@ -8,6 +8,7 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 
 use super::batch::{self, Candidate};
+use super::meter;
 use super::{Prediction, PredictionInput, ServingError};
 use crate::registry::LoadedModel;
 
@@ -70,12 +71,14 @@ impl Queue {
             state.waiting.retain(|waiting| !waiting.reply.is_closed());
         }
         if state.waiting.len() >= self.capacity {
+            meter::refused("full");
             return Err(ServingError::QueueFull {
                 capacity: self.capacity,
                 retry_after_s: RETRY_AFTER_S,
             });
         }
         state.waiting.push_back(request);
+        meter::waiting(state.waiting.len());
         self.arrived.notify_one();
         Ok(())
     }
@@ -138,6 +141,11 @@ impl State {
                 batch.push(waiting);
             } else if plan.discard.binary_search(&position).is_ok() {
                 let limit_ms = waiting.deadline.saturating_duration_since(waiting.accepted).as_millis();
+                meter::refused(if waiting.reply.is_closed() {
+                    "abandoned"
+                } else {
+                    "deadline"
+                });
                 // Nobody listens if the client has gone.
                 let _ = waiting.reply.send(Err(ServingError::Deadline { limit_ms }));
             } else {
@@ -145,6 +153,7 @@ impl State {
             }
         }
         self.waiting = kept;
+        meter::waiting(self.waiting.len());
         batch
     }
 }

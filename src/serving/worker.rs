@@ -9,7 +9,7 @@ use tracing::{error, info};
 
 use super::catalog::Catalog;
 use super::queue::{Load, Queue, Waiting, Work};
-use super::{Prediction, PredictionInput, ServingError, compute};
+use super::{Prediction, PredictionInput, ServingError, compute, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
@@ -100,6 +100,11 @@ fn answer(owned: &Models, batch: Vec<Waiting>) {
     match compute::predict(model, &inputs) {
         Ok(predicted) => {
             let compute_us = micros_since(started);
+            meter::computed(
+                &model.manifest.name,
+                batch.iter().map(|waiting| waiting.accepted),
+                started,
+            );
             for (waiting, frames) in batch.into_iter().zip(predicted) {
                 let queue_us = micros(started.saturating_duration_since(waiting.accepted));
                 let prediction = Prediction {
@@ -115,6 +120,7 @@ fn answer(owned: &Models, batch: Vec<Waiting>) {
         // One bad input must not fail its neighbours.
         Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(owned, vec![waiting])),
         Err(error) => {
+            meter::refused("error");
             if let Some(waiting) = batch.into_iter().next() {
                 let _ = waiting.reply.send(Err(error));
             }

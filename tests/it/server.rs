@@ -385,7 +385,6 @@ async fn an_accepted_request_is_answered_while_the_server_stops() {
     tokio::time::timeout(crate::service::PATIENCE, server.task)
         .await
         .unwrap()
-        .unwrap()
         .unwrap();
     assert!(TcpStream::connect(server.address).await.is_err());
 }

@@ -10,7 +10,7 @@ use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::{Frame, codec};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
 use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
-use foreframe::server::{self, App, ServerConfig, ServerError};
+use foreframe::server::{self, App, ServerConfig};
 use foreframe::types::Seed;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
@@ -169,7 +169,7 @@ pub(crate) async fn post_text(app: &App, path: &str, body: String, accept: &str)
 pub(crate) struct Running {
     pub(crate) address: std::net::SocketAddr,
     pub(crate) shutdown: oneshot::Sender<()>,
-    pub(crate) task: JoinHandle<Result<(), ServerError>>,
+    pub(crate) task: JoinHandle<()>,
 }
 
 pub(crate) async fn run(app: App) -> Running {
@@ -189,11 +189,7 @@ pub(crate) async fn run(app: App) -> Running {
 impl Running {
     pub(crate) async fn stop(self) {
         let _ = self.shutdown.send(());
-        tokio::time::timeout(PATIENCE, self.task)
-            .await
-            .unwrap()
-            .unwrap()
-            .unwrap();
+        tokio::time::timeout(PATIENCE, self.task).await.unwrap().unwrap();
     }
 }
 

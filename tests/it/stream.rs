@@ -321,5 +321,5 @@ async fn stopping_ends_streams_with_1001_and_is_not_ready() {
     };
     assert_eq!(close.code, CloseCode::Away);
     assert_eq!(get(&app, "/readyz").await.detail(503), "the server is stopping");
-    tokio::time::timeout(PATIENCE, task).await.unwrap().unwrap().unwrap();
+    tokio::time::timeout(PATIENCE, task).await.unwrap().unwrap();
 }

@@ -1,0 +1,102 @@
+//! Which versions of the models were published, and which of them serves. The files are in the objects.
+
+use super::database::{Row, Tx};
+use super::jobs::Lease;
+use super::{Store, StoreError};
+
+/// A published version.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VersionRow {
+    /// The model's name.
+    pub model: String,
+    /// Counts the publications of the name.
+    pub version: u32,
+    /// When it was published, in seconds since 1970.
+    pub published_s: f64,
+}
+
+fn version_of(row: &Row) -> Result<u32, StoreError> {
+    let version: i64 = row.get("version")?;
+    u32::try_from(version).map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
+}
+
+impl Store {
+    /// The version that a job is to publish: the next of the name above `shipped`; asked again, the same.
+    /// `None` if the lease is lost. Errors: `Query`.
+    pub async fn reserve_version(&self, lease: Lease, model: &str, shipped: u32) -> Result<Option<u32>, StoreError> {
+        let mut tx = self.database.begin().await?;
+        // Held until the commit, so that two jobs never reserve one number.
+        let sql = "UPDATE counters SET value = value WHERE name = 'job' \
+             AND EXISTS (SELECT 1 FROM jobs WHERE number = $1 AND token = $2 AND state = 'running')";
+        if tx.execute(sql, vec![lease.number.into(), lease.token.into()]).await? == 0 {
+            return Ok(None);
+        }
+        let sql = "SELECT version FROM model_versions WHERE job = $1";
+        if let Some(row) = tx.fetch(sql, vec![lease.number.into()]).await?.first() {
+            return version_of(row).map(Some);
+        }
+        let sql = "INSERT INTO model_versions (model, version, job) \
+             SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1, $3 \
+             FROM model_versions WHERE model = $1 RETURNING version";
+        let values = vec![model.into(), shipped.into(), lease.number.into()];
+        let rows = tx.fetch(sql, values).await?;
+        tx.commit().await?;
+        rows.first().map(version_of).transpose()
+    }
+
+    /// Every version that was published and not deleted, by name and number. Errors: `Query`.
+    pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
+        let sql = "SELECT model, version, published_s FROM model_versions \
+             WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
+        let rows = self.database.fetch(sql, vec![]).await?;
+        let version = |row: &Row| {
+            Ok(VersionRow {
+                model: row.get("model")?,
+                version: version_of(row)?,
+                published_s: row.get("published_s")?,
+            })
+        };
+        rows.iter().map(version).collect()
+    }
+
+    /// The name and version of every model of which one was chosen to serve. Errors: `Query`.
+    pub async fn active_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
+        let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;
+        rows.iter()
+            .map(|row| Ok((row.get("model")?, version_of(row)?)))
+            .collect()
+    }
+
+    /// Has a version serve from now on. Errors: `Query`.
+    pub async fn set_active(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
+        let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
+             ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s";
+        let values = vec![model.into(), version.into(), now_s.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
+    /// Deletes a version unless it serves; says whether it did. Errors: `Query`.
+    pub async fn delete_version(&self, model: &str, version: u32, now_s: f64) -> Result<bool, StoreError> {
+        let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
+             AND published_s IS NOT NULL AND deleted_s IS NULL \
+             AND NOT EXISTS (SELECT 1 FROM active_versions WHERE model = $1 AND version = $2)";
+        let values = vec![model.into(), version.into(), now_s.into()];
+        Ok(self.database.execute(sql, values).await? > 0)
+    }
+}
+
+pub(super) async fn write_published(
+    tx: &mut Tx,
+    (model, version): (&str, u32),
+    activates: bool,
+    now_s: f64,
+) -> Result<(), StoreError> {
+    let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
+    let values = || vec![model.into(), version.into(), now_s.into()];
+    tx.execute(sql, values()).await?;
+    if activates {
+        let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
+        tx.execute(sql, values()).await?;
+    }
+    Ok(())
+}

@@ -1,0 +1,80 @@
+//! The recorder of all metrics and its text for Prometheus. One a process, as the `metrics` crate has it.
+
+use std::fs;
+use std::sync::OnceLock;
+use std::time::SystemTime;
+
+use metrics::gauge;
+use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
+use tracing::error;
+
+use super::names;
+
+/// From half a millisecond, a small model's time, to the longest deadline there should be.
+const SECONDS: [f64; 16] = [
+    0.0005, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0,
+];
+const BATCH_SIZES: [f64; 10] = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 1024.0];
+
+static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
+
+/// Starts recording; what is recorded before is lost. A second call changes nothing.
+pub fn record() {
+    HANDLE.get_or_init(|| match install() {
+        Ok(handle) => Some(handle),
+        Err(error) => {
+            error!(%error, "metrics cannot be recorded");
+            None
+        }
+    });
+}
+
+fn install() -> Result<PrometheusHandle, BuildError> {
+    let handle = PrometheusBuilder::new()
+        .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &SECONDS)?
+        .set_buckets_for_metric(Matcher::Full(names::PREDICTION_BATCH_SIZE.to_owned()), &BATCH_SIZES)?
+        .install_recorder()?;
+    names::describe();
+    let commit = env!("FOREFRAME_GIT_COMMIT");
+    gauge!(names::BUILD_INFO, "version" => env!("CARGO_PKG_VERSION"), "commit" => commit).set(1.0);
+    let started = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    gauge!(names::PROCESS_START_SECONDS).set(started.unwrap_or_default().as_secs_f64());
+    Ok(handle)
+}
+
+/// All metrics in Prometheus' text format; empty before [`record`].
+#[must_use]
+pub fn render() -> String {
+    let Some(Some(handle)) = HANDLE.get() else {
+        return String::new();
+    };
+    measure_process();
+    handle.run_upkeep();
+    handle.render()
+}
+
+/// Folds what histograms have gathered into their buckets, so that their memory is bounded where nobody reads them.
+pub fn fold() {
+    if let Some(Some(handle)) = HANDLE.get() {
+        handle.run_upkeep();
+    }
+}
+
+/// Where there is no `/proc`, nothing is measured.
+fn measure_process() {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let field = |name: &str| -> Option<f64> {
+        let line = status.lines().find_map(|line| line.strip_prefix(name))?;
+        line.split_whitespace().next()?.parse().ok()
+    };
+    if let Some(kib) = field("VmRSS:") {
+        gauge!(names::PROCESS_RESIDENT_BYTES).set(kib * 1024.0);
+    }
+    if let Some(threads) = field("Threads:") {
+        gauge!(names::PROCESS_THREADS).set(threads);
+    }
+    if let Ok(open) = fs::read_dir("/proc/self/fd") {
+        // The listing itself holds one.
+        gauge!(names::PROCESS_OPEN_FDS).set(open.count().saturating_sub(1) as f64);
+    }
+}

@@ -1,0 +1,149 @@
+//! The configuration: what goes over what, where values come from, and how wrong ones are refused.
+
+use foreframe::config::{Config, ConfigError, Layer, Loaded};
+use foreframe::telemetry::LogFormat;
+
+fn environment(variables: &[(&str, &str)]) -> Vec<Layer> {
+    let owned = variables
+        .iter()
+        .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()));
+    Layer::environment(owned).collect()
+}
+
+fn file(text: &str) -> Layer {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("mine.toml");
+    std::fs::write(&path, text).unwrap();
+    Layer::file(&path).unwrap()
+}
+
+fn refused(layers: Vec<Layer>) -> String {
+    Loaded::from_layers(layers).unwrap_err().to_string()
+}
+
+#[test]
+fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
+    let layers = [file("max_streams = 1\nmax_frames = 1\nmax_batch = 1")]
+        .into_iter()
+        .chain(environment(&[
+            ("FOREFRAME_MAX_STREAMS", "2"),
+            ("FOREFRAME_MAX_FRAMES", "2"),
+        ]))
+        .chain([Layer::setting("max_streams=3").unwrap()]);
+    let loaded = Loaded::from_layers(layers).unwrap();
+    let limits = &loaded.config.server;
+    assert_eq!((limits.max_streams, limits.max_frames, limits.max_batch), (3, 2, 1));
+    let text = loaded.to_toml();
+    for line in [
+        "max_streams = 3  # --set; 1 to 1000000",
+        "max_frames = 2  # environment FOREFRAME_MAX_FRAMES; 1 to 4096",
+        "bind = \"127.0.0.1:8642\"  # default",
+        "# database_url is not set",
+    ] {
+        assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");
+    }
+    assert!(text.contains("mine.toml; 1 to 4096"), "{text}");
+}
+
+#[test]
+fn what_is_printed_can_be_read_as_a_file() {
+    let settings = [
+        "drain_ms=5",
+        "cors_origins=[\"http://a\"]",
+        "log_format=json",
+        "models_dir=m",
+    ];
+    let settings = settings.map(|setting| Layer::setting(setting).unwrap());
+    let printed = Loaded::from_layers(settings).unwrap();
+    let read = Loaded::from_layers([file(&printed.to_toml())]).unwrap();
+    assert_eq!(read.config, printed.config);
+    assert_eq!(read.config.log_format, LogFormat::Json);
+    assert_eq!(read.config.server.cors_origins, ["http://a"]);
+}
+
+#[test]
+fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
+    let defaults = Config::default().server;
+    for (field, value, range) in defaults.bounds() {
+        let setting = Layer::setting(&format!("{field}={value}")).unwrap();
+        assert_eq!(
+            Loaded::from_layers([setting]).unwrap().config.server,
+            defaults,
+            "{field}"
+        );
+        let too_much = range.end() + 1;
+        let message = refused(environment(&[(
+            &format!("FOREFRAME_{}", field.to_uppercase()),
+            &too_much.to_string(),
+        )]));
+        let (least, most) = (range.start(), range.end());
+        assert!(
+            message.starts_with(&format!("{field} is {too_much} (environment FOREFRAME_")),
+            "{message}"
+        );
+        assert!(message.ends_with(&format!("it must be {least} to {most}")), "{message}");
+    }
+}
+
+#[test]
+fn what_is_no_setting_is_refused_with_where_it_was_given() {
+    let set = |setting| vec![Layer::setting(setting).unwrap()];
+    for (layers, expected) in [
+        (
+            environment(&[("FOREFRAME_MAX_STREAM", "2")]),
+            "max_stream (environment FOREFRAME_MAX_STREAM) is no field of the configuration; foreframe config prints all \
+             of them",
+        ),
+        (
+            set("max_streams=many"),
+            "max_streams is \"many\" (--set); it must be 1 to 1000000",
+        ),
+        (
+            set("max_streams=-1"),
+            "max_streams is -1 (--set); it must be 1 to 1000000",
+        ),
+        (
+            set("bind=here"),
+            "bind is \"here\" (--set); it must be ADDRESS:PORT, as in 127.0.0.1:8642",
+        ),
+        (
+            set("log_format=xml"),
+            "log_format is \"xml\" (--set); it must be text or json",
+        ),
+        (set("insecure=2"), "insecure is 2 (--set); it must be a boolean"),
+    ] {
+        assert_eq!(refused(layers), expected);
+    }
+    assert!(matches!(Layer::setting("max_streams"), Err(ConfigError::Setting(_))));
+    let dir = tempfile::tempdir().unwrap();
+    assert!(matches!(
+        Layer::file(&dir.path().join("none")),
+        Err(ConfigError::Read { .. })
+    ));
+    std::fs::write(dir.path().join("bad"), "a = = 1").unwrap();
+    assert!(matches!(
+        Layer::file(&dir.path().join("bad")),
+        Err(ConfigError::Toml { .. })
+    ));
+}
+
+#[test]
+fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
+    let variables = [
+        ("FOREFRAME_DATABASE_URL", ""),
+        ("FOREFRAME_TEST_POSTGRES", "x"),
+        ("HOME", "/"),
+    ];
+    let loaded = Loaded::from_layers(environment(&variables)).unwrap();
+    assert_eq!(loaded.config, Config::default());
+}
+
+#[test]
+fn a_password_is_not_printed() {
+    let url = "database_url=postgres://ada:secret@db/foreframe";
+    let text = Loaded::from_layers([Layer::setting(url).unwrap()]).unwrap().to_toml();
+    assert!(
+        text.contains("postgres://ada:***@db/foreframe") && !text.contains("secret"),
+        "{text}"
+    );
+}

@@ -1,0 +1,221 @@
+//! What happens to connections that are slow, silent, foreign, or open while the server stops.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use axum::body::Body;
+use axum::http::{Request, header};
+use foreframe::server::ServerConfig;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+
+use crate::service::{PATIENCE, Running, app, get, run, send};
+
+const ASK: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
+
+async fn running(config: ServerConfig) -> (tempfile::TempDir, Running) {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), config)).await;
+    (dir, server)
+}
+
+async fn connect(address: SocketAddr) -> TcpStream {
+    TcpStream::connect(address).await.unwrap()
+}
+
+/// Reads until the server closes.
+async fn rest(client: &mut TcpStream) -> String {
+    let mut text = Vec::new();
+    // A reset is an end as well.
+    let _ = tokio::time::timeout(PATIENCE, client.read_to_end(&mut text))
+        .await
+        .unwrap();
+    String::from_utf8_lossy(&text).into_owned()
+}
+
+async fn answer(client: &mut TcpStream) -> String {
+    let mut text = String::new();
+    while !text.contains("\r\n\r\n{") || !text.ends_with('}') {
+        let mut byte = [0; 256];
+        let count = tokio::time::timeout(PATIENCE, client.read(&mut byte))
+            .await
+            .unwrap()
+            .unwrap();
+        assert!(count > 0, "the connection ended after: {text}");
+        text += std::str::from_utf8(&byte[..count]).unwrap();
+    }
+    text
+}
+
+#[tokio::test]
+async fn headers_that_come_too_slowly_are_cut_off() {
+    let (_dir, server) = running(ServerConfig {
+        header_read_ms: 100,
+        ..ServerConfig::default()
+    })
+    .await;
+    let mut silent = connect(server.address).await;
+    let mut slow = connect(server.address).await;
+    let dribble = async {
+        // A byte now and then does not put the end off.
+        for byte in ASK.iter().cycle() {
+            if slow.write_all(&[*byte | 0x40]).await.is_err() {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, dribble).await.unwrap();
+    assert!(!rest(&mut silent).await.contains("200"));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_idle_connection_is_closed_after_its_answers() {
+    let (_dir, server) = running(ServerConfig {
+        header_read_ms: 200,
+        ..ServerConfig::default()
+    })
+    .await;
+    let mut client = connect(server.address).await;
+    for _ in 0..2 {
+        client.write_all(ASK).await.unwrap();
+        assert!(answer(&mut client).await.starts_with("HTTP/1.1 200"));
+    }
+    let idle = Instant::now();
+    assert_eq!(rest(&mut client).await, "");
+    assert!(idle.elapsed() >= Duration::from_millis(150));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_head_over_its_limit_is_refused() {
+    let (_dir, server) = running(ServerConfig {
+        max_header_bytes: 8192,
+        ..ServerConfig::default()
+    })
+    .await;
+    let mut client = connect(server.address).await;
+    let head = format!("GET /livez HTTP/1.1\r\nhost: a\r\nx: {}\r\n\r\n", "y".repeat(9000));
+    client.write_all(head.as_bytes()).await.unwrap();
+    assert!(rest(&mut client).await.starts_with("HTTP/1.1 431"));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_client_that_reads_nothing_loses_its_connection() {
+    let (_dir, server) = running(ServerConfig {
+        write_stall_ms: 100,
+        ..ServerConfig::default()
+    })
+    .await;
+    let mut client = connect(server.address).await;
+    // Until both sides' buffers are full of answers that nobody reads.
+    let contract = b"GET /openapi.json HTTP/1.1\r\nhost: a\r\n\r\n".repeat(500);
+    let flood = async { while client.write_all(&contract).await.is_ok() {} };
+    tokio::time::timeout(PATIENCE, flood).await.unwrap();
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_stopping_server_is_not_ready_first_and_answers_while_it_drains() {
+    let (_dir, server) = running(ServerConfig {
+        drain_ms: 2_000,
+        ..ServerConfig::default()
+    })
+    .await;
+    let mut old = connect(server.address).await;
+    old.write_all(ASK).await.unwrap();
+    assert!(!answer(&mut old).await.contains("connection: close"));
+    server.shutdown.send(()).unwrap();
+    let refusal = loop {
+        let mut fresh = connect(server.address).await;
+        fresh
+            .write_all(b"GET /readyz HTTP/1.1\r\nhost: a\r\n\r\n")
+            .await
+            .unwrap();
+        let text = answer(&mut fresh).await;
+        if text.contains("the server is stopping") {
+            break text;
+        }
+    };
+    assert!(refusal.starts_with("HTTP/1.1 503"), "{refusal}");
+    old.write_all(ASK).await.unwrap();
+    let last = answer(&mut old).await;
+    assert!(
+        last.starts_with("HTTP/1.1 200") && last.contains("connection: close"),
+        "{last}"
+    );
+    tokio::time::timeout(PATIENCE, server.task).await.unwrap().unwrap();
+    assert!(TcpStream::connect(server.address).await.is_err());
+}
+
+#[tokio::test]
+async fn an_encoded_body_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let bomb = Request::post("/v1/models/plain/predict")
+        .header(header::CONTENT_TYPE, "application/json")
+        .header(header::CONTENT_ENCODING, "gzip")
+        .body(Body::from(vec![0x1f, 0x8b]))
+        .unwrap();
+    assert!(send(&app, bomb).await.detail(415).contains("Content-Encoding"));
+}
+
+#[tokio::test]
+async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        cors_origins: vec!["https://robots.example".to_owned()],
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let from = |method: &str, origin: &str| {
+        Request::builder()
+            .method(method)
+            .uri("/v1/models")
+            .header(header::HOST, "127.0.0.1:8642")
+            .header(header::ORIGIN, origin)
+            .body(Body::empty())
+            .unwrap()
+    };
+    let foreign = send(&app, from("GET", "https://evil.example")).await;
+    assert!(foreign.detail(403).contains("cors_origins"));
+    assert!(!foreign.headers.contains_key(header::ACCESS_CONTROL_ALLOW_ORIGIN));
+    let own = send(&app, from("GET", "http://127.0.0.1:8642")).await;
+    assert_eq!(own.status, 200);
+    assert!(!own.headers.contains_key(header::ACCESS_CONTROL_ALLOW_ORIGIN));
+    let named = send(&app, from("GET", "https://robots.example")).await;
+    assert_eq!(
+        (named.status.as_u16(), &named.headers[header::VARY]),
+        (200, &header::HeaderValue::from_static("origin"))
+    );
+    assert_eq!(
+        named.headers[header::ACCESS_CONTROL_ALLOW_ORIGIN],
+        "https://robots.example"
+    );
+    let question = send(&app, from("OPTIONS", "https://robots.example")).await;
+    assert_eq!(question.status, 204);
+    assert!(question.headers.contains_key(header::ACCESS_CONTROL_ALLOW_HEADERS));
+}
+
+#[tokio::test]
+async fn the_contract_can_be_browsed_without_the_internet() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    assert_eq!(get(&app, "/docs").await.headers[header::LOCATION], "/docs/");
+    let page = String::from_utf8(get(&app, "/docs/").await.body).unwrap();
+    for part in page.split(['"', '\'']).filter(|part| part.starts_with("./")) {
+        let asset = get(&app, &format!("/docs/{}", &part[2..])).await;
+        assert!(asset.status == 200 && !asset.body.is_empty(), "{part}");
+        let text = String::from_utf8_lossy(&asset.body);
+        assert!(
+            !part.ends_with("initializer.js") || text.contains("/openapi.json"),
+            "{text}"
+        );
+    }
+    assert!(
+        page.contains("./swagger-ui-bundle.js") && !page.contains("https://"),
+        "{page}"
+    );
+}

@@ -1,0 +1,299 @@
+//! The real program: what it says on the command line, and how it ends.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use foreframe::nn::Conditioning;
+use serde_json::{Value, json};
+
+use crate::service::{PATIENCE, context, model, slow_spec, spec};
+
+fn foreframe(dir: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
+    command.current_dir(dir);
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("FOREFRAME_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+fn output(dir: &Path, arguments: &[&str]) -> Output {
+    foreframe(dir).args(arguments).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// A running server; killed when a test ends before it.
+struct Served {
+    child: Child,
+    address: SocketAddr,
+}
+
+impl Served {
+    fn start(dir: &Path, arguments: &[&str]) -> Self {
+        let mut child = foreframe(dir)
+            .args(["serve", "--bind", "127.0.0.1:0"])
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.as_mut().unwrap())
+            .read_line(&mut line)
+            .unwrap();
+        let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
+        let served = Self {
+            address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
+            child,
+        };
+        let deadline = Instant::now() + PATIENCE;
+        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
+            assert!(Instant::now() < deadline, "the server did not get ready");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        served
+    }
+
+    fn get(&self, path: &str) -> String {
+        let mut stream = TcpStream::connect(self.address).unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\nhost: a\r\nconnection: close\r\n\r\n").unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        answer
+    }
+
+    fn terminate(&self) {
+        let kill = Command::new("kill")
+            .args(["-TERM", &self.child.id().to_string()])
+            .status();
+        assert!(kill.unwrap().success());
+    }
+
+    /// Waits for the end; gives its log.
+    fn ended(mut self) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(Instant::now() < deadline, "the server did not end");
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        let mut log = String::new();
+        self.child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        assert!(status.success(), "{status}: {log}");
+        log
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        // It has ended already in a test that passes.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
+fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
+    let head = format!(
+        "POST /v1/models/slow/predict HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\nexpect: 100-continue\r\n\
+         content-length: {}\r\n\r\n",
+        body.len()
+    );
+    while let Ok(mut stream) = TcpStream::connect(address) {
+        loop {
+            let mut go_on = [0; 25];
+            if stream.write_all(head.as_bytes()).is_err() || stream.read_exact(&mut go_on).is_err() {
+                break;
+            }
+            assert_eq!(&go_on, b"HTTP/1.1 100 Continue\r\n\r\n");
+            accepted.fetch_add(1, Ordering::Relaxed);
+            stream.write_all(body.as_bytes()).unwrap();
+            if !is_whole_answer(&mut stream) {
+                break;
+            }
+            answered.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+fn is_whole_answer(stream: &mut TcpStream) -> bool {
+    let mut reader = BufReader::new(stream);
+    let (mut line, mut length, mut is_status) = (String::new(), 0, true);
+    while line != "\r\n" {
+        line.clear();
+        if reader.read_line(&mut line).unwrap_or(0) == 0 {
+            return false;
+        }
+        assert!(!is_status || line.contains(" 200 ") || line.contains(" 503 "), "{line}");
+        is_status = false;
+        if let Some(bytes) = line.strip_prefix("content-length: ") {
+            length = bytes.trim().parse().unwrap();
+        }
+    }
+    reader.read_exact(&mut vec![0; length]).is_ok()
+}
+
+#[test]
+fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
+    let dir = tempfile::tempdir().unwrap();
+    model(&dir.path().join("models"), "slow", slow_spec());
+    let served = Served::start(
+        dir.path(),
+        &["--set", "drain_ms=300", "--set", "shutdown_deadline_ms=20000"],
+    );
+    let body = json!({"frames": context()}).to_string();
+    let (accepted, answered) = (AtomicUsize::new(0), AtomicUsize::new(0));
+    let address = served.address;
+    let told = std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| ask_until_refused(address, &body, &accepted, &answered));
+        }
+        while answered.load(Ordering::Relaxed) < 40 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        served.terminate();
+        Instant::now()
+    });
+    let log = served.ended();
+    assert!(told.elapsed() < Duration::from_secs(20), "{log}");
+    assert_eq!(
+        accepted.load(Ordering::Relaxed),
+        answered.load(Ordering::Relaxed),
+        "{log}"
+    );
+    assert!(log.contains("stopped") && !log.contains("deadline"), "{log}");
+}
+
+#[test]
+fn the_metrics_count_what_was_asked_by_route_and_not_by_path() {
+    let dir = tempfile::tempdir().unwrap();
+    model(&dir.path().join("models"), "plain", spec(Conditioning::None));
+    let served = Served::start(dir.path(), &["--log-format", "json"]);
+    for name in ["plain", "a", "b"] {
+        served.get(&format!("/v1/models/{name}"));
+    }
+    served.get("/nothing");
+    let body = json!({"frames": context()}).to_string();
+    let mut stream = TcpStream::connect(served.address).unwrap();
+    write!(
+        stream,
+        "POST /v1/models/plain/predict HTTP/1.1\r\nhost: a\r\nconnection: close\r\ncontent-type: application/json\r\n\
+         content-length: {}\r\n\r\n{body}",
+        body.len()
+    )
+    .unwrap();
+    stream.read_to_end(&mut Vec::new()).unwrap();
+    let metrics = served.get("/metrics");
+    for line in [
+        "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"200\"} 1",
+        "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"404\"} 2",
+        "foreframe_http_requests_total{method=\"GET\",route=\"none\",status=\"404\"} 1",
+        "foreframe_http_request_duration_seconds_count{route=\"/v1/models/{model}/predict\"} 1",
+        "foreframe_prediction_batch_size_sum{model=\"plain\"} 1",
+        "foreframe_prediction_queue_wait_seconds_count{model=\"plain\"} 1",
+        "foreframe_prediction_compute_seconds_count{model=\"plain\"} 1",
+        "foreframe_jobs{state=\"running\"} 0",
+        "foreframe_streams_active 0",
+        "foreframe_models_loaded 1",
+        "# TYPE process_resident_memory_bytes gauge",
+    ] {
+        assert!(
+            metrics.lines().any(|found| found == line),
+            "{line} is not in\n{metrics}"
+        );
+    }
+    assert!(
+        !metrics.contains("/v1/models/a") && !metrics.contains("/nothing"),
+        "{metrics}"
+    );
+    served.terminate();
+    let log = served.ended();
+    for line in log.lines() {
+        let entry: Value = serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"));
+        assert!(entry["level"].is_string() && entry["timestamp"].is_string(), "{line}");
+    }
+}
+
+#[test]
+fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = Served::start(dir.path(), &[]);
+    let bind = served.address.to_string();
+    let ready = output(dir.path(), &["healthcheck", "--bind", &bind]);
+    assert!(ready.status.success(), "{}", text(&ready.stderr));
+    let elsewhere = format!("http://{bind}/nothing");
+    let lost = output(dir.path(), &["healthcheck", "--url", &elsewhere]);
+    assert_eq!(
+        (lost.status.code(), text(&lost.stderr).contains("404")),
+        (Some(1), true)
+    );
+    served.terminate();
+    served.ended();
+    assert_eq!(
+        output(dir.path(), &["healthcheck", "--bind", &bind]).status.code(),
+        Some(1)
+    );
+}
+
+#[test]
+fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let refused = output(dir.path(), &["serve", "--bind", "0.0.0.0:0"]);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(
+        text(&refused.stderr).contains("foreframe keys create NAME"),
+        "{}",
+        text(&refused.stderr)
+    );
+    let key = text(&output(dir.path(), &["keys", "create", "robot 7"]).stdout);
+    let key = key.trim();
+    let listed = text(&output(dir.path(), &["keys", "list"]).stdout);
+    assert!(
+        listed.contains("valid") && listed.contains("robot 7") && !listed.contains(key),
+        "{listed}"
+    );
+    let served = Served::start(dir.path(), &[]);
+    assert!(served.get("/v1/models").starts_with("HTTP/1.1 401"));
+    let with_key = format!("/v1/models HTTP/1.1\r\nauthorization: Bearer {key}\r\nx:");
+    assert!(served.get(&with_key).starts_with("HTTP/1.1 200"));
+    let id = listed.split_whitespace().next().unwrap();
+    assert!(output(dir.path(), &["keys", "revoke", id]).status.success());
+    assert_eq!(output(dir.path(), &["keys", "revoke", id]).status.code(), Some(2));
+    served.terminate();
+    served.ended();
+}
+
+#[test]
+fn the_configuration_is_printed_with_where_it_comes_from() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();
+    let printed = foreframe(dir.path())
+        .args(["config", "--data-dir", "here"])
+        .env("FOREFRAME_MAX_BATCH", "9")
+        .output()
+        .unwrap();
+    let printed = text(&printed.stdout);
+    for line in [
+        "max_streams = 7  # foreframe.toml; 1 to 1000000",
+        "max_batch = 9  # environment FOREFRAME_MAX_BATCH; 1 to 4096",
+        "data_dir = \"here\"  # --data-dir",
+    ] {
+        assert!(
+            printed.lines().any(|found| found == line),
+            "{line} is not in\n{printed}"
+        );
+    }
+    std::fs::write(dir.path().join("foreframe.toml"), "max_stream = 7\n").unwrap();
+    let refused = output(dir.path(), &["serve"]);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(text(&refused.stderr).contains("max_stream (foreframe.toml) is no field"));
+}
