@@ -143,11 +143,10 @@ impl Loaded {
         let default = Path::new(DEFAULT_FILE);
         let file = file.or_else(|| default.is_file().then_some(default));
         let file = file.map(Layer::file).transpose()?;
-        Self::from_layers(
-            file.into_iter()
-                .chain(Layer::environment(std::env::vars()))
-                .chain(flags),
-        )
+        // A variable that is no text is none of ours.
+        let variables = std::env::vars_os();
+        let texts = variables.filter_map(|(name, text)| Some((name.into_string().ok()?, text.into_string().ok()?)));
+        Self::from_layers(file.into_iter().chain(Layer::environment(texts)).chain(flags))
     }
 
     /// The defaults under the layers, later ones over earlier ones. Errors: `Unknown`, `Type`, `Range`.

@@ -85,7 +85,7 @@ const GRACE: Duration = Duration::from_millis(200);
 #[derive(Clone)]
 pub struct App {
     shared: Arc<Shared>,
-    keys: Arc<Keys>,
+    keys: Keys,
 }
 
 struct Shared {
@@ -129,17 +129,14 @@ impl App {
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
-            keys: Arc::new(Keys::open()),
+            keys: Keys::open(),
         }
     }
 
     /// The same with these keys; without, everybody may call.
     #[must_use]
     pub fn with_keys(self, keys: Keys) -> Self {
-        Self {
-            keys: Arc::new(keys),
-            ..self
-        }
+        Self { keys, ..self }
     }
 
     /// The predictor.
@@ -240,6 +237,7 @@ pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output
     tokio::select! {
         never = connections.accept(&listener) => match never {},
         never = metrics::keep_folded() => match never {},
+        never = app.keys().keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
         () = shutdown => {}
     }
     info!("stopping");
@@ -261,9 +259,10 @@ pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output
         app.predictor().stop();
         ended
     });
-    match timeout_at((deadline + GRACE).into(), ended).await {
-        Ok(Ok(true)) => info!("stopped"),
-        _ => warn!("a computation did not end within the deadline"),
+    if let Ok(Ok(true)) = timeout_at((deadline + GRACE).into(), ended).await {
+        info!("stopped");
+    } else {
+        warn!("a computation did not end within the deadline");
     }
 }
 

@@ -5,8 +5,8 @@ use super::{CliError, say};
 
 /// Print every setting with where it comes from, and its range.
 ///
-/// The output is a configuration file: edit it and pass it with --config. Flags go over the environment (FOREFRAME_BIND,
-/// FOREFRAME_MAX_STREAMS, …), that over the file, that over the defaults. Passwords in URLs are masked.
+/// The output is a configuration file: edit it and pass it with --config. Flags go over the environment (`FOREFRAME_BIND`,
+/// `FOREFRAME_MAX_STREAMS`, …), that over the file, that over the defaults. Passwords in URLs are masked.
 #[derive(clap::Args)]
 #[command(after_help = "Example: FOREFRAME_MAX_STREAMS=8 foreframe config --set drain_ms=2000 > foreframe.toml")]
 pub(super) struct Args {

@@ -1,7 +1,5 @@
 //! `foreframe serve`
 
-use std::time::Duration;
-
 use tokio::net::TcpListener;
 use tracing::info;
 
@@ -10,7 +8,6 @@ use super::{CliError, say};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App};
-use crate::store::Store;
 use crate::{serving, telemetry};
 
 /// Serve models over HTTP and WebSocket.
@@ -40,8 +37,7 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config) -> Result<(), CliError> {
-    let store = open_store(&config).await?;
-    let keys = keys(&config, store).await?;
+    let keys = keys(&config).await?;
     let published = config.server.data_dir.join("models");
     let models = serving::load_models(&[config.models_dir.as_path(), published.as_path()])?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
@@ -67,11 +63,10 @@ async fn listen(config: Config) -> Result<(), CliError> {
 }
 
 /// Who may call. Errors: `Usage` if other machines can, and there is no key to ask them for.
-async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
+async fn keys(config: &Config) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
-    let mut valid = store.list_keys().await?;
-    valid.retain(|key| key.revoked_s.is_none());
-    if is_required && valid.is_empty() {
+    let keys = Keys::of(open_store(config).await?, is_required).await?;
+    if is_required && keys.count() == 0 {
         return Err(CliError::Usage(format!(
             "{} can be reached from other machines and there is no key to ask for; make one by foreframe keys create \
              NAME, bind a loopback address, or say --insecure",
@@ -79,12 +74,8 @@ async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
         )));
     }
     info!(
-        keys = valid.len(),
+        keys = keys.count(),
         "whoever has a key may call; without keys, everybody"
     );
-    Ok(Keys::of(
-        store,
-        is_required,
-        Duration::from_millis(config.server.key_cache_ms),
-    ))
+    Ok(keys)
 }

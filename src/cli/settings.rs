@@ -16,16 +16,16 @@ pub(super) struct StoreSettings {
     /// Where jobs keep data sets, runs and the models they train [default: data]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
-    /// postgres://USER:PASSWORD@HOST/NAME, to share jobs and keys with other servers [default: SQLite in the data directory]
+    /// Rows, to share them with other servers: PostgreSQL's URL [default: SQLite in the data directory]
     #[arg(long, value_name = "URL")]
     database_url: Option<String>,
-    /// s3://BUCKET/PREFIX, to share data sets and models with other servers [default: the data directory]
+    /// Files, to share them with other servers: an S3 bucket's URL [default: the data directory]
     #[arg(long, value_name = "URL")]
     objects_url: Option<String>,
     /// How log lines look: text or json [default: text]
     #[arg(long, value_name = "FORMAT")]
     log_format: Option<String>,
-    /// Any other setting, as in max_streams=64; may be given many times
+    /// Any other setting, as in `max_streams=64`; may be given many times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
 }

@@ -55,8 +55,8 @@ pub struct ServerConfig {
     pub drain_ms: u64,
     /// How long stopping may take, draining and all, in milliseconds.
     pub shutdown_deadline_ms: u64,
-    /// How long a revoked key may still be taken, in milliseconds.
-    pub key_cache_ms: u64,
+    /// How often keys are read: how long a revoked one may still be taken, in milliseconds.
+    pub key_refresh_ms: u64,
     /// Origins of other pages whose scripts may call this server, for example `https://robots.example`.
     pub cors_origins: Vec<String>,
 }
@@ -87,7 +87,7 @@ impl Default for ServerConfig {
             write_stall_ms: 30_000,
             drain_ms: 0,
             shutdown_deadline_ms: 10_000,
-            key_cache_ms: 5_000,
+            key_refresh_ms: 5_000,
             cors_origins: Vec::new(),
         }
     }
@@ -145,7 +145,7 @@ impl ServerConfig {
             ("write_stall_ms", self.write_stall_ms, deadline.clone()),
             ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadline),
             ("drain_ms", self.drain_ms, 0..=self.shutdown_deadline_ms),
-            ("key_cache_ms", self.key_cache_ms, 0..=MAX_DEADLINE_MS),
+            ("key_refresh_ms", self.key_refresh_ms, 100..=MAX_DEADLINE_MS),
         ]
     }
 

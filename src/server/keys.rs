@@ -1,7 +1,9 @@
 //! API keys: how they are made, and who may call.
 
 use std::collections::HashMap;
-use std::time::{Duration, Instant};
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use argon2::password_hash::phc::PasswordHash;
 use argon2::{Argon2, PasswordHasher as _, PasswordVerifier as _};
@@ -13,12 +15,11 @@ use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use metrics::counter;
 use sha2::{Digest as _, Sha256};
-use tokio::sync::Mutex;
 use tracing::warn;
 
 use super::error::ApiError;
 use super::{App, blocking};
-use crate::store::{KeyRow, Store};
+use crate::store::{Store, StoreError};
 use crate::telemetry::names;
 
 /// What keys begin with, so that they are recognized where they should not be.
@@ -70,19 +71,24 @@ impl NewKey {
     }
 }
 
-/// Who may call.
+/// Who may call; clones are the same.
+#[derive(Clone)]
 pub struct Keys {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
     store: Option<Store>,
     is_required: bool,
-    fresh_for: Duration,
     known: Mutex<Known>,
+    /// Slow hashes are computed one at a time, so that wrong keys cannot take all cores.
+    verifying: tokio::sync::Mutex<()>,
 }
 
 #[derive(Default)]
 struct Known {
-    read: Option<Instant>,
-    /// Those that are not revoked, by id.
-    rows: HashMap<String, KeyRow>,
+    /// Hashes of the keys that are not revoked, by id.
+    hashes: HashMap<String, String>,
     /// Keys that were checked against their hash, as their SHA-256: the slow hash is computed once a key.
     verified: HashMap<[u8; 32], String>,
 }
@@ -91,71 +97,88 @@ impl Keys {
     /// Everybody may.
     #[must_use]
     pub fn open() -> Self {
+        Self::with(None, false)
+    }
+
+    /// Whoever has a key of the store may; everybody while there is none, unless `is_required`. Errors: `Query`.
+    pub async fn of(store: Store, is_required: bool) -> Result<Self, StoreError> {
+        let keys = Self::with(Some(store), is_required);
+        keys.refresh().await?;
+        Ok(keys)
+    }
+
+    fn with(store: Option<Store>, is_required: bool) -> Self {
         Self {
-            store: None,
-            is_required: false,
-            fresh_for: Duration::ZERO,
-            known: Mutex::default(),
+            shared: Arc::new(Shared {
+                store,
+                is_required,
+                known: Mutex::default(),
+                verifying: tokio::sync::Mutex::default(),
+            }),
         }
     }
 
-    /// Whoever has a key of the store; everybody while there is none, unless `is_required`. The store is asked anew after
-    /// `fresh_for`.
+    /// How many are valid.
     #[must_use]
-    pub fn of(store: Store, is_required: bool, fresh_for: Duration) -> Self {
-        Self {
-            store: Some(store),
-            is_required,
-            fresh_for,
-            ..Self::open()
+    pub fn count(&self) -> usize {
+        self.known().hashes.len()
+    }
+
+    /// Takes new keys in, and drops revoked ones. Errors: `Query`, and then those known before are still taken.
+    pub async fn refresh(&self) -> Result<(), StoreError> {
+        let Some(store) = &self.shared.store else { return Ok(()) };
+        let rows = store.list_keys().await?.into_iter();
+        let hashes: HashMap<_, _> = rows
+            .filter(|row| row.revoked_s.is_none())
+            .map(|row| (row.id, row.hash))
+            .collect();
+        let mut known = self.known();
+        known.verified.retain(|_, id| hashes.contains_key(id));
+        known.hashes = hashes;
+        Ok(())
+    }
+
+    /// Asks the store again and again, so that no request has to.
+    pub(super) async fn keep_fresh(&self, interval: Duration) -> Infallible {
+        loop {
+            tokio::time::sleep(interval).await;
+            if let Err(error) = self.refresh().await {
+                warn!(%error, "the keys could not be read; those read before are taken");
+            }
         }
     }
 
     async fn check(&self, presented: Option<&str>) -> Result<(), ApiError> {
-        let Some(store) = &self.store else { return Ok(()) };
-        // Held while a key is verified, so that one slow hash is computed at a time.
-        let mut known = self.known.lock().await;
-        known.refresh(store, self.fresh_for).await?;
-        if known.rows.is_empty() && !self.is_required {
+        const UNKNOWN: ApiError = ApiError::Unauthorized("the key is not known here, or was revoked");
+        if self.count() == 0 && !self.shared.is_required {
             return Ok(());
         }
         let key = presented.ok_or(ApiError::Unauthorized(
             "this server asks for a key: send the header Authorization: Bearer KEY; foreframe keys create NAME makes one",
         ))?;
-        known.verify(key).await
-    }
-}
-
-impl Known {
-    async fn refresh(&mut self, store: &Store, fresh_for: Duration) -> Result<(), ApiError> {
-        if self.read.is_some_and(|read| read.elapsed() < fresh_for) {
-            return Ok(());
-        }
-        let rows = store.list_keys().await.map_err(|error| {
-            warn!(%error, "the keys could not be read");
-            ApiError::unavailable("the keys could not be read; try again later")
-        })?;
-        let valid = rows.into_iter().filter(|row| row.revoked_s.is_none());
-        self.rows = valid.map(|row| (row.id.clone(), row)).collect();
-        self.verified.retain(|_, id| self.rows.contains_key(id));
-        self.read = Some(Instant::now());
-        Ok(())
-    }
-
-    async fn verify(&mut self, key: &str) -> Result<(), ApiError> {
-        const UNKNOWN: ApiError = ApiError::Unauthorized("the key is not known here, or was revoked");
         let digest: [u8; 32] = Sha256::digest(key).into();
-        if self.verified.contains_key(&digest) {
+        if self.is_verified(&digest) {
             return Ok(());
         }
         let (id, secret) = parts(key).ok_or(UNKNOWN)?;
-        let row = self.rows.get(id).ok_or(UNKNOWN)?;
-        let (hash, secret) = (row.hash.clone(), secret.to_owned());
-        if !blocking(move || matches(&hash, &secret)).await? {
+        let hash = self.known().hashes.get(id).cloned().ok_or(UNKNOWN)?;
+        let turn = self.shared.verifying.lock().await;
+        let secret = secret.to_owned();
+        // Others with the same key may have waited before this one.
+        if !self.is_verified(&digest) && !blocking(move || matches(&hash, &secret)).await? {
             return Err(UNKNOWN);
         }
-        self.verified.insert(digest, row.id.clone());
+        drop(turn);
+        self.known().verified.insert(digest, id.to_owned());
         Ok(())
+    }
+
+    fn is_verified(&self, digest: &[u8; 32]) -> bool {
+        self.known().verified.contains_key(digest)
+    }
+
+    fn known(&self) -> MutexGuard<'_, Known> {
+        self.shared.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

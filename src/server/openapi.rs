@@ -3,7 +3,8 @@
 use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
-use utoipa::OpenApi;
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::{Modify, OpenApi};
 
 use super::{App, dashboard, environments, error, health, jobs, metrics, models, predict, preview, stream};
 
@@ -36,6 +37,8 @@ use super::{App, dashboard, environments, error, health, jobs, metrics, models, 
         dashboard::page,
     ),
     components(schemas(error::Problem)),
+    modifiers(&Keys),
+    security((), ("key" = [])),
     tags(
         (name = "models", description = "Models and their predictions"),
         (name = "environments", description = "The simulator, with Gymnasium's reset and step"),
@@ -45,6 +48,22 @@ use super::{App, dashboard, environments, error, health, jobs, metrics, models, 
     )
 )]
 struct Contract;
+
+/// How a request shows its key, where one is asked for; without a valid one the answer is 401.
+struct Keys;
+
+impl Modify for Keys {
+    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
+        let scheme = HttpBuilder::new()
+            .scheme(HttpAuthScheme::Bearer)
+            .description(Some(
+                "A key of this server, as `foreframe keys create` prints it; without a valid one: 401.",
+            ))
+            .build();
+        let components = contract.components.get_or_insert_default();
+        components.add_security_scheme("key", SecurityScheme::Http(scheme));
+    }
+}
 
 /// The OpenAPI 3.1 document of the whole service, as JSON with a line break at its end.
 #[must_use]

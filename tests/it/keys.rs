@@ -1,7 +1,5 @@
 //! API keys: who is asked for one, and what a revoked one is worth.
 
-use std::time::Duration;
-
 use axum::body::Body;
 use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
@@ -12,22 +10,22 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 
 use crate::service::{Answer, app, get, run, send};
 
-/// A server that looks its keys up every time.
-async fn guarded(is_required: bool) -> (tempfile::TempDir, Store, App) {
+async fn guarded(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig {
         data_dir: dir.path().to_owned(),
         ..StoreConfig::default()
     };
     let store = Store::open(&config).await.unwrap();
-    let keys = Keys::of(store.clone(), is_required, Duration::ZERO);
-    let app = app(dir.path(), ServerConfig::default()).with_keys(keys);
-    (dir, store, app)
+    let keys = Keys::of(store.clone(), is_required).await.unwrap();
+    let app = app(dir.path(), ServerConfig::default()).with_keys(keys.clone());
+    (dir, store, keys, app)
 }
 
-async fn new_key(store: &Store) -> NewKey {
+async fn new_key(store: &Store, keys: &Keys) -> NewKey {
     let key = NewKey::generate().unwrap();
     store.create_key(&key.id, "robot", &key.hash, 1.0).await.unwrap();
+    keys.refresh().await.unwrap();
     key
 }
 
@@ -41,20 +39,21 @@ async fn models_with(app: &App, authorization: &str) -> Answer {
 
 #[tokio::test]
 async fn without_keys_everybody_may_unless_one_is_required() {
-    let (_dir, store, app) = guarded(false).await;
+    let (_dir, store, keys, app) = guarded(false).await;
     assert_eq!(get(&app, "/v1/models").await.status, 200);
-    let key = new_key(&store).await;
+    let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    keys.refresh().await.unwrap();
     assert_eq!(get(&app, "/v1/models").await.status, 200);
-    let (_dir, _store, app) = guarded(true).await;
+    let (_dir, _store, _keys, app) = guarded(true).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
 }
 
 #[tokio::test]
 async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
-    let (_dir, store, app) = guarded(true).await;
-    let (key, other) = (new_key(&store).await, NewKey::generate().unwrap());
+    let (_dir, store, keys, app) = guarded(true).await;
+    let (key, other) = (new_key(&store, &keys).await, NewKey::generate().unwrap());
     let refused = get(&app, "/v1/models").await;
     assert!(refused.detail(401).contains("Authorization: Bearer KEY"));
     assert_eq!(refused.headers[header::WWW_AUTHENTICATE], "Bearer realm=\"foreframe\"");
@@ -70,13 +69,14 @@ async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
         assert_eq!(get(&app, path).await.status, 200, "{path}");
     }
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    keys.refresh().await.unwrap();
     assert_eq!(models_with(&app, &format!("Bearer {}", key.text)).await.status, 401);
 }
 
 #[tokio::test]
 async fn a_browser_shows_its_key_as_a_subprotocol() {
-    let (_dir, store, app) = guarded(true).await;
-    let key = new_key(&store).await;
+    let (_dir, store, keys, app) = guarded(true).await;
+    let key = new_key(&store, &keys).await;
     let server = run(app).await;
     let connect = async |protocols: String| {
         let url = format!("ws://{}/v1/models/plain/stream", server.address);

@@ -1,8 +1,9 @@
 //! The real program: what it says on the command line, and how it ends.
 
+use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -33,15 +34,18 @@ fn text(bytes: &[u8]) -> String {
 struct Served {
     child: Child,
     address: SocketAddr,
+    log: PathBuf,
 }
 
 impl Served {
     fn start(dir: &Path, arguments: &[&str]) -> Self {
+        let log = dir.join("log");
         let mut child = foreframe(dir)
             .args(["serve", "--bind", "127.0.0.1:0"])
             .args(arguments)
+            .env("RUST_LOG", "foreframe=debug")
             .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
+            .stderr(File::create(&log).unwrap())
             .spawn()
             .unwrap();
         let mut line = String::new();
@@ -52,6 +56,7 @@ impl Served {
         let served = Self {
             address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
             child,
+            log,
         };
         let deadline = Instant::now() + PATIENCE;
         while !served.get("/readyz").starts_with("HTTP/1.1 200") {
@@ -86,8 +91,7 @@ impl Served {
             assert!(Instant::now() < deadline, "the server did not end");
             std::thread::sleep(Duration::from_millis(5));
         };
-        let mut log = String::new();
-        self.child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        let log = std::fs::read_to_string(&self.log).unwrap();
         assert!(status.success(), "{status}: {log}");
         log
     }
@@ -174,14 +178,14 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
 }
 
 #[test]
-fn the_metrics_count_what_was_asked_by_route_and_not_by_path() {
+fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "plain", spec(Conditioning::None));
     let served = Served::start(dir.path(), &["--log-format", "json"]);
     for name in ["plain", "a", "b"] {
         served.get(&format!("/v1/models/{name}"));
     }
-    served.get("/nothing");
+    served.get("/nothing HTTP/1.1\r\nx-request-id: robot-7\r\nx:");
     let body = json!({"frames": context()}).to_string();
     let mut stream = TcpStream::connect(served.address).unwrap();
     write!(
@@ -217,10 +221,20 @@ fn the_metrics_count_what_was_asked_by_route_and_not_by_path() {
     );
     served.terminate();
     let log = served.ended();
-    for line in log.lines() {
-        let entry: Value = serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"));
-        assert!(entry["level"].is_string() && entry["timestamp"].is_string(), "{line}");
-    }
+    let entries = log
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap_or_else(|_| panic!("{line}")));
+    let answered: Vec<Value> = entries.filter(|entry| entry["message"] == "answered").collect();
+    assert!(
+        answered.len() >= 6 && answered.iter().all(|entry| entry["span"]["id"].is_string()),
+        "{log}"
+    );
+    assert!(
+        answered
+            .iter()
+            .any(|entry| entry["span"]["id"] == "robot-7" && entry["status"] == 404),
+        "{log}"
+    );
 }
 
 #[test]
@@ -254,20 +268,29 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
         "{}",
         text(&refused.stderr)
     );
-    let key = text(&output(dir.path(), &["keys", "create", "robot 7"]).stdout);
-    let key = key.trim();
+    let keys = ["robot 7", "robot 8"].map(|name| text(&output(dir.path(), &["keys", "create", name]).stdout));
     let listed = text(&output(dir.path(), &["keys", "list"]).stdout);
     assert!(
-        listed.contains("valid") && listed.contains("robot 7") && !listed.contains(key),
+        listed.contains("valid") && listed.contains("robot 7") && !listed.contains(keys[0].trim()),
         "{listed}"
     );
-    let served = Served::start(dir.path(), &[]);
+    let served = Served::start(dir.path(), &["--set", "key_refresh_ms=100"]);
     assert!(served.get("/v1/models").starts_with("HTTP/1.1 401"));
-    let with_key = format!("/v1/models HTTP/1.1\r\nauthorization: Bearer {key}\r\nx:");
-    assert!(served.get(&with_key).starts_with("HTTP/1.1 200"));
-    let id = listed.split_whitespace().next().unwrap();
+    let ask = |key: &str| {
+        served.get(&format!(
+            "/v1/models HTTP/1.1\r\nauthorization: Bearer {}\r\nx:",
+            key.trim()
+        ))
+    };
+    assert!(keys.iter().all(|key| ask(key).starts_with("HTTP/1.1 200")));
+    let id = keys[0].split('_').nth(1).unwrap();
     assert!(output(dir.path(), &["keys", "revoke", id]).status.success());
     assert_eq!(output(dir.path(), &["keys", "revoke", id]).status.code(), Some(2));
+    let deadline = Instant::now() + PATIENCE;
+    while !ask(&keys[0]).starts_with("HTTP/1.1 401") {
+        assert!(Instant::now() < deadline, "the revoked key is still taken");
+    }
+    assert!(ask(&keys[1]).starts_with("HTTP/1.1 200"));
     served.terminate();
     served.ended();
 }
