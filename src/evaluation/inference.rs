@@ -31,6 +31,8 @@ pub struct Predicted {
     pub truth: Vec<f32>,
     /// The true frames to come through the dense layers.
     pub codec: Vec<f32>,
+    /// The frames seen as the model reconstructs them.
+    pub reconstructed: Vec<f32>,
 }
 
 /// Predicts each window's frames to come. Errors: those of the network, `NotFinite`.
@@ -57,7 +59,8 @@ pub fn predict(
     }
 }
 
-/// As [`predict`] with the true actions, and what the dense layers alone make of the true frames to come.
+/// As [`predict`] with the true actions, what the dense layers alone make of the true frames to come, and what the
+/// reconstruction makes of those seen.
 pub fn predict_with_ceiling(
     loaded: &LoadedModel,
     dataset: &Dataset,
@@ -73,7 +76,12 @@ pub fn predict_with_ceiling(
     )?;
     let targets = Tensor::from_slice(&truth, (windows.len() * spec.horizon, spec.pixels()), &Device::Cpu)?;
     let codec = values(&loaded.model.decode_frames(&loaded.model.encode_frames(&targets)?)?)?;
-    Ok(Predicted { frames, truth, codec })
+    Ok(Predicted {
+        frames,
+        truth,
+        codec,
+        reconstructed: reconstruct(loaded, dataset, windows)?,
+    })
 }
 
 /// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space.

@@ -122,6 +122,11 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
     }
     writeln!(
         out,
+        "The frames seen come out of the reconstruction with an MSE of {} ×10⁻⁴.\n",
+        in_mse_units(scores.reconstruction_mse.mean)
+    )?;
+    writeln!(
+        out,
         "In the model's own space (smoothed, and inverted where it inverts) its MSE is {} ×10⁻⁴; that number serves no \
          comparison with models that preprocess differently.",
         in_mse_units(scores.model_space_mse.mean)

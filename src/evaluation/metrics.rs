@@ -85,6 +85,8 @@ pub struct WindowScores {
     pub frames: Vec<Vec<FrameScore>>,
     /// Mean squared error of the model in its own space, per step.
     pub model_space_mse: Vec<f64>,
+    /// Mean squared error of the reconstruction of each frame seen, the oldest first.
+    pub reconstruction_mse: Vec<f64>,
 }
 
 impl WindowScores {
@@ -191,6 +193,7 @@ mod tests {
                 Method::ALL.len()
             ],
             model_space_mse: vec![0.0],
+            reconstruction_mse: vec![0.0],
         };
         let rows = summarize(&[window(20.0, 1), window(40.0, 3)]);
         assert_eq!(rows[0].psnr_db.mean, 30.0);

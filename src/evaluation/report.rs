@@ -205,6 +205,8 @@ pub struct SetScores {
     /// Mean squared error of the model in its own space (smoothed, inverted where it inverts): not comparable between
     /// models that preprocess differently.
     pub model_space_mse: Curve,
+    /// Mean squared error of the reconstruction of the frames seen, the oldest first.
+    pub reconstruction_mse: Curve,
     /// Does the action matter? Absent for a model that takes none.
     pub actions: Option<ActionTable>,
     /// The windows that the figures show.
@@ -219,10 +221,8 @@ impl SetScores {
         bootstrap: &Bootstrap,
     ) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
-        let own_space = Trials::group(
-            &trial_of,
-            windows.iter().map(|window| window.model_space_mse.as_slice()),
-        );
+        let by_trial = |of: fn(&WindowScores) -> &[f64]| Trials::group(&trial_of, windows.iter().map(of));
+        let own_space = by_trial(|window| &window.model_space_mse);
         Self {
             windows: windows.len(),
             windows_available,
@@ -230,6 +230,7 @@ impl SetScores {
             skill: skill(windows, bootstrap),
             methods: summarize(windows),
             model_space_mse: Curve::new(own_space.means()),
+            reconstruction_mse: Curve::new(by_trial(|window| &window.reconstruction_mse).means()),
             actions,
             samples: SampleWindow::choose(windows),
         }

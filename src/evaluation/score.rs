@@ -97,6 +97,8 @@ fn score_window(
             score.collect()
         })
         .collect();
+    let seen_here = place * spec.context * pixels..(place + 1) * spec.context * pixels;
+    let reconstructed = predicted.reconstructed[seen_here].chunks_exact(pixels);
     let own = predicted.frames[here.clone()].chunks_exact(pixels);
     let own_truth = predicted.truth[here.clone()].chunks_exact(pixels);
     WindowScores {
@@ -104,5 +106,9 @@ fn score_window(
         first_frame: window.first_frame,
         frames,
         model_space_mse: own.zip(own_truth).map(|(a, b)| quality::mse(a, b)).collect(),
+        reconstruction_mse: reconstructed
+            .zip(&inputs)
+            .map(|(frame, truth)| quality::mse(&spec.preprocess.inverse(frame), truth))
+            .collect(),
     }
 }

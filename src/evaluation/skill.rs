@@ -109,6 +109,7 @@ mod tests {
                         })
                         .collect(),
                     model_space_mse: vec![0.0; 2],
+                    reconstruction_mse: vec![0.0; 2],
                 }
             })
             .collect()
