@@ -11,10 +11,12 @@ mod jobs;
 mod listener;
 mod middleware;
 mod models;
+mod multipart;
 mod picture;
 mod predict;
 mod preview;
-mod session;
+mod rollouts;
+mod sessions;
 mod stream;
 mod streams;
 
@@ -37,6 +39,7 @@ pub use error::Problem;
 pub use images::ImageFormat;
 use listener::BoundedListener;
 use middleware::RequestIds;
+use sessions::table::Table;
 use streams::Streams;
 
 use crate::jobs::pipeline::Pipeline;
@@ -84,6 +87,7 @@ struct Shared {
     predictor: Predictor,
     jobs: Jobs,
     streams: Streams,
+    sessions: Table,
     request_ids: RequestIds,
     contract: String,
 }
@@ -105,12 +109,14 @@ impl App {
     #[must_use]
     pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs) -> Self {
         let streams = Streams::new(config.max_streams);
+        let sessions = Table::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
         Self {
             shared: Arc::new(Shared {
                 config,
                 predictor,
                 jobs,
                 streams,
+                sessions,
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
@@ -139,6 +145,10 @@ impl App {
         &self.shared.streams
     }
 
+    fn sessions(&self) -> &Table {
+        &self.shared.sessions
+    }
+
     fn request_ids(&self) -> &RequestIds {
         &self.shared.request_ids
     }
@@ -159,7 +169,13 @@ pub fn router(app: App) -> Router {
         .route("/v1/models/{model}", get(models::get))
         .route("/v1/models/{model}/predict", post(predict::predict))
         .route("/v1/models/{model}/preview.png", get(preview::preview))
-        .route("/v1/models/{model}/stream", get(stream::stream))
+        .route("/v1/models/{model}/rollouts", post(rollouts::of_model))
+        .route("/v1/models/{model}/stream", get(stream::of_model))
+        .route("/v1/sessions", post(sessions::create).get(sessions::list))
+        .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::delete))
+        .route("/v1/sessions/{id}/state", get(sessions::state))
+        .route("/v1/sessions/{id}/rollouts", post(rollouts::of_session))
+        .route("/v1/sessions/{id}/stream", get(stream::of_session))
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))

@@ -5,7 +5,7 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use utoipa::OpenApi;
 
-use super::{App, dashboard, error, health, jobs, models, predict, preview, stream};
+use super::{App, dashboard, error, health, jobs, models, predict, preview, rollouts, sessions, stream};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -22,7 +22,15 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
         models::get,
         predict::predict,
         preview::preview,
-        stream::stream,
+        rollouts::of_model,
+        stream::of_model,
+        sessions::create,
+        sessions::list,
+        sessions::get,
+        sessions::delete,
+        sessions::state,
+        rollouts::of_session,
+        stream::of_session,
         jobs::create,
         jobs::list,
         jobs::get,
@@ -33,6 +41,7 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
     components(schemas(error::Problem)),
     tags(
         (name = "models", description = "Models and their predictions"),
+        (name = "sessions", description = "Streams of frames that are remembered"),
         (name = "jobs", description = "Collection and training in the background"),
         (name = "health", description = "Whether the server lives and is ready"),
         (name = "about", description = "This contract and a page for people"),
