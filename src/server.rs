@@ -36,7 +36,7 @@ use tracing::{info, warn};
 pub use config::ServerConfig;
 use error::ApiError;
 pub use error::Problem;
-pub use images::ImageFormat;
+pub use images::{ImageBytes, ImageFormat};
 use listener::BoundedListener;
 use middleware::RequestIds;
 use sessions::table::Table;

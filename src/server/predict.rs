@@ -72,7 +72,7 @@ pub(super) struct PredictResponse {
 /// Why a request for a prediction was refused.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum PredictError {
-    #[error("{field} holds {found} items; this server takes at most {limit} in a request")]
+    #[error("{field} holds {found}; this server takes at most {limit} in a request")]
     TooMany {
         field: &'static str,
         found: usize,

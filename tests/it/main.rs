@@ -3,6 +3,8 @@
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
+mod asyncapi;
+mod client;
 mod dataset_collect;
 mod dataset_sampler;
 mod evaluation;
@@ -12,9 +14,14 @@ mod nn_common;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
+mod rollouts;
 mod server;
 mod service;
+mod session_restart;
+mod sessions;
 mod sim;
 mod sim_refusals;
 mod stream;
+mod stream_equal;
+mod stream_slow;
 mod training;

@@ -84,7 +84,7 @@ fn from_msgpack<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
     deserializer.set_max_depth(MAX_DEPTH);
     let message = T::deserialize(&mut deserializer)?;
     // Whatever follows is more than nothing: a value, or one that is refused, for its depth if for nothing else.
-    deserializer.set_max_depth(0);
+    deserializer.set_max_depth(1);
     match IgnoredAny::deserialize(&mut deserializer) {
         Err(rmp_serde::decode::Error::InvalidMarkerRead(_)) => Ok(message),
         _ => Err(CodecError::Trailing),
