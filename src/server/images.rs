@@ -50,7 +50,12 @@ impl Serialize for ImageBytes {
 impl<'de> Deserialize<'de> for ImageBytes {
     /// From text as base64, from bytes as they are, whichever is there.
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_byte_buf(ImageVisitor)
+        // JSON would give a string's letters as bytes.
+        if deserializer.is_human_readable() {
+            deserializer.deserialize_str(ImageVisitor)
+        } else {
+            deserializer.deserialize_byte_buf(ImageVisitor)
+        }
     }
 }
 

@@ -132,12 +132,12 @@ pub(super) async fn of_session(
 ) -> Result<Response, ApiError> {
     let model = Arc::clone(session.model());
     let (state, format) = (session.state().0, request.format);
-    let told = predict::last_state(request.state, None, 0)?.or_else(|| state.robot_state().cloned());
-    let premises = premises(request.candidates, told, &model.manifest, app.config())?;
     let (have, need) = (state.have(), model.manifest.spec.context);
-    let task = state
-        .futures(premises, &model.manifest.spec)
-        .ok_or(PredictError::Warming { have, need })?;
+    if have < need {
+        return Err(PredictError::Warming { have, need }.into());
+    }
+    let told = predict::last_state(request.state, None, 0)?.or_else(|| state.robot_state().cloned());
+    let task = state.futures(premises(request.candidates, told, &model.manifest, app.config())?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     blocking(move || answer(wanted, format, &model, &[], &computed)).await?
 }

@@ -174,17 +174,17 @@ impl SessionState {
     /// What to compute for the last frame once more; `None` while the context is not full.
     #[must_use]
     pub fn again(&self, spec: &ModelSpec) -> Option<Task> {
-        self.futures(vec![self.premise.clone()], spec)
+        (self.features.len() == spec.context).then(|| self.futures(vec![self.premise.clone()]))
     }
 
-    /// What to compute for the futures that follow the last frame; `None` while the context is not full.
+    /// What to compute for the futures that follow the last frame, if the context is full.
     #[must_use]
-    pub fn futures(&self, premises: Vec<Premise>, spec: &ModelSpec) -> Option<Task> {
-        (self.features.len() == spec.context).then(|| Task {
+    pub fn futures(&self, premises: Vec<Premise>) -> Task {
+        Task {
             known: self.features.iter().cloned().collect(),
             frames: Vec::new(),
             premises,
-        })
+        }
     }
 }
 
