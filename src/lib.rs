@@ -6,8 +6,8 @@ pub mod types;
 
 pub mod files;
 
-pub mod wording;
 pub mod telemetry;
+pub mod wording;
 
 pub mod frame;
 

@@ -15,11 +15,13 @@ mod listener;
 mod metrics;
 mod middleware;
 mod models;
+mod multipart;
 mod origin;
 mod picture;
 mod predict;
 mod preview;
-mod session;
+mod rollouts;
+mod sessions;
 mod stream;
 mod streams;
 
@@ -44,10 +46,11 @@ use connections::Connections;
 use environments::Environments;
 use error::ApiError;
 pub use error::Problem;
-pub use images::ImageFormat;
+pub use images::{ImageBytes, ImageFormat};
 use keys::Keys;
 use listener::BoundedListener;
 use middleware::RequestIds;
+use sessions::table::Table;
 use streams::Streams;
 
 use crate::jobs::pipeline::Pipeline;
@@ -95,6 +98,7 @@ struct Shared {
     streams: Streams,
     environments: Environments,
     draining: AtomicBool,
+    sessions: Table,
     request_ids: RequestIds,
     contract: String,
 }
@@ -118,6 +122,7 @@ impl App {
         let streams = Streams::new(config.max_streams);
         let idle = Duration::from_millis(config.environment_idle_ms);
         let environments = Environments::new(config.max_environments, idle);
+        let sessions = Table::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
         Self {
             shared: Arc::new(Shared {
                 config,
@@ -126,6 +131,7 @@ impl App {
                 streams,
                 environments,
                 draining: AtomicBool::new(false),
+                sessions,
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
             }),
@@ -178,6 +184,10 @@ impl App {
         self.shared.draining.store(true, Ordering::Release);
     }
 
+    fn sessions(&self) -> &Table {
+        &self.shared.sessions
+    }
+
     fn request_ids(&self) -> &RequestIds {
         &self.shared.request_ids
     }
@@ -214,7 +224,13 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/models/{model}", get(models::get))
         .route("/v1/models/{model}/predict", post(predict::predict))
         .route("/v1/models/{model}/preview.png", get(preview::preview))
-        .route("/v1/models/{model}/stream", get(stream::stream))
+        .route("/v1/models/{model}/rollouts", post(rollouts::of_model))
+        .route("/v1/models/{model}/stream", get(stream::of_model))
+        .route("/v1/sessions", post(sessions::create).get(sessions::list))
+        .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::delete))
+        .route("/v1/sessions/{id}/state", get(sessions::state))
+        .route("/v1/sessions/{id}/rollouts", post(rollouts::of_session))
+        .route("/v1/sessions/{id}/stream", get(stream::of_session))
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))

@@ -1,14 +1,17 @@
-//! Predictions for many clients from one thread that owns the models: [`Predictor`] is the cheap handle, [`batch`] says
-//! which waiting requests are computed together, [`predict`] is the computation itself.
+//! Predictions for many clients from one thread that alone computes with the models: [`Predictor`] is the cheap handle,
+//! [`batch`] says which waiting tasks are computed together, [`predict`] is the computation itself, and [`session`] what
+//! a stream of frames remembers from one to the next.
 
 mod catalog;
 mod compute;
 mod input;
 mod meter;
 mod queue;
+mod task;
 mod worker;
 
 pub mod batch;
+pub mod session;
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -22,10 +25,13 @@ use crate::nn::NnError;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 
 use catalog::Catalog;
-pub use compute::predict;
+pub use compute::{Features, predict};
 pub(crate) use input::check_size;
 pub use input::{InputError, PredictionInput};
 use queue::{Load, Queue, Waiting};
+pub use session::{SessionMemory, SessionState};
+pub use task::{Premise, Task};
+pub(crate) use task::{STEP, Told};
 
 /// Why no prediction came.
 #[derive(Debug, thiserror::Error)]
@@ -89,7 +95,7 @@ pub enum ServingError {
 pub struct PredictorConfig {
     /// Requests that may wait, at least 1.
     pub queue_capacity: usize,
-    /// Requests computed together at most, at least 1.
+    /// Futures predicted together at most, at least 1, except that one task is never split.
     pub batch_limit: usize,
     /// How long a request may take from its arrival to its answer.
     pub deadline: Duration,
@@ -98,8 +104,8 @@ pub struct PredictorConfig {
 impl Default for PredictorConfig {
     fn default() -> Self {
         Self {
-            queue_capacity: 64,
-            batch_limit: 16,
+            queue_capacity: 256,
+            batch_limit: 64,
             deadline: Duration::from_secs(10),
         }
     }
@@ -114,6 +120,19 @@ pub struct Prediction {
     pub version: u32,
     /// t+1, t+2, …: as many as the model's horizon.
     pub frames: Vec<Frame>,
+    /// Microseconds in the queue.
+    pub queue_us: u64,
+    /// Microseconds of computation, of the whole batch.
+    pub compute_us: u64,
+}
+
+/// What came of a [`Task`] and how long it took.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Computed {
+    /// Of the task's frames, in order.
+    pub features: Vec<Features>,
+    /// One for each of the task's premises, in order.
+    pub futures: Vec<Vec<Frame>>,
     /// Microseconds in the queue.
     pub queue_us: u64,
     /// Microseconds of computation, of the whole batch.
@@ -144,8 +163,8 @@ impl Predictor {
     /// requests queue. Errors: `Thread`.
     pub fn start(models: Vec<LoadedModel>, config: PredictorConfig) -> Result<Self, ServingError> {
         let queue = Arc::new(Queue::new(config.queue_capacity, config.batch_limit));
-        let catalog = Arc::new(Catalog::of(models.iter().map(|model| model.manifest.clone())));
-        let worker = worker::spawn(models, Arc::clone(&queue), Arc::clone(&catalog))?;
+        let catalog = Arc::new(Catalog::of(models));
+        let worker = worker::spawn(Arc::clone(&queue), Arc::clone(&catalog))?;
         Ok(Self {
             shared: Arc::new(Shared {
                 queue,
@@ -165,24 +184,59 @@ impl Predictor {
     /// The loaded models' manifests, by name.
     #[must_use]
     pub fn models(&self) -> Vec<Arc<Manifest>> {
-        self.shared.catalog.all()
+        let models = self.shared.catalog.all().into_iter();
+        models.map(|model| Arc::clone(&model.manifest)).collect()
     }
 
     /// The manifest of one model. Errors: `UnknownModel`, which names those there are.
     pub fn model(&self, name: &str) -> Result<Arc<Manifest>, ServingError> {
+        Ok(Arc::clone(&self.active(name)?.manifest))
+    }
+
+    /// The version that now has that name; whoever holds it can go on computing with it when another has taken its place.
+    /// Errors: `UnknownModel`, which names those there are.
+    pub fn active(&self, name: &str) -> Result<Arc<LoadedModel>, ServingError> {
         self.shared.catalog.find(name)
     }
 
     /// Predicts the frames that follow. Dropping the future withdraws the request. Errors: `UnknownModel`, `Input`,
     /// `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
     pub async fn predict(&self, model: &str, input: PredictionInput) -> Result<Prediction, ServingError> {
-        let manifest = self.model(model)?;
-        input.check(&manifest.name, &manifest.spec)?;
+        self.predict_by(&self.active(model)?, input).await
+    }
+
+    /// As [`Predictor::predict`], by that version of a model.
+    pub async fn predict_by(
+        &self,
+        model: &Arc<LoadedModel>,
+        input: PredictionInput,
+    ) -> Result<Prediction, ServingError> {
+        let manifest = &model.manifest;
+        let task = input.into_task(&manifest.name, &manifest.spec)?;
+        let computed = self.compute(model, task, None).await?;
+        Ok(Prediction {
+            model: manifest.name.clone(),
+            version: manifest.version,
+            frames: computed.futures.into_iter().next().unwrap_or_default(),
+            queue_us: computed.queue_us,
+            compute_us: computed.compute_us,
+        })
+    }
+
+    /// Computes a task, which is a step of that session if there is one: of a session, one step is in a batch. Dropping
+    /// the future withdraws it. Errors: `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
+    pub async fn compute(
+        &self,
+        model: &Arc<LoadedModel>,
+        task: Task,
+        session: Option<u64>,
+    ) -> Result<Computed, ServingError> {
         let accepted = Instant::now();
         let (reply, answer) = oneshot::channel();
         self.shared.queue.push(Waiting {
-            model: manifest.name.clone(),
-            input,
+            model: Arc::clone(model),
+            task,
+            session,
             accepted,
             deadline: accepted + self.shared.deadline,
             reply,
@@ -223,4 +277,39 @@ pub fn load_models(directories: &[&Path]) -> Result<Vec<LoadedModel>, RegistryEr
         found.extend(registry::list(directory)?);
     }
     found.values().map(|path| registry::load(path)).collect()
+}
+
+/// A small model with random weights.
+#[cfg(test)]
+pub(crate) fn test_model() -> LoadedModel {
+    use crate::nn::{ChannelScale, Conditioning, Model, ModelSpec, Parameters};
+    let channel = |name: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: String::new(),
+        mean: 0.0,
+        std: 1.0,
+    };
+    let spec = ModelSpec {
+        frame_width_px: 6,
+        frame_height_px: 4,
+        context: 3,
+        horizon: 2,
+        features: 5,
+        hidden: 4,
+        conditioning: Conditioning::StateAction,
+        actions: vec![channel("a")],
+        states: vec![channel("s")],
+        ..ModelSpec::default()
+    };
+    let parameters = Parameters::initialize(&spec, crate::types::Seed(1)).unwrap();
+    let manifest = serde_json::json!({
+        "name": "test", "version": 1, "spec": spec, "weights_sha256": "00",
+        "dataset": {"name": "none", "content_hash": "", "scenario": null, "windows": 1, "split_seed": 0},
+        "seed": 1, "command": "", "training": {}, "metrics": {}, "parameters": 1, "multiply_adds_per_frame": 1,
+        "program": {"version": "0", "git_commit": null},
+    });
+    LoadedModel {
+        manifest: Arc::new(serde_json::from_value(manifest).unwrap()),
+        model: Model::detached(spec, &parameters).unwrap(),
+    }
 }

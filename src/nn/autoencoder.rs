@@ -113,20 +113,13 @@ impl Model {
                 &[Some(batch), Some(self.spec.horizon), Some(self.spec.features)],
             )?;
         }
+        let truth = match feedback {
+            Feedback::Truth(truth) => truth,
+            Feedback::Prediction => return self.run_predictor(features, None, condition),
+        };
         let conditions = condition.inputs(&self.spec, batch)?;
         let (_, state) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
-        let truth = match feedback {
-            Feedback::Truth(truth) => truth,
-            Feedback::Prediction => {
-                let decoder = Decoder {
-                    cell: &self.predictor,
-                    output: &self.predictor_output,
-                    adds: true,
-                };
-                return decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state);
-            }
-        };
         let before = Tensor::cat(&[&last.unsqueeze(1)?, &truth.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
         let inputs = match &conditions {
             Some(conditions) => Tensor::cat(&[&before, conditions], 2)?,
@@ -135,6 +128,44 @@ impl Model {
         let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
         let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
         Ok((before + changes.reshape(truth.dims())?)?)
+    }
+
+    /// Features `[N, horizon, F]` of N futures of B windows with `features` [B, context, F]: future n follows the window
+    /// `windows[n]` under the condition's row n. A window is encoded once, however many futures it has.
+    /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    pub fn predict_futures(
+        &self,
+        features: &Tensor,
+        windows: &[u32],
+        condition: &Condition,
+    ) -> Result<Tensor, NnError> {
+        self.check_windows(features)?;
+        self.run_predictor(features, Some(windows), condition)
+    }
+
+    fn run_predictor(
+        &self,
+        features: &Tensor,
+        windows: Option<&[u32]>,
+        condition: &Condition,
+    ) -> Result<Tensor, NnError> {
+        let (_, mut state) = self.encode(features)?;
+        let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
+        if let Some(windows) = windows {
+            let rows = Tensor::new(windows, features.device())?;
+            last = last.index_select(&rows, 0)?;
+            state = LstmState {
+                h: state.h.contiguous()?.index_select(&rows, 0)?,
+                c: state.c.contiguous()?.index_select(&rows, 0)?,
+            };
+        }
+        let conditions = condition.inputs(&self.spec, last.dim(0)?)?;
+        let decoder = Decoder {
+            cell: &self.predictor,
+            output: &self.predictor_output,
+            adds: true,
+        };
+        decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
     }
 
     /// The features [B, context, F] again, from what the encoder kept of them. Approach 1 (sequence): from the encoder's

@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
+use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor};
 
@@ -18,7 +19,7 @@ const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
 #[derive(Clone)]
 pub struct LoadedModel {
     /// What it is.
-    pub manifest: Manifest,
+    pub manifest: Arc<Manifest>,
     /// What predicts.
     pub model: Model,
 }
@@ -58,7 +59,10 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     };
     let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(misfit)?;
     let model = Model::detached(manifest.spec.clone(), &parameters).map_err(misfit)?;
-    Ok(LoadedModel { manifest, model })
+    Ok(LoadedModel {
+        manifest: Arc::new(manifest),
+        model,
+    })
 }
 
 /// The parameters as a safetensors file of half-precision numbers, tensors sorted by name.

@@ -22,7 +22,7 @@ pub struct ServerConfig {
     pub max_frames: usize,
     /// Predictions that may wait; more are answered 503.
     pub max_queued_predictions: usize,
-    /// Predictions computed together at most.
+    /// Futures predicted together at most; those of one request are never split.
     pub max_batch: usize,
     /// Connections at a time; more are answered 503 and closed.
     pub max_connections: usize,
@@ -30,6 +30,16 @@ pub struct ServerConfig {
     pub max_streams: usize,
     /// Simulated environments at a time; more are answered 503.
     pub max_environments: usize,
+    /// Sessions at a time; more are answered 503.
+    pub max_sessions: usize,
+    /// Frames of a stream that are read before those before them are answered; more are read later.
+    pub max_pipelined_frames: usize,
+    /// Bytes of answers that wait for a slow reader of a stream; beyond them the oldest predictions are dropped.
+    pub max_stream_buffer_bytes: usize,
+    /// Candidates in one request for rollouts at most.
+    pub max_candidates: usize,
+    /// Bytes of predicted images, unencoded, that one request for rollouts may ask for.
+    pub max_rollout_bytes: usize,
     /// Jobs that may wait; more are answered 503.
     pub max_queued_jobs: usize,
     /// Ended jobs that are remembered.
@@ -53,6 +63,8 @@ pub struct ServerConfig {
     pub write_stall_ms: u64,
     /// How long the server, told to stop, goes on taking requests while `/readyz` says 503, in milliseconds.
     pub drain_ms: u64,
+    /// How long a session is kept when no stream is open and nobody uses it, in milliseconds.
+    pub session_grace_ms: u64,
     /// How long stopping may take, draining and all, in milliseconds.
     pub shutdown_deadline_ms: u64,
     /// How often keys are read: how long a revoked one may still be taken, in milliseconds.
@@ -70,11 +82,16 @@ impl Default for ServerConfig {
             data_dir: PathBuf::from("data"),
             max_body_bytes: 8 << 20,
             max_frames: 64,
-            max_queued_predictions: 64,
-            max_batch: 16,
+            max_queued_predictions: 256,
+            max_batch: 64,
             max_connections: 512,
             max_streams: 128,
             max_environments: 16,
+            max_sessions: 1024,
+            max_pipelined_frames: 16,
+            max_stream_buffer_bytes: 4 << 20,
+            max_candidates: 512,
+            max_rollout_bytes: 64 << 20,
             max_queued_jobs: 16,
             max_ended_jobs: 100,
             prediction_deadline_ms: 10_000,
@@ -86,6 +103,7 @@ impl Default for ServerConfig {
             header_read_ms: 30_000,
             write_stall_ms: 30_000,
             drain_ms: 0,
+            session_grace_ms: 60_000,
             shutdown_deadline_ms: 10_000,
             key_refresh_ms: 5_000,
             cors_origins: Vec::new(),
@@ -131,8 +149,17 @@ impl ServerConfig {
             ),
             ("max_batch", self.max_batch as u64, 1..=4096),
             ("max_connections", self.max_connections as u64, count.clone()),
-            ("max_streams", self.max_streams as u64, count),
+            ("max_streams", self.max_streams as u64, count.clone()),
+            ("max_sessions", self.max_sessions as u64, count),
             ("max_environments", self.max_environments as u64, 1..=10_000),
+            ("max_pipelined_frames", self.max_pipelined_frames as u64, 1..=4096),
+            (
+                "max_stream_buffer_bytes",
+                self.max_stream_buffer_bytes as u64,
+                1024..=1 << 30,
+            ),
+            ("max_candidates", self.max_candidates as u64, 1..=100_000),
+            ("max_rollout_bytes", self.max_rollout_bytes as u64, 1024..=1 << 32),
             ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
@@ -141,6 +168,7 @@ impl ServerConfig {
             ("environment_idle_ms", self.environment_idle_ms, deadline.clone()),
             ("stream_idle_ms", self.stream_idle_ms, deadline.clone()),
             ("stream_send_ms", self.stream_send_ms, deadline.clone()),
+            ("session_grace_ms", self.session_grace_ms, deadline.clone()),
             ("header_read_ms", self.header_read_ms, deadline.clone()),
             ("write_stall_ms", self.write_stall_ms, deadline.clone()),
             ("shutdown_deadline_ms", self.shutdown_deadline_ms, deadline),

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ApiError, Problem};
 use super::extract::{Json, Path};
-use super::images::{self, ImageFormat};
+use super::images::{self, ImageBytes, ImageFormat};
 use super::{App, blocking};
 use crate::nn::spec::MAX_MODEL_SIDE_PX;
 use crate::sim::{self, Environment, Observation, Scenario, SimError, Step, TrialParameters, World, WorldConfig};
@@ -52,7 +52,7 @@ pub(super) struct StepRequest {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct ObservationBody {
     /// The camera's frame: PNG, base64.
-    frame: String,
+    frame: ImageBytes,
     /// In the order and units of the environment's `state`.
     state: Vec<f32>,
 }
@@ -251,9 +251,8 @@ fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, 
 }
 
 fn body(observation: Observation) -> Result<ObservationBody, EnvironmentError> {
-    let frames = images::encode(&[observation.frame], ImageFormat::Png)?;
     Ok(ObservationBody {
-        frame: frames.concat(),
+        frame: images::encode_one(&observation.frame, ImageFormat::Png)?,
         state: observation.state.into(),
     })
 }

@@ -2,7 +2,8 @@
 
 use axum::Json;
 use axum::body::Body;
-use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection};
+use axum::extract::multipart::MultipartError;
+use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection, QueryRejection};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -11,6 +12,7 @@ use tracing::error;
 use super::environments::EnvironmentError;
 use super::images::ImageError;
 use super::predict::PredictError;
+use super::sessions::table::TableError;
 use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
@@ -45,6 +47,7 @@ pub(super) enum ApiError {
     NotAcceptable(String),
     Timeout(String),
     Conflict(String),
+    Gone(String),
     TooLarge(String),
     UnsupportedMedia(String),
     Unprocessable(String),
@@ -71,6 +74,7 @@ impl ApiError {
             Self::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable"),
             Self::Timeout(_) => (StatusCode::REQUEST_TIMEOUT, "timeout"),
             Self::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
+            Self::Gone(_) => (StatusCode::GONE, "gone"),
             Self::TooLarge(_) => (StatusCode::PAYLOAD_TOO_LARGE, "too-large"),
             Self::UnsupportedMedia(_) => (StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported-media-type"),
             Self::Unprocessable(_) => (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable"),
@@ -88,6 +92,7 @@ impl ApiError {
             | Self::NotAcceptable(detail)
             | Self::Timeout(detail)
             | Self::Conflict(detail)
+            | Self::Gone(detail)
             | Self::TooLarge(detail)
             | Self::UnsupportedMedia(detail)
             | Self::Unprocessable(detail)
@@ -173,12 +178,15 @@ impl From<ServingError> for ApiError {
 impl From<PredictError> for ApiError {
     fn from(error: PredictError) -> Self {
         match error {
-            PredictError::TooManyFrames { .. } => Self::TooLarge(error.to_string()),
+            PredictError::TooMany { .. } | PredictError::TooLarge { .. } => Self::TooLarge(error.to_string()),
             PredictError::Image(image) => image.into(),
             PredictError::Serving(serving) => serving.into(),
-            PredictError::Value { .. } | PredictError::BothStates | PredictError::StateCount { .. } => {
-                Self::Unprocessable(error.to_string())
-            }
+            PredictError::Warming { .. } => Self::Conflict(error.to_string()),
+            PredictError::Value { .. }
+            | PredictError::BothStates
+            | PredictError::StateCount { .. }
+            | PredictError::NoCandidates
+            | PredictError::Input(_) => Self::Unprocessable(error.to_string()),
             PredictError::Picture(FrameError::Size { .. }) => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
@@ -202,6 +210,17 @@ impl From<EnvironmentError> for ApiError {
             EnvironmentError::Ended => Self::Conflict(error.to_string()),
             EnvironmentError::Image(image) => image.into(),
             _ => Self::Unprocessable(error.to_string()),
+        }
+    }
+}
+
+impl From<TableError> for ApiError {
+    fn from(error: TableError) -> Self {
+        match error {
+            TableError::Unknown(_) => Self::NotFound(error.to_string()),
+            TableError::Expired { .. } => Self::Gone(error.to_string()),
+            TableError::Token => Self::Forbidden(error.to_string()),
+            TableError::Full(_) => Self::unavailable(error.to_string()),
         }
     }
 }
@@ -239,6 +258,22 @@ impl From<BytesRejection> for ApiError {
             Self::TooLarge("the body is longer than this server takes".to_owned())
         } else {
             Self::Malformed(rejection.body_text())
+        }
+    }
+}
+
+impl From<QueryRejection> for ApiError {
+    fn from(rejection: QueryRejection) -> Self {
+        Self::Malformed(rejection.body_text())
+    }
+}
+
+impl From<MultipartError> for ApiError {
+    fn from(error: MultipartError) -> Self {
+        if error.status() == StatusCode::PAYLOAD_TOO_LARGE {
+            Self::TooLarge("the body is longer than this server takes".to_owned())
+        } else {
+            Self::Malformed(format!("the body is no multipart form: {}", error.body_text()))
         }
     }
 }

@@ -6,7 +6,9 @@ use axum::response::IntoResponse;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::{Modify, OpenApi};
 
-use super::{App, dashboard, environments, error, health, jobs, metrics, models, predict, preview, stream};
+use super::{
+    App, dashboard, environments, error, health, jobs, metrics, models, predict, preview, rollouts, sessions, stream,
+};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -24,11 +26,19 @@ use super::{App, dashboard, environments, error, health, jobs, metrics, models, 
         models::get,
         predict::predict,
         preview::preview,
-        stream::stream,
         environments::create,
         environments::reset,
         environments::step,
         environments::delete,
+        rollouts::of_model,
+        stream::of_model,
+        sessions::create,
+        sessions::list,
+        sessions::get,
+        sessions::delete,
+        sessions::state,
+        rollouts::of_session,
+        stream::of_session,
         jobs::create,
         jobs::list,
         jobs::get,
@@ -42,6 +52,7 @@ use super::{App, dashboard, environments, error, health, jobs, metrics, models, 
     tags(
         (name = "models", description = "Models and their predictions"),
         (name = "environments", description = "The simulator, with Gymnasium's reset and step"),
+        (name = "sessions", description = "Streams of frames that are remembered"),
         (name = "jobs", description = "Collection and training in the background"),
         (name = "health", description = "Whether the server lives and is ready"),
         (name = "about", description = "This contract and a page for people"),

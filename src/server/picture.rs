@@ -1,10 +1,100 @@
-//! A prediction in motion, for a person.
+//! Predictions as pictures, for a person.
 
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+
+use super::error::ApiError;
+use super::predict::PredictError;
 use crate::evaluation::figures::montage::{Row, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 
 /// How long an animation rests on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;
+
+/// The answer that is a picture.
+pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, ApiError> {
+    let bytes = picture
+        .and_then(|picture| codec::encode_png(&picture))
+        .map_err(PredictError::Picture)?;
+    Ok(([(header::CONTENT_TYPE, "image/png")], bytes).into_response())
+}
+
+/// The answer that is an animation.
+pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, ApiError> {
+    let bytes = bytes.map_err(PredictError::Picture)?;
+    Ok(([(header::CONTENT_TYPE, "image/gif")], bytes).into_response())
+}
+
+/// The frames seen (none where they are not known), and a row for each future; plain and small where there are many.
+/// Errors: `Size` if they are too many.
+pub(super) fn rollout_sheet(seen: &[Frame], futures: &[Vec<Frame>]) -> Result<Frame, FrameError> {
+    let inputs = Row::in_time("inputs", seen, 1 - seen.len() as i64);
+    let rows = futures
+        .iter()
+        .enumerate()
+        .map(|(index, frames)| Row::in_time(&format!("candidate {index}"), frames, 1));
+    let mut rows: Vec<Row> = Some(inputs)
+        .filter(|_| !seen.is_empty())
+        .into_iter()
+        .chain(rows)
+        .collect();
+    let large = montage("", &rows, &style(futures));
+    if !matches!(large, Err(FrameError::Size { .. })) {
+        return large;
+    }
+    for row in &mut rows {
+        row.label.clear();
+        row.cells.iter_mut().for_each(|(caption, _)| caption.clear());
+    }
+    montage("", &rows, &SMALL)
+}
+
+/// All futures side by side, from the last frame seen on where that is known. Errors: `Size` if they are too many.
+pub(super) fn rollout_animation(seen: &[Frame], futures: &[Vec<Frame>], period_s: f64) -> Result<Vec<u8>, FrameError> {
+    let columns = (futures.len() as f64).sqrt().ceil().max(1.0) as usize;
+    let steps = futures.iter().map(Vec::len).max().unwrap_or(0);
+    let grid = |cells: Vec<(String, Frame)>| {
+        let rows = cells.chunks(columns).map(|cells| Row {
+            label: String::new(),
+            cells: cells.to_vec(),
+        });
+        let rows: Vec<Row> = rows.collect();
+        montage("", &rows, &style(futures)).or_else(|_| montage("", &rows, &SMALL))
+    };
+    let named = |(index, frame): (usize, &Frame)| (index.to_string(), frame.clone());
+    let first = seen
+        .last()
+        .map(|last| futures.iter().map(|_| last).enumerate().map(named).collect());
+    let later = (0..steps).map(|step| {
+        futures
+            .iter()
+            .filter_map(|future| future.get(step))
+            .enumerate()
+            .map(named)
+            .collect()
+    });
+    film(
+        first
+            .into_iter()
+            .chain(later)
+            .map(grid)
+            .collect::<Result<_, FrameError>>()?,
+        period_s,
+    )
+}
+
+const SMALL: Style = Style {
+    scale: 1,
+    grid_lines: 0,
+};
+
+fn style(futures: &[Vec<Frame>]) -> Style {
+    let width = futures.iter().flatten().next().map_or(1, Frame::width);
+    Style {
+        grid_lines: 0,
+        ..Style::for_frames_of(width)
+    }
+}
 
 /// The frames seen, then those predicted, each with its time from t on, one frame period apart, as a GIF.
 /// Errors: `Size` if the frames are too large.
@@ -25,7 +115,10 @@ pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> R
         montage("", &[row], &style)
     };
     let cells = rows.into_iter().flat_map(|row| row.cells);
-    let mut frames = cells.map(picture).collect::<Result<Vec<Frame>, FrameError>>()?;
+    film(cells.map(picture).collect::<Result<_, FrameError>>()?, period_s)
+}
+
+fn film(mut frames: Vec<Frame>, period_s: f64) -> Result<Vec<u8>, FrameError> {
     let last = frames.last().cloned();
     frames.extend(last.into_iter().flat_map(|last| vec![last; REST_PERIODS]));
     codec::encode_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
@@ -39,5 +132,21 @@ mod tests {
     fn an_animation_is_a_gif() {
         let flat = |value| Frame::new(64, 64, vec![value; 4096]).unwrap();
         assert!(animation(&[flat(1)], &[flat(2)], 0.2).unwrap().starts_with(b"GIF89a"));
+        let film = rollout_animation(&[], &vec![vec![flat(1), flat(2)]; 5], 0.2).unwrap();
+        assert!(film.starts_with(b"GIF89a"));
+    }
+
+    #[test]
+    fn many_futures_are_drawn_small_and_too_many_are_refused() {
+        let futures = |count| vec![vec![Frame::new(64, 64, vec![9; 4096]).unwrap(); 2]; count];
+        let (few, many) = (
+            rollout_sheet(&[], &futures(2)).unwrap(),
+            rollout_sheet(&[], &futures(40)).unwrap(),
+        );
+        assert!(few.width() > 2 * 192 && many.width() < 2 * 192);
+        assert!(matches!(
+            rollout_sheet(&[], &futures(400)),
+            Err(FrameError::Size { .. })
+        ));
     }
 }

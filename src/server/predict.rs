@@ -1,28 +1,31 @@
 //! One prediction from one request.
 
+use std::sync::Arc;
+
 use axum::extract::State;
-use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::error::{ApiError, Problem};
-use super::extract::{Json, Path, Wanted};
-use super::images::{self, ImageError, ImageFormat};
+use super::extract::{Path, Wanted};
+use super::images::{self, ImageBytes, ImageError, ImageFormat};
+use super::multipart::{Upload, WithFrames};
 use super::picture;
 use super::protocol::Timing;
 use super::{App, blocking};
 use crate::evaluation::figures::montage::prediction_sheet;
-use crate::frame::{Frame, FrameError, codec};
+use crate::frame::{Frame, FrameError};
 use crate::registry::Manifest;
-use crate::serving::{Prediction, PredictionInput, ServingError};
+use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
 use crate::types::{Action, RobotState, ValueError};
 
 /// What a prediction starts from.
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PredictRequest {
-    /// The context's images, oldest first, base64.
-    frames: Vec<String>,
+    /// The context's images, oldest first; in a form, its parts `frames`.
+    #[serde(default)]
+    frames: Vec<ImageBytes>,
     /// How the images are encoded, and those of the answer shall be.
     #[serde(default)]
     format: ImageFormat,
@@ -40,6 +43,17 @@ pub(super) struct PredictRequest {
     future_actions: Option<Vec<Vec<f32>>>,
 }
 
+/// The same as a form.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code, reason = "describes the form; `Upload` reads it")]
+struct PredictForm {
+    /// The context's image files, oldest first.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    frames: Vec<ImageBytes>,
+    /// The rest, as JSON.
+    request: Option<PredictRequest>,
+}
+
 /// The frames to come.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct PredictResponse {
@@ -47,8 +61,8 @@ pub(super) struct PredictResponse {
     model: String,
     /// The model's version.
     version: u32,
-    /// t+1, t+2, …: base64.
-    frames: Vec<String>,
+    /// t+1, t+2, ….
+    frames: Vec<ImageBytes>,
     /// How they are encoded.
     format: ImageFormat,
     /// How long it took.
@@ -58,8 +72,18 @@ pub(super) struct PredictResponse {
 /// Why a request for a prediction was refused.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum PredictError {
-    #[error("frames holds {found} images; this server takes at most {limit} in a request")]
-    TooManyFrames { found: usize, limit: usize },
+    #[error("{field} holds {found}; this server takes at most {limit} in a request")]
+    TooMany {
+        field: &'static str,
+        found: usize,
+        limit: usize,
+    },
+    #[error("the futures would be {found} bytes of images; this server predicts at most {limit} for a request")]
+    TooLarge { found: u64, limit: usize },
+    #[error("candidates is empty; give at least one sequence of future actions")]
+    NoCandidates,
+    #[error("the session has {have} frames of the {need} that a prediction takes; send it more")]
+    Warming { have: usize, need: usize },
     #[error("{field}: {source}")]
     Value { field: String, source: ValueError },
     #[error("state and states are both given; give one")]
@@ -69,17 +93,26 @@ pub(super) enum PredictError {
     #[error(transparent)]
     Image(#[from] ImageError),
     #[error(transparent)]
+    Input(#[from] InputError),
+    #[error(transparent)]
     Serving(#[from] ServingError),
     #[error("the picture could not be made")]
     Picture(#[source] FrameError),
 }
 
-/// Predicts the frames that follow a context. `Accept: image/png` gives a labelled contact sheet of frames and
-/// predictions, `image/gif` an animation.
+impl WithFrames for PredictRequest {
+    fn frames(&mut self) -> &mut Vec<ImageBytes> {
+        &mut self.frames
+    }
+}
+
+/// Predicts the frames that follow a context, given as JSON or as a form (`multipart/form-data`) of image files `frames`
+/// and the rest as JSON in a part `request`. `Accept: image/png` gives a labelled contact sheet of frames and predictions,
+/// `image/gif` an animation.
 #[utoipa::path(
     post, path = "/v1/models/{model}/predict", tag = "models",
     params(("model" = String, Path, description = "The model's name")),
-    request_body = PredictRequest,
+    request_body(content((PredictRequest = "application/json"), (PredictForm = "multipart/form-data"))),
     responses(
         (status = 200, description = "The prediction", content(
             (PredictResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
@@ -87,7 +120,7 @@ pub(super) enum PredictError {
         (status = 400, description = "Not JSON", body = Problem),
         (status = 404, description = "No such model", body = Problem),
         (status = 413, description = "A body or a list over the limit", body = Problem),
-        (status = 415, description = "Not declared as JSON", body = Problem),
+        (status = 415, description = "Declared neither as JSON nor as a form", body = Problem),
         (status = 422, description = "Does not fit the model", body = Problem),
         (status = 503, description = "Too many predictions wait", body = Problem),
     )
@@ -96,57 +129,76 @@ pub(super) async fn predict(
     State(app): State<App>,
     Path(model): Path<String>,
     wanted: Wanted,
-    Json(request): Json<PredictRequest>,
+    Upload(request): Upload<PredictRequest>,
 ) -> Result<Response, ApiError> {
-    let manifest = app.predictor().model(&model)?;
-    let (max_frames, format) = (app.config().max_frames, request.format);
+    let model = app.predictor().active(&model)?;
+    let (manifest, format) = (Arc::clone(&model.manifest), request.format);
+    let max_frames = app.config().max_frames;
     let input = blocking(move || request.into_input(&manifest, max_frames)).await??;
     let seen = input.frames.clone();
-    let prediction = app.predictor().predict(&model, input).await?;
-    let manifest = app.predictor().model(&model)?;
-    let period_s = manifest.spec.frame_period_s;
+    let prediction = app.predictor().predict_by(&model, input).await?;
+    let period_s = model.manifest.spec.frame_period_s;
     blocking(move || answer(wanted, format, &seen, prediction, period_s)).await?
 }
 
 impl PredictRequest {
     fn into_input(self, manifest: &Manifest, max_frames: usize) -> Result<PredictionInput, PredictError> {
-        if self.frames.len() > max_frames {
-            return Err(PredictError::TooManyFrames {
-                found: self.frames.len(),
-                limit: max_frames,
-            });
-        }
-        let frame =
-            |(index, text): (usize, &String)| images::decode(&format!("frames[{index}]"), text, self.format, manifest);
-        let frames: Vec<Frame> = self.frames.iter().enumerate().map(frame).collect::<Result<_, _>>()?;
-        if let Some(states) = self.states.as_ref().filter(|states| states.len() != frames.len()) {
-            return Err(PredictError::StateCount {
-                found: states.len(),
-                frames: frames.len(),
-            });
-        }
-        let state = match (self.state, self.states) {
-            (Some(_), Some(_)) => return Err(PredictError::BothStates),
-            (state, None) => state,
-            (None, Some(states)) => states.into_iter().next_back(),
-        };
-        let state = state.map(RobotState::try_from).transpose();
+        let frames = decode_frames(self.frames, self.format, manifest, max_frames)?;
         Ok(PredictionInput {
-            frames,
+            state: last_state(self.state, self.states, frames.len())?,
             actions: actions("actions", self.actions)?,
-            state: state.map_err(|source| PredictError::Value {
-                field: "state".to_owned(),
-                source,
-            })?,
             future_actions: self
                 .future_actions
                 .map(|values| actions("future_actions", values))
                 .transpose()?,
+            frames,
         })
     }
 }
 
-fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, PredictError> {
+/// The images of `frames` in a request.
+pub(super) fn decode_frames(
+    frames: Vec<ImageBytes>,
+    format: ImageFormat,
+    manifest: &Manifest,
+    limit: usize,
+) -> Result<Vec<Frame>, PredictError> {
+    check_count("frames", frames.len(), limit)?;
+    let frame = |(index, image)| images::decode(&format!("frames[{index}]"), image, format, manifest);
+    Ok(frames
+        .into_iter()
+        .enumerate()
+        .map(frame)
+        .collect::<Result<_, ImageError>>()?)
+}
+
+/// The state at the last frame, from either field of a request.
+pub(super) fn last_state(
+    state: Option<Vec<f32>>,
+    states: Option<Vec<Vec<f32>>>,
+    frames: usize,
+) -> Result<Option<RobotState>, PredictError> {
+    if let Some(states) = states.as_ref().filter(|states| states.len() != frames) {
+        return Err(PredictError::StateCount {
+            found: states.len(),
+            frames,
+        });
+    }
+    let state = match (state, states) {
+        (Some(_), Some(_)) => return Err(PredictError::BothStates),
+        (state, None) => state,
+        (None, Some(states)) => states.into_iter().next_back(),
+    };
+    state
+        .map(RobotState::try_from)
+        .transpose()
+        .map_err(|source| PredictError::Value {
+            field: "state".to_owned(),
+            source,
+        })
+}
+
+pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, PredictError> {
     let action = |(index, values)| {
         Action::try_from(values).map_err(|source| PredictError::Value {
             field: format!("{field}[{index}]"),
@@ -156,6 +208,13 @@ fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, PredictErr
     values.into_iter().enumerate().map(action).collect()
 }
 
+pub(super) fn check_count(field: &'static str, found: usize, limit: usize) -> Result<(), PredictError> {
+    if found <= limit {
+        return Ok(());
+    }
+    Err(PredictError::TooMany { field, found, limit })
+}
+
 fn answer(
     wanted: Wanted,
     format: ImageFormat,
@@ -163,17 +222,10 @@ fn answer(
     prediction: Prediction,
     period_s: f64,
 ) -> Result<Response, ApiError> {
-    let picture = |result: Result<Vec<u8>, FrameError>, media_type: &'static str| {
-        let bytes = result.map_err(PredictError::Picture)?;
-        Ok(([(header::CONTENT_TYPE, media_type)], bytes).into_response())
-    };
     let predicted = &prediction.frames;
     match wanted {
-        Wanted::Png => picture(
-            prediction_sheet(seen, predicted, &[]).and_then(|sheet| codec::encode_png(&sheet)),
-            "image/png",
-        ),
-        Wanted::Gif => picture(picture::animation(seen, predicted, period_s), "image/gif"),
+        Wanted::Png => picture::png(prediction_sheet(seen, predicted, &[])),
+        Wanted::Gif => picture::gif(picture::animation(seen, predicted, period_s)),
         Wanted::Json => {
             let format = format.answer();
             Ok(axum::Json(PredictResponse {

@@ -1,15 +1,13 @@
 //! A picture of what a model can do: a simulated trial, what it predicts of it, and what came.
 
 use axum::extract::State;
-use axum::http::header;
-use axum::response::IntoResponse;
+use axum::response::Response;
 
 use super::error::{ApiError, Problem};
 use super::extract::Path;
-use super::predict::PredictError;
-use super::{App, blocking};
+use super::{App, blocking, picture};
 use crate::evaluation::figures::montage::prediction_sheet;
-use crate::frame::{Frame, codec};
+use crate::frame::Frame;
 use crate::nn::{Conditioning, ModelSpec};
 use crate::registry::Manifest;
 use crate::serving::PredictionInput;
@@ -33,16 +31,14 @@ const TRIAL: u64 = 1;
         (status = 503, description = "Too many predictions wait", body = Problem),
     )
 )]
-pub(super) async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<impl IntoResponse, ApiError> {
+pub(super) async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Response, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let (input, came) = blocking(move || simulate(&manifest))
         .await?
         .map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
     let predicted = app.predictor().predict(&model, input).await?.frames;
-    let sheet = blocking(move || prediction_sheet(&seen, &predicted, &came).and_then(|s| codec::encode_png(&s)));
-    let bytes = sheet.await?.map_err(PredictError::Picture)?;
-    Ok(([(header::CONTENT_TYPE, "image/png")], bytes))
+    blocking(move || picture::png(prediction_sheet(&seen, &predicted, &came))).await?
 }
 
 /// What the model sees of the trial, and the frames that came after.

@@ -1,12 +1,14 @@
-//! The messages of a stream in the sub-protocol `foreframe.v1.json`, from and to text. Knows no socket.
+//! The messages of a stream, the same in both sub-protocols; [`codec`] takes them from and to the wire. Knows no socket.
+//! `openapi/asyncapi.yaml` is the contract, with an example of each.
+
+pub mod codec;
 
 use serde::{Deserialize, Serialize};
 
-use super::images::ImageFormat;
+use super::images::{ImageBytes, ImageFormat};
 use crate::nn::ModelSpec;
 
-/// The sub-protocol's name.
-pub const SUBPROTOCOL: &str = "foreframe.v1.json";
+pub use codec::Codec;
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
@@ -14,9 +16,11 @@ pub const SUBPROTOCOL: &str = "foreframe.v1.json";
 pub enum ClientMessage {
     /// The next frame.
     Frame(FrameMessage),
+    /// How the session shall behave from here on.
+    Configure(ConfigureMessage),
     /// Asks for a sign of life.
     Ping(PingMessage),
-    /// Ends the stream.
+    /// Ends the stream; the session stays.
     Close(CloseMessage),
 }
 
@@ -24,25 +28,48 @@ pub enum ClientMessage {
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameMessage {
-    /// Counts from 0; a number once answered gets the same answer and changes nothing.
+    /// Counts from 0; a number once answered gets the last answer again and changes nothing.
     pub seq: u64,
     /// The client's clock in microseconds; echoed.
     pub timestamp_us: i64,
-    /// The image, base64.
-    pub image: String,
-    /// How the image is encoded, and how those of the answer shall be.
+    /// The image.
+    pub image: ImageBytes,
+    /// How the image is encoded, and how those of the answer shall be, unless configured.
     #[serde(default)]
     pub format: ImageFormat,
     /// What acts from this frame to the next, in the model's order and units; needed where the model is conditioned on
-    /// actions.
-    #[serde(default)]
+    /// actions and there is no `plan`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub action: Option<Vec<f32>>,
     /// What the robot says of itself at this frame; needed where the model is conditioned on it.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<Vec<f32>>,
     /// The actions to predict under, as many as the model's horizon; default: `action`, held.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<Vec<Vec<f32>>>,
+}
+
+/// Settings of a session; what is absent stays as it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConfigureMessage {
+    /// What a missing frame means.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub on_gap: Option<OnGap>,
+    /// How predicted frames are encoded, whatever the format of those sent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub format: Option<ImageFormat>,
+}
+
+/// What a missing frame means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnGap {
+    /// The frame that leaves others out is refused.
+    #[default]
+    Error,
+    /// The session goes on with it, and its answer says how many are missing.
+    Skip,
 }
 
 /// Asks for a `pong` with the same time.
@@ -60,11 +87,14 @@ pub struct PingMessage {
 pub struct CloseMessage {}
 
 /// What the server sends.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum ServerMessage {
     /// First of all.
     Ready {
+        /// The session's id; absent where the session ends with its stream.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// The model's name.
         model: String,
         /// The model's version.
@@ -73,7 +103,7 @@ pub enum ServerMessage {
         spec: Box<ModelSpec>,
         /// The stream's bounds.
         limits: StreamLimits,
-        /// The number the first frame shall have.
+        /// The number the next frame shall have.
         next_seq: u64,
     },
     /// Frames are missing until the context is full.
@@ -86,6 +116,8 @@ pub enum ServerMessage {
         have: usize,
         /// Frames needed.
         need: usize,
+        /// Frames left out before this one.
+        skipped: u64,
     },
     /// The frames to come.
     Prediction {
@@ -93,14 +125,31 @@ pub enum ServerMessage {
         seq: u64,
         /// The frame's time, echoed.
         timestamp_us: i64,
-        /// t+1, t+2, …, base64.
-        frames: Vec<String>,
+        /// t+1, t+2, ….
+        frames: Vec<ImageBytes>,
         /// How they are encoded.
         format: ImageFormat,
         /// How long it took.
         timing: Timing,
-        /// Frames since the last prediction that got none because the server was busy.
+        /// Predictions left out since the last one that was sent, because they were not read in time.
         dropped: u64,
+        /// Frames left out before this one.
+        skipped: u64,
+    },
+    /// Answers `configure`: how the session behaves now.
+    Configured {
+        /// What a missing frame means.
+        on_gap: OnGap,
+        /// How predicted frames are encoded; absent for as those sent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        format: Option<ImageFormat>,
+    },
+    /// Something that the client should know of; nothing was refused.
+    Warning {
+        /// What kind, for programs.
+        code: WarningCode,
+        /// What it is, and what would help.
+        detail: String,
     },
     /// Something was refused; the stream goes on.
     Error {
@@ -124,16 +173,24 @@ pub enum ServerMessage {
 }
 
 /// Bounds of a stream.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
 pub struct StreamLimits {
     /// Bytes of a message at most.
     pub message_bytes: usize,
+    /// Frames that may be sent before their answers have come; more are read later.
+    pub pipelined_frames: usize,
+    /// Bytes of answers that wait for a slow reader; beyond them the oldest predictions are dropped.
+    pub buffered_bytes: usize,
     /// Milliseconds of silence at most.
     pub idle_ms: u64,
+    /// Milliseconds for which the session outlives its socket; 0 where it ends with it.
+    pub grace_ms: u64,
 }
 
 /// How long a prediction took.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
 pub struct Timing {
     /// Microseconds in the queue.
     pub queue_us: u64,
@@ -141,8 +198,18 @@ pub struct Timing {
     pub compute_us: u64,
 }
 
+/// The kinds of warnings of a stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WarningCode {
+    /// The client reads too slowly: predictions are dropped.
+    Slow,
+    /// Nothing came for long; the stream will be closed.
+    Idle,
+}
+
 /// The kinds of errors of a stream.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ErrorCode {
     /// Not a message of this protocol.
@@ -158,92 +225,19 @@ pub enum ErrorCode {
 }
 
 /// Why a stream ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ClosingReason {
     /// The client asked.
     Asked,
     /// Nothing came for too long.
     Idle,
+    /// The session was taken over by a newer connection.
+    Replaced,
+    /// The session was deleted.
+    Deleted,
+    /// The client reads too slowly.
+    Slow,
     /// The server stops.
     Shutdown,
-}
-
-/// A client's message from its text. Errors: a sentence that says where the text goes wrong.
-pub fn decode(text: &str) -> Result<ClientMessage, String> {
-    serde_json::from_str(text).map_err(|error| format!("not a message of {SUBPROTOCOL}: {error}"))
-}
-
-/// A server's message as text.
-#[must_use]
-pub fn encode(message: &ServerMessage) -> String {
-    // No message holds a map with keys that are not text, the one thing that JSON cannot hold.
-    serde_json::to_string(message).unwrap_or_default()
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    proptest! {
-        #[test]
-        fn a_frame_message_survives_its_text(seq in any::<u64>(), timestamp_us in any::<i64>(), linear in -9.0f32..9.0) {
-            let message = ClientMessage::Frame(FrameMessage {
-                seq,
-                timestamp_us,
-                image: "AAAA".to_owned(),
-                format: ImageFormat::Raw,
-                action: Some(vec![linear]),
-                state: None,
-                plan: Some(vec![vec![linear]; 2]),
-            });
-            prop_assert_eq!(decode(&serde_json::to_string(&message).unwrap()).unwrap(), message);
-        }
-
-        #[test]
-        fn no_text_makes_the_codec_panic(text in ".{0,200}") {
-            let _ = decode(&text);
-        }
-    }
-
-    #[test]
-    fn an_unknown_field_is_refused_by_its_name() {
-        let error = decode(r#"{"type":"frame","seq":0,"timestamp_us":0,"image":"","colour":1}"#).unwrap_err();
-        assert!(error.contains("unknown field `colour`"), "{error}");
-        assert!(decode(r#"{"type":"close","why":1}"#).is_err());
-    }
-
-    #[test]
-    fn an_unknown_type_is_refused_with_those_there_are() {
-        let error = decode(r#"{"type":"configure"}"#).unwrap_err();
-        assert!(error.contains("expected one of `frame`, `ping`, `close`"), "{error}");
-    }
-
-    #[test]
-    fn the_wire_text_of_the_answers_is_as_promised() {
-        let prediction = ServerMessage::Prediction {
-            seq: 7,
-            timestamp_us: 9,
-            frames: vec!["AAAA".to_owned()],
-            format: ImageFormat::Raw,
-            timing: Timing {
-                queue_us: 1,
-                compute_us: 2,
-            },
-            dropped: 0,
-        };
-        insta::assert_snapshot!(encode(&prediction), @r#"{"type":"prediction","seq":7,"timestamp_us":9,"frames":["AAAA"],"format":"raw","timing":{"queue_us":1,"compute_us":2},"dropped":0}"#);
-        let gap = ServerMessage::Error {
-            code: ErrorCode::Gap,
-            detail: "seq is 9; seq 7 is next".to_owned(),
-            next_seq: 7,
-        };
-        insta::assert_snapshot!(encode(&gap), @r#"{"type":"error","code":"gap","detail":"seq is 9; seq 7 is next","next_seq":7}"#);
-        let closing = ServerMessage::Closing {
-            reason: ClosingReason::Shutdown,
-        };
-        insta::assert_snapshot!(encode(&closing), @r#"{"type":"closing","reason":"shutdown"}"#);
-    }
 }

@@ -2,11 +2,15 @@
 
 use std::time::Instant;
 
-/// What the policy knows of a waiting request.
+/// What the policy knows of a waiting task.
 #[derive(Clone, Copy, Debug)]
-pub struct Candidate<'a> {
-    /// The model it asks for.
-    pub model: &'a str,
+pub struct Candidate {
+    /// The version of a model that it asks for; equal if and only if it is the same.
+    pub model: usize,
+    /// The session that it is a step of.
+    pub session: Option<u64>,
+    /// Futures that it asks for, or 1.
+    pub rows: usize,
     /// Whether its client has gone.
     pub abandoned: bool,
     /// When its answer would be too late.
@@ -22,17 +26,23 @@ pub struct Plan {
     pub batch: Vec<usize>,
 }
 
-/// The oldest request that is still wanted chooses the model; those behind it for the same model join in order, up to
-/// `limit`.
+/// The oldest task that is still wanted chooses the model. Those behind it for the same model join in order as long as the
+/// rows stay within the limit, at most one of a session; the oldest goes even if it alone is over the limit.
 #[must_use]
-pub fn plan(waiting: &[Candidate<'_>], now: Instant, limit: usize) -> Plan {
+pub fn plan(waiting: &[Candidate], now: Instant, row_limit: usize) -> Plan {
     let mut plan = Plan::default();
-    let mut model = None;
+    let (mut model, mut rows, mut sessions) = (None, 0, Vec::new());
     for (position, candidate) in waiting.iter().enumerate() {
         if candidate.abandoned || candidate.deadline <= now {
             plan.discard.push(position);
-        } else if plan.batch.len() < limit && *model.get_or_insert(candidate.model) == candidate.model {
+            continue;
+        }
+        let fits = plan.batch.is_empty() || rows + candidate.rows <= row_limit;
+        let is_later_step = candidate.session.is_some_and(|session| sessions.contains(&session));
+        sessions.extend(candidate.session);
+        if fits && !is_later_step && *model.get_or_insert(candidate.model) == candidate.model {
             plan.batch.push(position);
+            rows += candidate.rows;
         }
     }
     plan
@@ -46,63 +56,118 @@ mod tests {
 
     use super::*;
 
-    fn candidates(kinds: &[(u8, bool, bool)], now: Instant) -> Vec<Candidate<'static>> {
+    #[derive(Clone, Debug)]
+    struct Kind {
+        model: usize,
+        session: Option<u64>,
+        rows: usize,
+        abandoned: bool,
+        late: bool,
+    }
+
+    fn of(model: usize) -> Kind {
+        Kind {
+            model,
+            session: None,
+            rows: 1,
+            abandoned: false,
+            late: false,
+        }
+    }
+
+    fn kinds() -> impl Strategy<Value = Vec<Kind>> {
+        let kind = (
+            0usize..3,
+            proptest::option::of(0u64..4),
+            1usize..6,
+            any::<bool>(),
+            any::<bool>(),
+        );
+        let kind = kind.prop_map(|(model, session, rows, abandoned, late)| Kind {
+            model,
+            session,
+            rows,
+            abandoned,
+            late,
+        });
+        proptest::collection::vec(kind, 0..40)
+    }
+
+    fn candidates(kinds: &[Kind], now: Instant) -> Vec<Candidate> {
         kinds
             .iter()
-            .map(|&(model, abandoned, late)| Candidate {
-                model: ["a", "b", "c"][usize::from(model % 3)],
-                abandoned,
-                deadline: if late { now } else { now + Duration::from_secs(1) },
+            .map(|kind| Candidate {
+                model: kind.model,
+                session: kind.session,
+                rows: kind.rows,
+                abandoned: kind.abandoned,
+                deadline: if kind.late { now } else { now + Duration::from_secs(1) },
             })
             .collect()
     }
 
-    #[test]
-    fn the_oldest_request_chooses_the_model_and_others_of_it_join() {
+    fn planned(kinds: &[Kind], limit: usize) -> Plan {
         let now = Instant::now();
-        let waiting = candidates(
-            &[
-                (0, true, false),
-                (1, false, false),
-                (0, false, false),
-                (1, false, false),
-            ],
-            now,
-        );
-        let plan = plan(&waiting, now, 8);
-        assert_eq!(plan.discard, [0]);
-        assert_eq!(plan.batch, [1, 3]);
+        plan(&candidates(kinds, now), now, limit)
     }
 
     #[test]
-    fn a_request_past_its_deadline_is_not_computed() {
-        let now = Instant::now();
-        let waiting = candidates(&[(0, false, true)], now);
-        assert_eq!(
-            plan(&waiting, now, 8),
-            Plan {
-                discard: vec![0],
-                batch: vec![]
-            }
-        );
+    fn the_oldest_task_chooses_the_model_and_others_of_it_join() {
+        let abandoned = Kind {
+            abandoned: true,
+            ..of(0)
+        };
+        let plan = planned(&[abandoned, of(1), of(0), of(1)], 8);
+        assert_eq!((plan.discard, plan.batch), (vec![0], vec![1, 3]));
+    }
+
+    #[test]
+    fn a_task_past_its_deadline_is_not_computed() {
+        let plan = planned(&[Kind { late: true, ..of(0) }], 8);
+        assert_eq!((plan.discard, plan.batch), (vec![0], vec![]));
+    }
+
+    #[test]
+    fn a_second_step_of_a_session_waits_for_the_next_batch() {
+        let step = |session| Kind {
+            session: Some(session),
+            ..of(0)
+        };
+        assert_eq!(planned(&[step(1), step(1), step(2)], 8).batch, [0, 2]);
+    }
+
+    #[test]
+    fn many_futures_go_alone_and_hold_nobody_small_back() {
+        let rows = |rows| Kind { rows, ..of(0) };
+        assert_eq!(planned(&[rows(100), of(0)], 8).batch, [0]);
+        assert_eq!(planned(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
     }
 
     proptest! {
         #[test]
-        fn a_batch_is_of_one_model_in_order_within_the_limit_and_holds_the_oldest(
-            kinds in proptest::collection::vec(any::<(u8, bool, bool)>(), 0..40),
-            limit in 1usize..10,
-        ) {
+        fn a_batch_is_of_one_model_in_order_within_the_limit_and_holds_the_oldest(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now);
             let plan = plan(&waiting, now, limit);
-            prop_assert!(plan.batch.len() <= limit);
+            let rows: usize = plan.batch.iter().map(|&i| waiting[i].rows).sum();
+            prop_assert!(rows <= limit || plan.batch.len() == 1);
             prop_assert!(plan.batch.is_sorted());
             prop_assert!(plan.batch.iter().all(|&i| waiting[i].model == waiting[plan.batch[0]].model));
-            let wanted = |c: &Candidate<'_>| !c.abandoned && c.deadline > now;
+            let wanted = |c: &Candidate| !c.abandoned && c.deadline > now;
             prop_assert_eq!(plan.batch.first().copied(), waiting.iter().position(wanted));
             prop_assert!(plan.discard.iter().all(|&i| !wanted(&waiting[i])));
             prop_assert_eq!(plan.discard.len(), waiting.iter().filter(|c| !wanted(c)).count());
+        }
+
+        #[test]
+        fn of_a_session_only_its_oldest_step_is_computed(kinds in kinds(), limit in 1usize..10) {
+            let now = Instant::now();
+            let waiting = candidates(&kinds, now);
+            for &position in &plan(&waiting, now, limit).batch {
+                let earlier = waiting[..position].iter().filter(|c| !c.abandoned && c.deadline > now);
+                let session = waiting[position].session;
+                prop_assert!(session.is_none() || earlier.clone().all(|c| c.session != session));
+            }
         }
     }
 }

@@ -1,41 +1,43 @@
-//! What is known of the loaded models without owning them: read by the handles, written by the worker.
+//! The models that answer, by name. A handle to one keeps that version alive after another has taken its name.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::ServingError;
-use crate::registry::Manifest;
+use crate::registry::LoadedModel;
 
 pub(super) struct Catalog {
-    manifests: RwLock<BTreeMap<String, Arc<Manifest>>>,
+    models: RwLock<BTreeMap<String, Arc<LoadedModel>>>,
     ready: AtomicBool,
 }
 
 impl Catalog {
-    pub(super) fn of(manifests: impl Iterator<Item = Manifest>) -> Self {
-        let named = manifests.map(|manifest| (manifest.name.clone(), Arc::new(manifest)));
+    pub(super) fn of(models: Vec<LoadedModel>) -> Self {
+        let named = models
+            .into_iter()
+            .map(|model| (model.manifest.name.clone(), Arc::new(model)));
         Self {
-            manifests: RwLock::new(named.collect()),
+            models: RwLock::new(named.collect()),
             ready: AtomicBool::new(false),
         }
     }
 
-    pub(super) fn insert(&self, manifest: Manifest) {
-        let mut manifests = self.manifests.write().unwrap_or_else(PoisonError::into_inner);
-        manifests.insert(manifest.name.clone(), Arc::new(manifest));
+    pub(super) fn insert(&self, model: LoadedModel) {
+        let mut models = self.models.write().unwrap_or_else(PoisonError::into_inner);
+        models.insert(model.manifest.name.clone(), Arc::new(model));
     }
 
-    pub(super) fn all(&self) -> Vec<Arc<Manifest>> {
-        let manifests = self.manifests.read().unwrap_or_else(PoisonError::into_inner);
-        manifests.values().cloned().collect()
+    pub(super) fn all(&self) -> Vec<Arc<LoadedModel>> {
+        let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
+        models.values().cloned().collect()
     }
 
-    pub(super) fn find(&self, name: &str) -> Result<Arc<Manifest>, ServingError> {
-        let manifests = self.manifests.read().unwrap_or_else(PoisonError::into_inner);
-        manifests.get(name).cloned().ok_or_else(|| ServingError::UnknownModel {
+    pub(super) fn find(&self, name: &str) -> Result<Arc<LoadedModel>, ServingError> {
+        let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
+        models.get(name).cloned().ok_or_else(|| ServingError::UnknownModel {
             name: name.to_owned(),
-            known: manifests.keys().cloned().collect(),
+            known: models.keys().cloned().collect(),
         })
     }
 

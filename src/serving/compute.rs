@@ -4,72 +4,178 @@ use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 
-use super::{PredictionInput, ServingError};
+use super::{PredictionInput, Premise, ServingError, Task};
 use crate::frame::Frame;
+use crate::nn::tensors::with_values;
 use crate::nn::{Condition, ModelSpec};
 use crate::registry::LoadedModel;
+use crate::types::{Action, RobotState};
+
+/// A frame as the model keeps it, `[F]`.
+pub type Features = Arc<[f32]>;
+
+/// Frames that are decoded together at most, so that many futures take no more memory than their pixels.
+const DECODED_FRAMES: usize = 1024;
+
+/// What came of a [`Task`].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Computation {
+    /// Of the task's frames, in order.
+    pub(super) features: Vec<Features>,
+    /// One for each of the task's premises, in order.
+    pub(super) futures: Vec<Vec<Frame>>,
+}
 
 /// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
 /// `Model`, `Tensor`, `Frame`.
 pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Vec<Frame>>, ServingError> {
-    let (name, spec) = (loaded.manifest.name.as_str(), loaded.model.spec());
-    for input in inputs {
-        input.check(name, spec)?;
+    let tasks = inputs
+        .iter()
+        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
+        .collect::<Result<Vec<Task>, ServingError>>()?;
+    let computed = run(loaded, &tasks.iter().collect::<Vec<_>>())?;
+    Ok(computed
+        .into_iter()
+        .flat_map(|computation| computation.futures)
+        .collect())
+}
+
+/// Computes the tasks as one batch: all new frames are encoded in one product, all futures predicted in one.
+/// Errors: `Model` if one does not fit the model, `Tensor`, `Frame`.
+pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Computation>, ServingError> {
+    let mut encoded = encode(loaded, tasks)?.into_iter();
+    let mut computations: Vec<Computation> = tasks
+        .iter()
+        .map(|task| Computation {
+            features: encoded.by_ref().take(task.frames.len()).collect(),
+            futures: Vec::with_capacity(task.premises.len()),
+        })
+        .collect();
+    let (mut windows, mut window_of) = (Vec::new(), Vec::new());
+    for (task, computation) in tasks
+        .iter()
+        .zip(&computations)
+        .filter(|(task, _)| !task.premises.is_empty())
+    {
+        window_of.extend(vec![windows.len() as u32; task.premises.len()]);
+        windows.push(task.known.iter().chain(&computation.features));
     }
-    let frames = frames_tensor(spec, inputs).map_err(tensor_error)?;
-    let condition = condition(name, spec, inputs)?;
+    let premises: Vec<&Premise> = tasks.iter().flat_map(|task| &task.premises).collect();
+    if premises.is_empty() {
+        return Ok(computations);
+    }
+    let values: Vec<f32> = windows
+        .into_iter()
+        .flatten()
+        .flat_map(|features| features.iter().copied())
+        .collect();
+    let mut futures = predict_windows(loaded, values, &window_of, &premises)?.into_iter();
+    for (task, computation) in tasks.iter().zip(&mut computations) {
+        computation.futures.extend(futures.by_ref().take(task.premises.len()));
+    }
+    Ok(computations)
+}
+
+/// The features of all the tasks' frames, in order.
+fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
+    let spec = loaded.model.spec();
+    let frames: Vec<&Frame> = tasks.iter().flat_map(|task| &task.frames).collect();
+    if frames.is_empty() {
+        return Ok(Vec::new());
+    }
+    let values: Vec<f32> = frames.iter().flat_map(|frame| spec.preprocess.forward(frame)).collect();
+    let features = Tensor::from_vec(values, (frames.len(), spec.pixels()), &Device::Cpu)
+        .map_err(tensor_error)
+        .and_then(|frames| {
+            loaded
+                .model
+                .encode_frames(&frames)
+                .map_err(|source| model_error(loaded, source))
+        })?;
+    with_values(&features, |values| {
+        values.chunks_exact(spec.features).map(Features::from).collect()
+    })
+    .map_err(tensor_error)
+}
+
+/// The futures of the premises: `values` are the windows' features, one after the other.
+fn predict_windows(
+    loaded: &LoadedModel,
+    values: Vec<f32>,
+    window_of: &[u32],
+    premises: &[&Premise],
+) -> Result<Vec<Vec<Frame>>, ServingError> {
+    let spec = loaded.model.spec();
+    let count = values.len() / (spec.context * spec.features);
+    let features =
+        Tensor::from_vec(values, (count, spec.context, spec.features), &Device::Cpu).map_err(tensor_error)?;
     let predicted = loaded
         .model
-        .predict_frames(&frames, &condition)
-        .map_err(|source| ServingError::Model {
-            model: name.to_owned(),
-            source: Arc::new(source),
-        })?;
-    let values = predicted.to_vec3::<f32>().map_err(tensor_error)?;
-    let frame = |pixels: &Vec<f32>| {
+        .predict_futures(&features, window_of, &condition(spec, premises)?)
+        .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
+        .map_err(|source| model_error(loaded, source))?;
+    let total = premises.len() * spec.horizon;
+    let mut frames = Vec::with_capacity(total);
+    for first in (0..total).step_by(DECODED_FRAMES) {
+        let part = predicted
+            .narrow(0, first, DECODED_FRAMES.min(total - first))
+            .map_err(tensor_error)?;
+        let pixels = loaded
+            .model
+            .decode_frames(&part)
+            .map_err(|source| model_error(loaded, source))?;
+        frames.extend(with_values(&pixels, |values| images(loaded, values)).map_err(tensor_error)??);
+    }
+    let mut frames = frames.into_iter();
+    Ok(premises
+        .iter()
+        .map(|_| frames.by_ref().take(spec.horizon).collect())
+        .collect())
+}
+
+fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
+    let spec = loaded.model.spec();
+    let frame = |pixels| {
         spec.preprocess
             .frame_from(pixels, spec.frame_width_px, spec.frame_height_px)
-            .map_err(|source| ServingError::Frame {
-                model: name.to_owned(),
-                source,
-            })
     };
-    values
+    let frames = values.chunks_exact(spec.pixels()).map(frame);
+    frames.collect::<Result<_, _>>().map_err(|source| ServingError::Frame {
+        model: loaded.manifest.name.clone(),
+        source,
+    })
+}
+
+/// Actions `[N, horizon, A]` and state `[N, S]` in raw units, where the model takes them.
+fn condition(spec: &ModelSpec, premises: &[&Premise]) -> Result<Condition, ServingError> {
+    let actions = premises
         .iter()
-        .map(|horizon| horizon.iter().map(frame).collect())
-        .collect()
-}
-
-/// `[B, T, P]` in the model's space.
-fn frames_tensor(spec: &ModelSpec, inputs: &[&PredictionInput]) -> candle_core::Result<Tensor> {
-    let pixels = spec.frame_width_px as usize * spec.frame_height_px as usize;
-    let mut values = Vec::with_capacity(inputs.len() * spec.context * pixels);
-    for frame in inputs.iter().flat_map(|input| &input.frames) {
-        values.extend(spec.preprocess.forward(frame));
-    }
-    Tensor::from_vec(values, (inputs.len(), spec.context, pixels), &Device::Cpu)
-}
-
-/// Actions `[B, horizon, A]` and state `[B, S]` in raw units, where the model takes them.
-fn condition(name: &str, spec: &ModelSpec, inputs: &[&PredictionInput]) -> Result<Condition, ServingError> {
-    let (mut actions, mut states) = (Vec::new(), Vec::new());
-    for input in inputs {
-        for action in input.future_actions(name, spec)?.into_iter().flatten() {
-            actions.extend_from_slice(action);
-        }
-        states.extend_from_slice(input.state(name, spec)?.unwrap_or_default());
-    }
-    let (batch, device) = (inputs.len(), &Device::Cpu);
+        .flat_map(|premise| &premise.actions)
+        .flat_map(Action::as_slice);
+    let states = premises
+        .iter()
+        .flat_map(|premise| &premise.state)
+        .flat_map(RobotState::as_slice);
     let tensor = |values: Vec<f32>, shape: &[usize]| {
         let given = !values.is_empty();
         given
-            .then(|| Tensor::from_vec(values, shape, device).map_err(tensor_error))
+            .then(|| Tensor::from_vec(values, shape, &Device::Cpu).map_err(tensor_error))
             .transpose()
     };
     Ok(Condition {
-        actions: tensor(actions, &[batch, spec.horizon, spec.actions.len()])?,
-        state: tensor(states, &[batch, spec.states.len()])?,
+        actions: tensor(
+            actions.copied().collect(),
+            &[premises.len(), spec.horizon, spec.actions.len()],
+        )?,
+        state: tensor(states.copied().collect(), &[premises.len(), spec.states.len()])?,
     })
+}
+
+fn model_error(loaded: &LoadedModel, source: crate::nn::NnError) -> ServingError {
+    ServingError::Model {
+        model: loaded.manifest.name.clone(),
+        source: Arc::new(source),
+    }
 }
 
 fn tensor_error(source: candle_core::Error) -> ServingError {

@@ -1,7 +1,8 @@
 //! What a prediction takes, and whether it fits a model.
 
+use super::task::{Premise, REQUEST, Task, Told};
 use crate::frame::Frame;
-use crate::nn::{Conditioning, ModelSpec};
+use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
 
 /// What does not fit, by the name of the field.
@@ -42,8 +43,10 @@ pub enum InputError {
         frames: usize,
     },
     /// Not as many future actions as the model's horizon.
-    #[error("future_actions holds {found} actions; model \"{model}\" takes {expected}")]
+    #[error("{field} holds {found} actions; model \"{model}\" takes {expected}")]
     FutureActionCount {
+        /// The field, with its index.
+        field: String,
         /// The model's name.
         model: String,
         /// Actions given.
@@ -64,6 +67,12 @@ pub enum InputError {
         expected: usize,
         /// Their names and units.
         channels: String,
+    },
+    /// Candidates to tell apart, and a model that is told nothing.
+    #[error("model \"{model}\" takes no actions, so every candidate has the same future; ask for one by predict")]
+    Unconditioned {
+        /// The model's name.
+        model: String,
     },
     /// The model needs it and it was not given.
     #[error("{field} is missing; model \"{model}\" takes {channels}")]
@@ -94,6 +103,17 @@ pub struct PredictionInput {
 impl PredictionInput {
     /// Whether the model named `model` takes this. Errors name the field, what it is and what it should be.
     pub fn check(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
+        self.check_frames(model, spec)?;
+        if self.actions.len() > self.frames.len() {
+            return Err(InputError::ActionCount {
+                found: self.actions.len(),
+                frames: self.frames.len(),
+            });
+        }
+        self.premise(model, spec).map(|_| ())
+    }
+
+    pub(super) fn check_frames(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
         if self.frames.len() != spec.context {
             return Err(InputError::FrameCount {
                 model: model.to_owned(),
@@ -109,68 +129,27 @@ impl PredictionInput {
                 (frame.width(), frame.height()),
             )?;
         }
-        if self.actions.len() > self.frames.len() {
-            return Err(InputError::ActionCount {
-                found: self.actions.len(),
-                frames: self.frames.len(),
-            });
-        }
-        self.check_conditions(model, spec)
+        Ok(())
     }
 
-    /// Whether actions and state fit, whatever the frames.
-    pub(crate) fn check_conditions(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
-        self.future_actions(model, spec)?;
-        self.state(model, spec).map(|_| ())
-    }
-
-    /// The actions the model is conditioned on, one a predicted frame, or `None` where it takes none.
-    pub(super) fn future_actions(&self, model: &str, spec: &ModelSpec) -> Result<Option<Vec<&[f32]>>, InputError> {
-        if spec.conditioning == Conditioning::None {
-            return Ok(None);
-        }
-        for (field, actions) in [
-            ("actions", Some(&self.actions)),
-            ("future_actions", self.future_actions.as_ref()),
-        ] {
-            for (index, action) in actions.into_iter().flatten().enumerate() {
-                let field = format!("{field}[{index}]");
-                check_length(field, model, action.as_slice().len(), &channels_of(&spec.actions))?;
-            }
-        }
-        match (&self.future_actions, self.actions.last()) {
-            (Some(actions), _) if actions.len() == spec.horizon => {
-                Ok(Some(actions.iter().map(Action::as_slice).collect()))
-            }
-            (Some(actions), _) => Err(InputError::FutureActionCount {
-                model: model.to_owned(),
-                found: actions.len(),
-                expected: spec.horizon,
-            }),
-            (None, Some(held)) => Ok(Some(vec![held.as_slice(); spec.horizon])),
-            (None, None) => Err(InputError::Missing {
-                field: "future_actions",
-                model: model.to_owned(),
-                channels: channels_of(&spec.actions).join(", "),
-            }),
-        }
-    }
-
-    /// The state the model is conditioned on, or `None` where it takes none.
-    pub(super) fn state(&self, model: &str, spec: &ModelSpec) -> Result<Option<&[f32]>, InputError> {
-        if spec.conditioning != Conditioning::StateAction {
-            return Ok(None);
-        }
-        let channels = channels_of(&spec.states);
-        let Some(state) = &self.state else {
-            return Err(InputError::Missing {
-                field: "state",
-                model: model.to_owned(),
-                channels: channels.join(", "),
-            });
+    /// What the future is predicted under. Errors name the field, what it is and what it should be.
+    pub(crate) fn premise(&self, model: &str, spec: &ModelSpec) -> Result<Premise, InputError> {
+        let told = Told {
+            past: &self.actions,
+            future: self.future_actions.as_deref(),
+            state: self.state.as_ref(),
         };
-        check_length("state".to_owned(), model, state.as_slice().len(), &channels)?;
-        Ok(Some(state.as_slice()))
+        Premise::new(told, &REQUEST, model, spec)
+    }
+
+    /// All of it as a task of one future. Errors: as [`PredictionInput::check`].
+    pub(crate) fn into_task(self, model: &str, spec: &ModelSpec) -> Result<Task, InputError> {
+        self.check(model, spec)?;
+        Ok(Task {
+            premises: vec![self.premise(model, spec)?],
+            frames: self.frames,
+            ..Task::default()
+        })
     }
 }
 
@@ -192,24 +171,4 @@ pub(crate) fn check_size(
         model_width: spec.frame_width_px,
         model_height: spec.frame_height_px,
     })
-}
-
-fn check_length(field: String, model: &str, found: usize, channels: &[String]) -> Result<(), InputError> {
-    if found == channels.len() {
-        return Ok(());
-    }
-    Err(InputError::Dimension {
-        field,
-        model: model.to_owned(),
-        found,
-        expected: channels.len(),
-        channels: channels.join(", "),
-    })
-}
-
-fn channels_of(scales: &[crate::nn::ChannelScale]) -> Vec<String> {
-    scales
-        .iter()
-        .map(|scale| format!("{} {}", scale.name, scale.unit).trim_end().to_owned())
-        .collect()
 }

@@ -2,26 +2,27 @@
 
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use tokio::sync::oneshot;
 
 use super::batch::{self, Candidate};
-use super::meter;
-use super::{Prediction, PredictionInput, ServingError};
+use super::{Computed, ServingError, Task, meter};
 use crate::registry::LoadedModel;
 
 /// A full queue of the reference model's predictions is worked off well within this.
 const RETRY_AFTER_S: u64 = 1;
 
-/// A request that waits.
+/// A task that waits.
 pub(super) struct Waiting {
-    pub(super) model: String,
-    pub(super) input: PredictionInput,
+    pub(super) model: Arc<LoadedModel>,
+    pub(super) task: Task,
+    /// The session that it is a step of.
+    pub(super) session: Option<u64>,
     pub(super) accepted: Instant,
     pub(super) deadline: Instant,
-    pub(super) reply: oneshot::Sender<Result<Prediction, ServingError>>,
+    pub(super) reply: oneshot::Sender<Result<Computed, ServingError>>,
 }
 
 /// A model to take in.
@@ -124,11 +125,13 @@ impl Queue {
 
 impl State {
     fn next_batch(&mut self, now: Instant, limit: usize) -> Vec<Waiting> {
-        let candidates: Vec<Candidate<'_>> = self
+        let candidates: Vec<Candidate> = self
             .waiting
             .iter()
             .map(|waiting| Candidate {
-                model: &waiting.model,
+                model: Arc::as_ptr(&waiting.model).addr(),
+                session: waiting.session,
+                rows: waiting.task.premises.len().max(1),
                 abandoned: waiting.reply.is_closed(),
                 deadline: waiting.deadline,
             })
@@ -163,13 +166,17 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::serving::test_model;
 
-    fn request(model: &str) -> (Waiting, oneshot::Receiver<Result<Prediction, ServingError>>) {
+    type Answer = oneshot::Receiver<Result<Computed, ServingError>>;
+
+    fn request(model: &Arc<LoadedModel>) -> (Waiting, Answer) {
         let (reply, answer) = oneshot::channel();
         let accepted = Instant::now();
         let waiting = Waiting {
-            model: model.to_owned(),
-            input: PredictionInput::default(),
+            model: Arc::clone(model),
+            task: Task::default(),
+            session: None,
             accepted,
             deadline: accepted + Duration::from_mins(1),
             reply,
@@ -179,8 +186,8 @@ mod tests {
 
     #[test]
     fn a_full_queue_refuses_with_an_error_and_gives_its_size() {
-        let queue = Queue::new(2, 8);
-        let (requests, _answers): (Vec<_>, Vec<_>) = (0..3).map(|_| request("a")).unzip();
+        let (queue, model) = (Queue::new(2, 8), Arc::new(test_model()));
+        let (requests, _answers): (Vec<_>, Vec<_>) = (0..3).map(|_| request(&model)).unzip();
         let results: Vec<_> = requests.into_iter().map(|request| queue.push(request)).collect();
         assert!(results[0].is_ok() && results[1].is_ok());
         assert!(matches!(results[2], Err(ServingError::QueueFull { capacity: 2, .. })));
@@ -188,24 +195,35 @@ mod tests {
 
     #[test]
     fn an_abandoned_request_holds_no_place_and_is_never_computed() {
-        let queue = Queue::new(1, 8);
-        let (first, answer) = request("a");
+        let (queue, one, other) = (Queue::new(1, 8), Arc::new(test_model()), Arc::new(test_model()));
+        let (first, answer) = request(&one);
         queue.push(first).unwrap();
         drop(answer);
-        let (second, _answer) = request("b");
+        let (second, _answer) = request(&other);
         queue.push(second).unwrap();
         let Work::Batch(batch) = queue.take() else { panic!() };
         assert_eq!(batch.len(), 1);
-        assert_eq!(batch[0].model, "b");
+        assert!(Arc::ptr_eq(&batch[0].model, &other));
+    }
+
+    #[test]
+    fn two_versions_of_a_model_are_never_computed_together() {
+        let (queue, old, new) = (Queue::new(4, 8), Arc::new(test_model()), Arc::new(test_model()));
+        let (requests, _answers): (Vec<_>, Vec<_>) = [&old, &new, &old].into_iter().map(request).unzip();
+        for request in requests {
+            queue.push(request).unwrap();
+        }
+        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 2));
+        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 1));
     }
 
     #[test]
     fn a_closed_queue_is_worked_off_and_then_stops() {
-        let queue = Queue::new(4, 1);
-        let (first, _answer) = request("a");
+        let (queue, model) = (Queue::new(4, 1), Arc::new(test_model()));
+        let (first, _answer) = request(&model);
         queue.push(first).unwrap();
         queue.close();
-        assert!(matches!(queue.push(request("a").0), Err(ServingError::Stopped)));
+        assert!(matches!(queue.push(request(&model).0), Err(ServingError::Stopped)));
         assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 1));
         assert!(matches!(queue.take(), Work::Stop));
     }

@@ -1,6 +1,5 @@
-//! The one thread that owns the models.
+//! The one thread that computes with the models.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Instant;
@@ -9,19 +8,13 @@ use tracing::{error, info};
 
 use super::catalog::Catalog;
 use super::queue::{Load, Queue, Waiting, Work};
-use super::{Prediction, PredictionInput, ServingError, compute, meter};
+use super::{Computed, PredictionInput, ServingError, Task, compute, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::{Action, RobotState};
 
-type Models = BTreeMap<String, LoadedModel>;
-
-pub(super) fn spawn(
-    models: Vec<LoadedModel>,
-    queue: Arc<Queue>,
-    catalog: Arc<Catalog>,
-) -> Result<JoinHandle<()>, ServingError> {
+pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHandle<()>, ServingError> {
     std::thread::Builder::new()
         .name("inference".to_owned())
         .spawn(move || {
@@ -31,7 +24,7 @@ pub(super) fn spawn(
                 .use_current_thread()
                 .build();
             match pool {
-                Ok(pool) => pool.install(|| run(models, &queue, &catalog)),
+                Ok(pool) => pool.install(|| run(&queue, &catalog)),
                 Err(error) => error!(%error, "the predictor's thread pool could not be built"),
             }
             queue.close();
@@ -39,29 +32,26 @@ pub(super) fn spawn(
         .map_err(ServingError::Thread)
 }
 
-fn run(models: Vec<LoadedModel>, queue: &Queue, catalog: &Catalog) {
-    let mut owned = Models::new();
-    for model in models {
+fn run(queue: &Queue, catalog: &Catalog) {
+    for model in catalog.all() {
         if let Err(error) = warm_up(&model) {
             error!(model.id = %model.manifest.name, %error, "model failed its first prediction");
         }
-        owned.insert(model.manifest.name.clone(), model);
     }
     catalog.set_ready();
     loop {
         match queue.take() {
-            Work::Load(load) => take_in(*load, &mut owned, catalog),
-            Work::Batch(batch) => answer(&owned, batch),
+            Work::Load(load) => take_in(*load, catalog),
+            Work::Batch(batch) => answer(batch),
             Work::Stop => return,
         }
     }
 }
 
-fn take_in(Load { model, reply }: Load, owned: &mut Models, catalog: &Catalog) {
+fn take_in(Load { model, reply }: Load, catalog: &Catalog) {
     let result = warm_up(&model);
     if result.is_ok() {
-        catalog.insert(model.manifest.clone());
-        owned.insert(model.manifest.name.clone(), model);
+        catalog.insert(model);
     }
     // Whoever asked may have gone; the model serves all the same.
     let _ = reply.send(result);
@@ -91,34 +81,33 @@ fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
     })
 }
 
-fn answer(owned: &Models, batch: Vec<Waiting>) {
-    let Some(model) = batch.first().and_then(|first| owned.get(&first.model)) else {
-        return; // The dropped replies say that the predictor stopped; models are never taken out.
+fn answer(batch: Vec<Waiting>) {
+    let Some(model) = batch.first().map(|first| Arc::clone(&first.model)) else {
+        return;
     };
     let started = Instant::now();
-    let inputs: Vec<&PredictionInput> = batch.iter().map(|waiting| &waiting.input).collect();
-    match compute::predict(model, &inputs) {
-        Ok(predicted) => {
+    let tasks: Vec<&Task> = batch.iter().map(|waiting| &waiting.task).collect();
+    match compute::run(&model, &tasks) {
+        Ok(computations) => {
             let compute_us = micros_since(started);
             meter::computed(
                 &model.manifest.name,
                 batch.iter().map(|waiting| waiting.accepted),
                 started,
             );
-            for (waiting, frames) in batch.into_iter().zip(predicted) {
-                let queue_us = micros(started.saturating_duration_since(waiting.accepted));
-                let prediction = Prediction {
-                    model: model.manifest.name.clone(),
-                    version: model.manifest.version,
-                    frames,
-                    queue_us,
+            for (waiting, computation) in batch.into_iter().zip(computations) {
+                let computed = Computed {
+                    features: computation.features,
+                    futures: computation.futures,
+                    queue_us: micros(started.saturating_duration_since(waiting.accepted)),
                     compute_us,
                 };
-                let _ = waiting.reply.send(Ok(prediction));
+                // Nobody listens if the client has gone.
+                let _ = waiting.reply.send(Ok(computed));
             }
         }
-        // One bad input must not fail its neighbours.
-        Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(owned, vec![waiting])),
+        // One bad task must not fail its neighbours.
+        Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(vec![waiting])),
         Err(error) => {
             meter::refused("error");
             if let Some(waiting) = batch.into_iter().next() {

@@ -3,8 +3,10 @@
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
 mod architecture;
+mod asyncapi;
 mod browser;
 mod cli;
+mod client;
 mod config;
 mod connections;
 mod dataset_collect;
@@ -19,9 +21,14 @@ mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
 mod program;
+mod rollouts;
 mod server;
 mod service;
+mod session_restart;
+mod sessions;
 mod sim;
 mod sim_refusals;
 mod stream;
+mod stream_equal;
+mod stream_slow;
 mod training;

@@ -127,11 +127,6 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
         ),
         (
             PLAIN,
-            json!({"frames": ["%"]}),
-            "frames[0] is not base64: Invalid symbol 37, offset 0.",
-        ),
-        (
-            PLAIN,
             json!({"frames": ["AAAA"]}),
             "frames[0] is not a readable PNG or JPEG image",
         ),
@@ -178,6 +173,11 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
     ] {
         assert_eq!(post(&app, path, &body).await.detail(422), expected);
     }
+    let garbled = post(&app, PLAIN, &json!({"frames": ["AAAA", "%"]})).await.detail(422);
+    assert!(
+        garbled.contains("frames[1]: the image is not base64: Invalid symbol 37"),
+        "{garbled}"
+    );
 }
 
 #[tokio::test]
@@ -273,7 +273,7 @@ async fn a_body_or_a_list_over_its_limit_is_refused() {
         .detail(413);
     assert_eq!(long, "the body is longer than this server takes");
     let many = post(&app, PLAIN, &json!({"frames": vec!["AAAA"; 5]})).await.detail(413);
-    assert_eq!(many, "frames holds 5 images; this server takes at most 4 in a request");
+    assert_eq!(many, "frames holds 5; this server takes at most 4 in a request");
 }
 
 #[tokio::test]

@@ -175,25 +175,21 @@ async fn what_is_refused_leaves_the_stream_where_it_was() {
     };
     let small = png(&foreframe::frame::Frame::new(8, 8, vec![0; 64]).unwrap());
     for (message, code, detail) in [
-        (json!({"type": "configure"}), "malformed", "unknown variant `configure`"),
+        (json!({"type": "dance"}), "malformed", "unknown variant `dance`"),
         (with(json!({"colour": 1})), "malformed", "unknown field `colour`"),
         (
             with(json!({"image": small})),
             "invalid",
             "image is 8×8 px; model \"moving\" takes 16×12",
         ),
-        (with(json!({"action": [0.0]})), "invalid", "actions[0] holds 1 numbers"),
+        (with(json!({"action": [0.0]})), "invalid", "action holds 1 numbers"),
         (with(json!({"state": null})), "invalid", "state is missing"),
         (
             with(json!({"action": [1e39, 0.0]})),
             "invalid",
             "action component 0 is inf",
         ),
-        (
-            with(json!({"plan": [[0.0, 0.0]]})),
-            "invalid",
-            "future_actions holds 1 actions",
-        ),
+        (with(json!({"plan": [[0.0, 0.0]]})), "invalid", "plan holds 1 actions"),
     ] {
         let answer = ask(&mut socket, message).await;
         assert_eq!(
@@ -272,6 +268,11 @@ async fn a_silent_stream_is_ended_with_a_word() {
     };
     let server = run(app(dir.path(), config)).await;
     let mut socket = open(&server, "plain").await;
+    let warning = receive(&mut socket).await;
+    assert_eq!(
+        (&warning["type"], &warning["code"]),
+        (&json!("warning"), &json!("idle"))
+    );
     assert_eq!(receive(&mut socket).await, json!({"type": "closing", "reason": "idle"}));
     drop(socket);
     server.stop().await;

@@ -1,0 +1,265 @@
+//! One socket of a session: what comes is read and checked while what came before is computed and what was computed is
+//! sent, each in order.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
+use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+use tracing::{debug, info, trace};
+
+use super::outbox::{Next, Outbox};
+use crate::server::images;
+use crate::server::protocol::{
+    ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, WarningCode,
+};
+use crate::server::sessions::core::{Step, StepError};
+use crate::server::sessions::limits;
+use crate::server::sessions::session::{Hold, Holder, Session};
+use crate::server::{App, streams};
+use crate::serving::{Premise, STEP, Told};
+use crate::types::{Action, RobotState};
+
+/// How long a client may take to hang up after the end was said, so that it has read it.
+const LINGER: Duration = Duration::from_secs(1);
+
+/// What is answered in the order in which it came.
+enum Item {
+    Frame(Box<Step>),
+    Configure(ConfigureMessage),
+    Refused(ErrorCode, String),
+}
+
+/// The client is gone: nothing more can be said to it.
+struct Gone;
+
+pub(super) struct Connection {
+    app: App,
+    hold: Hold,
+    is_kept: bool,
+    codec: Codec,
+    outbox: Outbox,
+}
+
+impl Connection {
+    /// Takes the session from whoever holds it.
+    pub(super) fn new(app: App, session: &Arc<Session>, is_kept: bool, codec: Codec) -> Self {
+        let outbox = Outbox::new(app.config().max_stream_buffer_bytes);
+        let hold = session.hold();
+        Self {
+            app,
+            hold,
+            is_kept,
+            codec,
+            outbox,
+        }
+    }
+
+    pub(super) async fn run(self, socket: WebSocket) {
+        let session = self.hold.session();
+        info!(session.id = %session.id(), model.id = %session.model().manifest.name, "stream opened");
+        let (mut sink, mut stream) = socket.split();
+        self.outbox.push(self.ready()).await;
+        let worked = async {
+            let (inbox, items) = mpsc::channel(self.app.config().max_pipelined_frames);
+            let answered = self.answer(items).map(Ok);
+            let (reason, ()) = tokio::try_join!(self.read(&mut stream, inbox), answered)?;
+            self.outbox.close(reason);
+            // The writer ends the stream.
+            std::future::pending::<Result<(), Gone>>().await
+        };
+        let ended = tokio::select! {
+            gone = worked => gone,
+            written = self.write(&mut sink) => written,
+        };
+        if ended.is_ok() {
+            // Closing with unread bytes would reset the connection before the client has read why.
+            let _ = timeout(LINGER, async { while let Some(Ok(_)) = stream.next().await {} }).await;
+        }
+        info!(
+            frames = self.hold.session().next_seq(),
+            gone = ended.is_err(),
+            "stream closed"
+        );
+    }
+
+    fn ready(&self) -> ServerMessage {
+        let session = self.hold.session();
+        let manifest = &session.model().manifest;
+        ServerMessage::Ready {
+            session: self.is_kept.then(|| session.id().to_owned()),
+            model: manifest.name.clone(),
+            version: manifest.version,
+            spec: Box::new(manifest.spec.clone()),
+            limits: limits(self.app.config(), self.is_kept),
+            next_seq: session.next_seq(),
+        }
+    }
+
+    /// Reads until the stream shall end; says why.
+    async fn read(
+        &self,
+        stream: &mut SplitStream<WebSocket>,
+        inbox: mpsc::Sender<Item>,
+    ) -> Result<ClosingReason, Gone> {
+        let mut stopping = self.app.streams().stopping();
+        tokio::select! {
+            biased;
+            () = streams::told(&mut stopping) => Ok(ClosingReason::Shutdown),
+            holder = self.hold.lost() => Ok(match holder {
+                Holder::Connection(_) => ClosingReason::Replaced,
+                Holder::Deleted => ClosingReason::Deleted,
+            }),
+            end = self.read_all(stream, &inbox) => end,
+        }
+    }
+
+    async fn read_all(
+        &self,
+        stream: &mut SplitStream<WebSocket>,
+        inbox: &mpsc::Sender<Item>,
+    ) -> Result<ClosingReason, Gone> {
+        loop {
+            let Some(message) = self.receive(stream).await? else {
+                return Ok(ClosingReason::Idle);
+            };
+            let item = match self.codec.decode::<ClientMessage>(&message) {
+                Ok(ClientMessage::Frame(frame)) => {
+                    trace!(seq = frame.seq, "frame");
+                    self.checked(frame)
+                        .map_or_else(|error| Item::Refused(error.code(), error.to_string()), Item::Frame)
+                }
+                Ok(ClientMessage::Configure(message)) => Item::Configure(message),
+                Ok(ClientMessage::Ping(ping)) => {
+                    let timestamp_us = ping.timestamp_us;
+                    self.outbox.push(ServerMessage::Pong { timestamp_us }).await;
+                    continue;
+                }
+                Ok(ClientMessage::Close(_)) => return Ok(ClosingReason::Asked),
+                Err(error) => Item::Refused(ErrorCode::Malformed, error.to_string()),
+            };
+            inbox.send(item).await.map_err(|_| Gone)?;
+        }
+    }
+
+    /// The next message of the protocol, warning once of silence; `None` if it lasts.
+    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Option<Message>, Gone> {
+        let quarter = Duration::from_millis(self.app.config().stream_idle_ms) / 4;
+        let mut is_warned = false;
+        loop {
+            let wait = if is_warned { quarter } else { 3 * quarter };
+            match timeout(wait, stream.next()).await {
+                Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => return Ok(Some(message)),
+                // Answered by the WebSocket itself; a sign of life.
+                Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
+                Ok(None | Some(Err(_) | Ok(Message::Close(_)))) => return Err(Gone),
+                Err(_) if is_warned => return Ok(None),
+                Err(_) => {
+                    is_warned = true;
+                    let detail = format!("nothing came; in {} ms the stream is closed", quarter.as_millis());
+                    let code = WarningCode::Idle;
+                    self.outbox.push(ServerMessage::Warning { code, detail }).await;
+                }
+            }
+        }
+    }
+
+    /// The frame, if it fits the model.
+    fn checked(&self, message: FrameMessage) -> Result<Box<Step>, StepError> {
+        let manifest = &self.hold.session().model().manifest;
+        let action = |field| {
+            move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
+        };
+        let past: Option<Action> = message.action.map(action("action")).transpose()?;
+        let plan: Option<Vec<Action>> = message
+            .plan
+            .map(|plan| plan.into_iter().map(action("plan")).collect())
+            .transpose()?;
+        let state = message.state.map(RobotState::try_from).transpose();
+        let state = state.map_err(|source| StepError::Value { field: "state", source })?;
+        let told = Told {
+            past: past.as_slice(),
+            future: plan.as_deref(),
+            state: state.as_ref(),
+        };
+        Ok(Box::new(Step {
+            seq: message.seq,
+            timestamp_us: message.timestamp_us,
+            premise: Premise::new(told, &STEP, &manifest.name, &manifest.spec)?,
+            frame: images::decode("image", message.image, message.format, manifest)?,
+            format: message.format,
+        }))
+    }
+
+    /// Answers what was read, in order, until there is no more.
+    async fn answer(&self, mut items: mpsc::Receiver<Item>) {
+        while let Some(item) = items.recv().await {
+            let answer = match item {
+                Item::Frame(step) => match self.hold.step(self.app.predictor(), *step).await {
+                    Ok(answer) => answer,
+                    // The reader has been told as well, and says why.
+                    Err(StepError::NotHeld) => return,
+                    Err(error) => self.error(error.code(), error.to_string()),
+                },
+                Item::Configure(message) => self.hold.session().configure(message),
+                Item::Refused(code, detail) => self.error(code, detail),
+            };
+            self.outbox.push(answer).await;
+        }
+    }
+
+    fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
+        let next_seq = self.hold.session().next_seq();
+        ServerMessage::Error { code, detail, next_seq }
+    }
+
+    /// Sends what waits until the end, which is said; a client that reads nothing for too long is told so and left.
+    async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), Gone> {
+        let limit = Duration::from_millis(self.app.config().stream_send_ms);
+        loop {
+            let (message, reason) = match self.outbox.next().await {
+                Next::Message(message) => (message, None),
+                Next::Close(reason) => (ServerMessage::Closing { reason }, Some(reason)),
+            };
+            match timeout(limit, sink.send(self.codec.encode(&message))).await {
+                Ok(sent) => sent.map_err(|_| Gone)?,
+                Err(_) => return self.leave(sink, limit).await,
+            }
+            if let Some(reason) = reason {
+                return close(sink, code_of(reason), limit).await;
+            }
+        }
+    }
+
+    async fn leave(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), Gone> {
+        debug!("the client reads nothing");
+        let reason = ClosingReason::Slow;
+        let last = self.codec.encode(&ServerMessage::Closing { reason });
+        timeout(limit, sink.send(last))
+            .await
+            .map_err(|_| Gone)?
+            .map_err(|_| Gone)?;
+        close(sink, code_of(reason), limit).await
+    }
+}
+
+async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), Gone> {
+    let frame = CloseFrame {
+        code,
+        reason: "".into(),
+    };
+    let sent = timeout(limit, sink.send(Message::Close(Some(frame)))).await;
+    sent.map_err(|_| Gone)?.map_err(|_| Gone)
+}
+
+fn code_of(reason: ClosingReason) -> u16 {
+    match reason {
+        ClosingReason::Asked | ClosingReason::Idle | ClosingReason::Deleted => close_code::NORMAL,
+        ClosingReason::Replaced => close_code::POLICY,
+        ClosingReason::Slow => close_code::AGAIN,
+        ClosingReason::Shutdown => close_code::AWAY,
+    }
+}

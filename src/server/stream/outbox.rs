@@ -1,0 +1,239 @@
+//! What waits to be read by a client: a bounded number of bytes. Predictions make room for newer ones; what else is said
+//! is never dropped, and whoever says it waits for room.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+
+use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
+
+/// What a message weighs besides its images, in bytes: more than any but `ready` takes.
+const MESSAGE_BYTES: usize = 512;
+
+/// What the writer does next.
+#[derive(Debug, PartialEq)]
+pub(super) enum Next {
+    /// Send this.
+    Message(ServerMessage),
+    /// Say why, and close.
+    Close(ClosingReason),
+}
+
+pub(super) struct Outbox {
+    state: Mutex<State>,
+    changed: Notify,
+    limit_bytes: usize,
+}
+
+#[derive(Default)]
+struct State {
+    waiting: VecDeque<ServerMessage>,
+    bytes: usize,
+    /// Predictions dropped since the last one that was taken.
+    dropped: u64,
+    closing: Option<ClosingReason>,
+}
+
+impl Outbox {
+    pub(super) fn new(limit_bytes: usize) -> Self {
+        Self {
+            state: Mutex::default(),
+            changed: Notify::new(),
+            limit_bytes,
+        }
+    }
+
+    /// Adds a message. A prediction takes the place of the oldest ones where there is no room; anything else waits for it.
+    pub(super) async fn push(&self, message: ServerMessage) {
+        if matches!(message, ServerMessage::Prediction { .. }) {
+            self.state().push_prediction(message, self.limit_bytes);
+        } else {
+            self.room().await;
+            self.state().push(message);
+        }
+        self.changed.notify_waiters();
+    }
+
+    /// Waits until there is room for one more message.
+    async fn room(&self) {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            // From here on no change is missed.
+            changed.as_mut().enable();
+            if self.state().bytes + MESSAGE_BYTES <= self.limit_bytes.max(MESSAGE_BYTES) {
+                return;
+            }
+            changed.await;
+        }
+    }
+
+    /// Nothing follows but this, once all that waits has been sent.
+    pub(super) fn close(&self, reason: ClosingReason) {
+        self.state().closing.get_or_insert(reason);
+        self.changed.notify_waiters();
+    }
+
+    pub(super) async fn next(&self) -> Next {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            changed.as_mut().enable();
+            let next = self.state().pop();
+            if let Some(next) = next {
+                self.changed.notify_waiters();
+                return next;
+            }
+            changed.await;
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn push(&mut self, message: ServerMessage) {
+        self.bytes += bytes(&message);
+        self.waiting.push_back(message);
+    }
+
+    fn push_prediction(&mut self, message: ServerMessage, limit_bytes: usize) {
+        let was_dropping = self.dropped > 0;
+        while self.bytes + bytes(&message) > limit_bytes && self.drop_oldest() {}
+        if self.dropped > 0 && !was_dropping {
+            self.push(ServerMessage::Warning {
+                code: WarningCode::Slow,
+                detail: "answers are read too slowly: the oldest predictions are dropped and counted".to_owned(),
+            });
+        }
+        self.push(message);
+    }
+
+    /// Drops the oldest prediction, if there is one.
+    fn drop_oldest(&mut self) -> bool {
+        let is_prediction = |message: &ServerMessage| matches!(message, ServerMessage::Prediction { .. });
+        let oldest = self.waiting.iter().position(is_prediction);
+        let Some(message) = oldest.and_then(|oldest| self.waiting.remove(oldest)) else {
+            return false;
+        };
+        self.bytes -= bytes(&message);
+        self.dropped += 1;
+        true
+    }
+
+    fn pop(&mut self) -> Option<Next> {
+        let Some(mut message) = self.waiting.pop_front() else {
+            return self.closing.map(Next::Close);
+        };
+        self.bytes -= bytes(&message);
+        if let ServerMessage::Prediction { dropped, .. } = &mut message {
+            *dropped = std::mem::take(&mut self.dropped);
+        }
+        Some(Next::Message(message))
+    }
+}
+
+fn bytes(message: &ServerMessage) -> usize {
+    MESSAGE_BYTES
+        + match message {
+            ServerMessage::Prediction { frames, .. } => frames.iter().map(|frame| frame.0.len()).sum(),
+            _ => 0,
+        }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::FutureExt as _;
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::server::images::{ImageBytes, ImageFormat};
+    use crate::server::protocol::Timing;
+
+    fn prediction(seq: u64, size: usize) -> ServerMessage {
+        ServerMessage::Prediction {
+            seq,
+            timestamp_us: 0,
+            frames: vec![ImageBytes(vec![0; size])],
+            format: ImageFormat::Raw,
+            timing: Timing::default(),
+            dropped: 0,
+            skipped: 0,
+        }
+    }
+
+    fn pong(timestamp_us: i64) -> ServerMessage {
+        ServerMessage::Pong { timestamp_us }
+    }
+
+    #[test]
+    fn the_oldest_predictions_make_room_and_the_next_one_sent_says_how_many() {
+        let mut state = State::default();
+        state.push(pong(1));
+        for seq in 0..5 {
+            state.push_prediction(prediction(seq, 1000), 4000);
+        }
+        let mut sent = Vec::new();
+        while let Some(Next::Message(message)) = state.pop() {
+            sent.push(message);
+        }
+        let kinds: Vec<String> = sent
+            .iter()
+            .map(|message| match message {
+                ServerMessage::Prediction { seq, dropped, .. } => format!("{seq} after {dropped}"),
+                ServerMessage::Warning { .. } => "warning".to_owned(),
+                _ => "pong".to_owned(),
+            })
+            .collect();
+        assert_eq!(kinds, ["pong", "warning", "4 after 4"]);
+        assert_eq!((state.bytes, state.dropped), (0, 0));
+    }
+
+    #[test]
+    fn a_word_waits_for_room_and_the_end_comes_last() {
+        let outbox = Outbox::new(2 * MESSAGE_BYTES);
+        for timestamp_us in 0..2 {
+            assert!(outbox.push(pong(timestamp_us)).now_or_never().is_some());
+        }
+        let mut third = Box::pin(outbox.push(pong(2)));
+        assert!(third.as_mut().now_or_never().is_none());
+        outbox.close(ClosingReason::Asked);
+        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(0))));
+        assert!(third.now_or_never().is_some());
+        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(1))));
+        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(2))));
+        assert_eq!(outbox.next().now_or_never(), Some(Next::Close(ClosingReason::Asked)));
+    }
+
+    proptest! {
+        #[test]
+        fn what_waits_stays_within_the_limit_and_every_prediction_is_sent_or_counted(
+            pushes in proptest::collection::vec((any::<bool>(), 0usize..3000), 0..60),
+        ) {
+            let (mut state, limit) = (State::default(), 8000);
+            let (mut pushed, mut accounted) = (0, 0);
+            let mut count = |state: &mut State| {
+                let next = state.pop();
+                if let Some(Next::Message(ServerMessage::Prediction { dropped, .. })) = next {
+                    accounted += dropped + 1;
+                }
+                next.is_some()
+            };
+            for (is_read, size) in pushes {
+                if is_read {
+                    count(&mut state);
+                } else {
+                    state.push_prediction(prediction(pushed, size), limit);
+                    pushed += 1;
+                }
+                // One prediction and the warning are there even where they are over it.
+                prop_assert!(state.bytes <= limit + MESSAGE_BYTES, "{}", state.bytes);
+            }
+            while count(&mut state) {}
+            prop_assert_eq!(pushed, accounted);
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! Many futures of one context, and images as files.
+
+use axum::body::Body;
+use axum::http::{Request, header};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use foreframe::frame::codec;
+use foreframe::server::protocol::Codec;
+use foreframe::server::{App, ServerConfig};
+use serde_json::{Value, json};
+
+use crate::client::{Client, Opened, send_frame, step};
+use crate::service::{Answer, CONTEXT, HEIGHT, WIDTH, app, context, frame, post, post_text, run, send};
+
+const ROLLOUTS: &str = "/v1/models/moving/rollouts";
+
+fn candidates(count: usize) -> Vec<Value> {
+    (0..count)
+        .map(|index| {
+            let value = index as f32 / 8.0 - 3.0;
+            json!([[value, -value], [value / 2.0, 1.0]])
+        })
+        .collect()
+}
+
+fn pixels(image: &Value) -> Vec<u8> {
+    STANDARD.decode(image.as_str().unwrap()).unwrap()
+}
+
+/// The greatest difference of any two pixels.
+fn difference(a: &Value, b: &Value) -> u8 {
+    let (a, b) = (a.as_array().unwrap(), b.as_array().unwrap());
+    assert_eq!(a.len(), b.len());
+    let pairs = a.iter().zip(b).flat_map(|(a, b)| pixels(a).into_iter().zip(pixels(b)));
+    pairs.map(|(a, b)| a.abs_diff(b)).max().unwrap()
+}
+
+#[tokio::test]
+async fn hundreds_of_candidates_come_to_what_each_would_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let raw: Vec<String> = (0..CONTEXT as u8)
+        .map(|i| STANDARD.encode(frame(i * 10).pixels()))
+        .collect();
+    let candidates = candidates(300);
+    let body = json!({"frames": raw, "format": "raw", "state": [0.5], "candidates": candidates});
+    let answer = post(&app, ROLLOUTS, &body).await.json();
+    let futures = answer["futures"].as_array().unwrap();
+    assert_eq!((futures.len(), &answer["format"]), (300, &json!("raw")));
+    for index in [0, 1, 150, 299] {
+        let body = json!({"frames": raw, "format": "raw", "state": [0.5], "future_actions": candidates[index]});
+        let alone = post(&app, "/v1/models/moving/predict", &body).await.json();
+        assert!(difference(&futures[index], &alone["frames"]) <= 1);
+    }
+    assert!(difference(&futures[0], &futures[299]) > 0);
+}
+
+#[tokio::test]
+async fn rollouts_can_be_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let body = |count| json!({"frames": context(), "state": [0.5], "candidates": candidates(count)}).to_string();
+    let sheet = post_text(&app, ROLLOUTS, body(4), "image/png").await;
+    let sheet = codec::decode(&sheet.body).unwrap();
+    assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 5 * HEIGHT);
+    let film = post_text(&app, ROLLOUTS, body(4), "image/gif").await;
+    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(film.body.starts_with(b"GIF89a"));
+    let many = post_text(&app, ROLLOUTS, body(400), "image/png").await;
+    assert_eq!(
+        many.detail(406),
+        "the picture would be too large; ask for application/json"
+    );
+}
+
+#[tokio::test]
+async fn candidates_that_do_not_fit_are_refused_by_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_candidates: 8,
+        max_rollout_bytes: 4 * 2 * (WIDTH * HEIGHT) as usize,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let with = |candidates: Value| json!({"frames": context(), "state": [0.5], "candidates": candidates});
+    for (body, status, detail) in [
+        (
+            with(json!([])),
+            422,
+            "candidates is empty; give at least one sequence of future actions",
+        ),
+        (
+            with(json!([[[0, 0]]])),
+            422,
+            "candidates[0] holds 1 actions; model \"moving\" takes 2",
+        ),
+        (
+            with(json!([[[0, 0], [0, 0]], [[0, 0], [0]]])),
+            422,
+            "candidates[1][1] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
+        ),
+        (
+            with(json!(candidates(9))),
+            413,
+            "candidates holds 9; this server takes at most 8 in a request",
+        ),
+        (
+            with(json!(candidates(5))),
+            413,
+            "the futures would be 1920 bytes of images; this server predicts at most 1536 for a request",
+        ),
+    ] {
+        assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
+    }
+    let untold = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
+        .await
+        .detail(422);
+    assert!(untold.starts_with("model \"plain\" takes no actions"), "{untold}");
+}
+
+#[tokio::test]
+async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &json!({"model": "moving"})).await;
+    let path = session.path("/rollouts");
+    let body = json!({"candidates": candidates(20), "format": "raw"});
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    for seq in 0..CONTEXT as u64 {
+        let early = post(&app, &path, &body).await.detail(409);
+        assert_eq!(
+            early,
+            format!("the session has {seq} frames of the 3 that a prediction takes; send it more")
+        );
+        client.ask(&send_frame(seq)).await;
+    }
+    let futures = post(&app, &path, &body).await.json();
+    let raw: Vec<String> = (0..CONTEXT as u64)
+        .map(|seq| STANDARD.encode(&step(seq).image.0))
+        .collect();
+    let state = step(CONTEXT as u64 - 1).state;
+    let stateless = json!({"frames": raw, "format": "raw", "state": state, "candidates": candidates(20)});
+    let stateless = post(&app, ROLLOUTS, &stateless).await.json();
+    for (found, expected) in futures["futures"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .zip(stateless["futures"].as_array().unwrap())
+    {
+        assert!(difference(found, expected) <= 1);
+    }
+    let film = post_text(&app, &path, body.to_string(), "image/gif").await;
+    assert!(film.body.starts_with(b"GIF89a"));
+    drop(client);
+    server.stop().await;
+}
+
+async fn post_form(app: &App, path: &str, parts: &[(&str, &[u8])]) -> Answer {
+    let mut body = Vec::new();
+    for (name, content) in parts {
+        let head = format!("--edge\r\nContent-Disposition: form-data; name=\"{name}\"; filename=\"a\"\r\n\r\n");
+        body.extend(head.as_bytes());
+        body.extend(*content);
+        body.extend(b"\r\n");
+    }
+    body.extend(b"--edge--\r\n");
+    let request = Request::post(path).header(header::CONTENT_TYPE, "multipart/form-data; boundary=edge");
+    send(app, request.body(Body::from(body)).unwrap()).await
+}
+
+#[tokio::test]
+async fn image_files_in_a_form_are_predicted_as_the_same_in_json() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_frames: 4,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let files: Vec<Vec<u8>> = (0..CONTEXT as u8)
+        .map(|i| codec::encode_png(&frame(i * 10)).unwrap())
+        .collect();
+    let mut parts: Vec<(&str, &[u8])> = files.iter().map(|file| ("frames", file.as_slice())).collect();
+    let plain = "/v1/models/plain/predict";
+    let by_json = post(&app, plain, &json!({"frames": context()})).await.json();
+    assert_eq!(post_form(&app, plain, &parts).await.json()["frames"], by_json["frames"]);
+
+    let told = json!({"state": [0.5], "actions": [[1.0, 2.0]]});
+    let mut body = told.clone();
+    body["frames"] = json!(context());
+    let by_json = post(&app, "/v1/models/moving/predict", &body).await.json();
+    let told = told.to_string();
+    parts.push(("request", told.as_bytes()));
+    let by_form = post_form(&app, "/v1/models/moving/predict", &parts).await.json();
+    assert_eq!(by_form["frames"], by_json["frames"]);
+
+    let odd = post_form(&app, plain, &[("image", &b"x"[..])]).await.detail(422);
+    assert_eq!(odd, "the form has a part \"image\"; there are frames and request");
+    let many = post_form(&app, plain, &[("frames", &b"x"[..]); 5]).await.detail(413);
+    assert_eq!(many, "frames holds 5; this server takes at most 4 in a request");
+    let unknown = post_form(&app, plain, &[("request", &b"{\"colour\": 1}"[..])])
+        .await
+        .detail(422);
+    assert!(unknown.contains("request: unknown field `colour`"), "{unknown}");
+    let half = Request::post(plain).header(header::CONTENT_TYPE, "multipart/form-data; boundary=edge");
+    let half = half
+        .body(Body::from(
+            "--edge\r\nContent-Disposition: form-data; name=\"frames\"\r\n\r\nabc",
+        ))
+        .unwrap();
+    send(&app, half).await.detail(400);
+}

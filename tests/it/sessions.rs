@@ -1,0 +1,562 @@
+//! Sessions: what outlives a socket, what a number sent twice means, and who may ask.
+
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::http::Request;
+use foreframe::server::protocol::{
+    ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, ServerMessage,
+};
+use foreframe::server::{ImageFormat, ServerConfig};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+use tokio_tungstenite::tungstenite::Error;
+
+use crate::client::{Client, Opened, send_frame, step};
+use crate::service::{CONTEXT, app, get, post, run, send, until};
+
+const MOVING: &str = r#"{"model": "moving"}"#;
+
+fn moving() -> Value {
+    serde_json::from_str(MOVING).unwrap()
+}
+
+fn frames(message: &ServerMessage) -> &[foreframe::server::ImageBytes] {
+    match message {
+        ServerMessage::Prediction { frames, .. } => frames,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn code(message: &ServerMessage) -> (ErrorCode, u64) {
+    match message {
+        ServerMessage::Error { code, next_seq, .. } => (*code, *next_seq),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let (broken, whole) = (Opened::open(&app, &moving()).await, Opened::open(&app, &moving()).await);
+    let mut reference = Client::connect(server.address, &whole.path("/stream"), Codec::Json)
+        .await
+        .unwrap();
+    for seq in 0..6 {
+        // Every frame over a socket of its own, in either sub-protocol.
+        let codec = [Codec::Json, Codec::Msgpack][seq as usize % 2];
+        let mut client = Client::connect(server.address, &broken.path("/stream"), codec)
+            .await
+            .unwrap();
+        assert_eq!(client.next_seq, seq);
+        let (answer, expected) = (
+            client.ask(&send_frame(seq)).await,
+            reference.ask(&send_frame(seq)).await,
+        );
+        if seq + 1 < CONTEXT as u64 {
+            assert_eq!(answer, expected);
+        } else {
+            assert_eq!(frames(&answer), frames(&expected));
+        }
+    }
+    let state = |session: &Opened| {
+        let path = session.path("/state");
+        let app = app.clone();
+        async move { get(&app, &path).await.json() }
+    };
+    assert_eq!(state(&broken).await, state(&whole).await);
+    let described = get(&app, &format!("/v1/sessions/{}", whole.id)).await.json();
+    assert_eq!(
+        (&described["next_seq"], &described["connected"]),
+        (&json!(6), &json!(true))
+    );
+    assert!(described.get("token").is_none());
+    drop(reference);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let path = session.path("/stream");
+    let mut older = Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
+    older.ask(&send_frame(0)).await;
+    let mut newer = Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
+    assert_eq!(newer.next_seq, 1);
+    assert_eq!(older.end().await, (Some(ClosingReason::Replaced), Some(1008)));
+    assert!(matches!(
+        newer.ask(&send_frame(1)).await,
+        ServerMessage::Warming { have: 2, .. }
+    ));
+    let gone = Request::delete(session.path("")).body(Body::empty()).unwrap();
+    assert_eq!(send(&app, gone).await.status, 204);
+    assert_eq!(newer.end().await, (Some(ClosingReason::Deleted), Some(1000)));
+    get(&app, &format!("/v1/sessions/{}", session.id)).await.detail(404);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn nothing_is_said_of_a_session_without_its_token() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    assert!(session.token.len() >= 32 && session.id.len() >= 32);
+    for (path, status) in [
+        (format!("/v1/sessions/{}/state", session.id), 403),
+        (format!("/v1/sessions/{}/state?token=guess", session.id), 403),
+        (format!("/v1/sessions/none/state?token={}", session.token), 404),
+    ] {
+        get(&app, &path).await.detail(status);
+    }
+    let by_header =
+        Request::get(format!("/v1/sessions/{}/state", session.id)).header("x-session-token", &session.token);
+    assert_eq!(send(&app, by_header.body(Body::empty()).unwrap()).await.status, 200);
+    let path = format!("/v1/sessions/{}/stream?token=guess", session.id);
+    let Error::Http(refused) = *Client::connect(server.address, &path, Codec::Json).await.err().unwrap() else {
+        panic!()
+    };
+    assert_eq!(refused.status(), 403);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_never_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        session_grace_ms: 50,
+        max_sessions: 1,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Json)
+        .await
+        .unwrap();
+    tokio::time::sleep(Duration::from_millis(80)).await;
+    // While its stream is open it does not expire, and holds its place.
+    assert!(matches!(
+        client.ask(&send_frame(0)).await,
+        ServerMessage::Warming { .. }
+    ));
+    let full = post(&app, "/v1/sessions", &moving()).await;
+    assert_eq!(full.detail(503), "1 sessions are open already; try again later");
+    assert_eq!(full.headers["retry-after"], "1");
+    drop(client);
+    let path = session.path("/state");
+    // Asking with the token would count as use.
+    let peek = format!("/v1/sessions/{}", session.id);
+    until(async || (get(&app, &peek).await.status == 410).then_some(())).await;
+    assert!(
+        get(&app, &path)
+            .await
+            .detail(410)
+            .contains("was not used for 50 ms and has expired")
+    );
+    get(&app, "/v1/sessions/another").await.detail(404);
+    Opened::open(&app, &moving()).await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn sessions_are_listed_page_by_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    for _ in 0..5 {
+        Opened::open(&app, &moving()).await;
+    }
+    let (mut after, mut seen) = (String::new(), Vec::new());
+    loop {
+        let page = get(&app, &format!("/v1/sessions?limit=2&after={after}")).await.json();
+        seen.extend(
+            page["sessions"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .map(|session| session["id"].clone()),
+        );
+        match page["next"].as_str() {
+            Some(next) => after = next.to_owned(),
+            None => break,
+        }
+    }
+    assert_eq!(seen.len(), 5);
+    assert!(seen.is_sorted_by_key(|id| id.as_str().unwrap().to_owned()));
+    assert_eq!(
+        get(&app, "/v1/sessions?limit=0").await.detail(422),
+        "limit is 0; it must be 1 to 1000"
+    );
+    get(&app, "/v1/sessions?colour=red").await.detail(400);
+}
+
+#[tokio::test]
+async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    assert_eq!(code(&client.ask(&send_frame(2)).await), (ErrorCode::Gap, 0));
+    let configure = ClientMessage::Configure(ConfigureMessage {
+        on_gap: Some(OnGap::Skip),
+        format: Some(ImageFormat::Png),
+    });
+    let configured = ServerMessage::Configured {
+        on_gap: OnGap::Skip,
+        format: Some(ImageFormat::Png),
+    };
+    assert_eq!(client.ask(&configure).await, configured);
+    for (seq, expected) in [(2, 2), (3, 0), (5, 1)] {
+        let answer = client.ask(&send_frame(seq)).await;
+        let (ServerMessage::Warming { skipped, .. } | ServerMessage::Prediction { skipped, .. }) = answer else {
+            panic!("{answer:?}")
+        };
+        assert_eq!(skipped, expected);
+    }
+    let ServerMessage::Prediction { format, frames, .. } = client.ask(&send_frame(6)).await else {
+        panic!()
+    };
+    assert_eq!(format, ImageFormat::Png);
+    assert!(frames[0].0.starts_with(b"\x89PNG"));
+    assert_eq!(code(&client.ask(&send_frame(u64::MAX)).await), (ErrorCode::Invalid, 7));
+    let settings = get(&app, &session.path("/state")).await.json();
+    assert_eq!(
+        (&settings["on_gap"], &settings["format"]),
+        (&json!("skip"), &json!("png"))
+    );
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn frames_sent_ahead_of_their_answers_are_answered_in_order() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    for seq in 0..100 {
+        client.send(&send_frame(seq)).await;
+    }
+    client.send(&ClientMessage::Close(CloseMessage {})).await;
+    for expected in 0..100 {
+        let answer = client.receive().await;
+        let (ServerMessage::Warming { seq, .. } | ServerMessage::Prediction { seq, .. }) = answer else {
+            panic!("{answer:?}")
+        };
+        assert_eq!(seq, expected);
+    }
+    assert_eq!(client.end().await, (Some(ClosingReason::Asked), Some(1000)));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_exported_state_goes_on_in_another_server_as_if_nothing_had_been() {
+    let (here, there) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let (first, second) = (
+        app(here.path(), ServerConfig::default()),
+        app(there.path(), ServerConfig::default()),
+    );
+    let (old, new) = (run(first.clone()).await, run(second.clone()).await);
+    let session = Opened::open(&first, &moving()).await;
+    let mut client = Client::connect(old.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    for seq in 0..5 {
+        client.ask(&send_frame(seq)).await;
+    }
+    let state = get(&first, &session.path("/state")).await.json();
+    let last = client.ask(&send_frame(4)).await;
+    let next = client.ask(&send_frame(5)).await;
+
+    let moved = Opened::open(&second, &json!({"state": state})).await;
+    assert_eq!(get(&second, &moved.path("/state")).await.json(), state);
+    let mut client = Client::connect(new.address, &moved.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    assert_eq!(client.next_seq, 5);
+    // The last answer did not travel; it is computed again, and nothing is stepped.
+    assert_eq!(frames(&client.ask(&send_frame(4)).await), frames(&last));
+    assert_eq!(frames(&client.ask(&send_frame(5)).await), frames(&next));
+    old.stop().await;
+    new.stop().await;
+}
+
+#[tokio::test]
+async fn a_state_that_does_not_fit_is_refused_by_field() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Json)
+        .await
+        .unwrap();
+    client.ask(&send_frame(0)).await;
+    let state = get(&app, &session.path("/state")).await.json();
+    for (pointer, value, status, detail) in [
+        ("/weights_sha256", json!("00"), 409, "here version 1"),
+        ("/model", json!("none"), 404, "no model is named"),
+        ("/memory/next_seq", json!(0), 422, "state.memory.next_seq is 0"),
+        (
+            "/memory/features",
+            json!(vec![vec![0.0; 8]; 4]),
+            422,
+            "state.memory.features holds 4 frames",
+        ),
+        (
+            "/memory/features/0",
+            json!([0.5]),
+            422,
+            "state.memory.features[0] holds 1 numbers",
+        ),
+        (
+            "/memory/features/0/2",
+            json!(1.5),
+            422,
+            "state.memory.features[0][2] is 1.5",
+        ),
+        ("/memory/actions", json!([]), 422, "actions holds 0 actions"),
+        ("/memory/state", json!([1, 2, 3]), 422, "state holds 3 numbers"),
+        ("/on_gap", json!("dance"), 422, "state.on_gap: unknown variant `dance`"),
+    ] {
+        let mut changed = state.clone();
+        *changed.pointer_mut(pointer).unwrap() = value;
+        let found = post(&app, "/v1/sessions", &json!({"state": changed}))
+            .await
+            .detail(status);
+        assert!(found.contains(detail), "{pointer}: {found}");
+    }
+    let found = post(&app, "/v1/sessions", &json!({"state": state, "model": "plain"}))
+        .await
+        .detail(422);
+    assert!(found.contains("the state is of \"moving\""), "{found}");
+    let found = post(&app, "/v1/sessions", &json!({})).await.detail(422);
+    assert!(found.starts_with("model is missing"), "{found}");
+    server.stop().await;
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Mishap {
+    /// The next frame as it should be.
+    Next,
+    /// One of the last frames once more.
+    Twice(u64),
+    /// A frame that leaves others out.
+    Ahead(u64),
+    /// Two frames the wrong way round.
+    Swapped,
+    /// The socket goes without a word.
+    Lost,
+    /// The socket goes after a frame was sent and before its answer came.
+    LostAfter,
+}
+
+fn mishap() -> impl Strategy<Value = Mishap> {
+    prop_oneof![
+        4 => Just(Mishap::Next),
+        2 => (0u64..4).prop_map(Mishap::Twice),
+        1 => (1u64..4).prop_map(Mishap::Ahead),
+        1 => Just(Mishap::Swapped),
+        1 => Just(Mishap::Lost),
+        1 => Just(Mishap::LostAfter),
+    ]
+}
+
+async fn suffer(mishaps: &[Mishap]) -> Result<(), TestCaseError> {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let path = session.path("/stream");
+    let connect = async || Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
+    let mut client = connect().await;
+    let mut next = 0;
+    for mishap in mishaps {
+        match *mishap {
+            Mishap::Next => {
+                client.ask(&send_frame(next)).await;
+                next += 1;
+            }
+            Mishap::Twice(back) if next > 0 => {
+                client.ask(&send_frame((next - 1).saturating_sub(back))).await;
+            }
+            Mishap::Twice(_) => {}
+            Mishap::Ahead(by) => {
+                prop_assert_eq!(code(&client.ask(&send_frame(next + by)).await), (ErrorCode::Gap, next));
+            }
+            Mishap::Swapped => {
+                client.ask(&send_frame(next + 1)).await;
+                client.ask(&send_frame(next)).await;
+                next += 1;
+            }
+            Mishap::Lost => client = connect().await,
+            Mishap::LostAfter => {
+                client.send(&send_frame(next)).await;
+                client = connect().await;
+                // It was taken or it was not; the server says which.
+                prop_assert!(client.next_seq == next || client.next_seq == next + 1);
+                next = client.next_seq;
+            }
+        }
+        let described = get(&app, &format!("/v1/sessions/{}", session.id)).await.json();
+        prop_assert_eq!(&described["next_seq"], next);
+    }
+    let reference = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &reference.path("/stream"), Codec::Json)
+        .await
+        .unwrap();
+    for seq in 0..next {
+        client.ask(&send_frame(seq)).await;
+    }
+    let (found, expected) = (
+        get(&app, &session.path("/state")).await,
+        get(&app, &reference.path("/state")).await,
+    );
+    prop_assert_eq!(found.json(), expected.json());
+    drop(client);
+    server.stop().await;
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn duplicates_reorders_drops_and_reconnects_end_in_the_state_of_the_reference(
+        mishaps in proptest::collection::vec(mishap(), 1..24),
+    ) {
+        tokio::runtime::Runtime::new().unwrap().block_on(suffer(&mishaps))?;
+    }
+
+    #[test]
+    fn no_body_opens_a_session_by_accident_or_breaks_the_server(
+        pointer in prop_oneof![
+            Just(""), Just("/state"), Just("/state/memory"), Just("/state/memory/features"), Just("/state/memory/features/0"),
+            Just("/state/memory/next_seq"), Just("/state/memory/actions"), Just("/state/version"), Just("/model"),
+        ],
+        garbage in prop_oneof![
+            Just(json!(null)), Just(json!([])), Just(json!({})), Just(json!("")), any::<i64>().prop_map(|n| json!(n)),
+            any::<f32>().prop_map(|x| json!([x, [x]])), Just(json!([[[[[[]]]]]])), Just(json!([["a"]])),
+        ],
+    ) {
+        tokio::runtime::Runtime::new().unwrap().block_on(async {
+            let dir = tempfile::tempdir().unwrap();
+            let app = app(dir.path(), ServerConfig::default());
+            let session = Opened::open(&app, &moving()).await;
+            let mut body = json!({"model": "moving", "state": get(&app, &session.path("/state")).await.json()});
+            body["state"]["memory"]["features"] = json!([vec![0.0; 8]]);
+            if let Some(place) = body.pointer_mut(pointer) {
+                *place = garbage;
+            }
+            let status = post(&app, "/v1/sessions", &body).await.status.as_u16();
+            prop_assert!([201, 400, 404, 409, 422].contains(&status), "{status} {body}");
+            Ok(())
+        })?;
+    }
+}
+
+#[tokio::test]
+async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
+    use tokio::io::AsyncWriteExt as _;
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    client.ask(&send_frame(0)).await;
+    // The head of a masked binary message of 200 bytes, and three of them.
+    client
+        .socket
+        .get_mut()
+        .write_all(&[0x82, 0xFE, 0, 200, 1, 2, 3, 4, 5, 6, 7])
+        .await
+        .unwrap();
+    drop(client);
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    assert_eq!(client.next_seq, 1);
+    assert!(matches!(
+        client.ask(&send_frame(1)).await,
+        ServerMessage::Warming { have: 2, .. }
+    ));
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let session = Opened::open(&app, &moving()).await;
+    let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    let before = get(&app, &session.path("/state")).await.json();
+    // A PNG that states 60,000 × 60,000 pixels in its first bytes.
+    let mut liar = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\0\0\0\0".to_vec();
+    liar.extend([0; 64]);
+    let changed = |change: &dyn Fn(&mut foreframe::server::protocol::FrameMessage)| {
+        let mut message = step(0);
+        change(&mut message);
+        ClientMessage::Frame(message)
+    };
+    for (message, detail) in [
+        (
+            changed(&|m| m.action = Some(vec![f32::NAN, 0.0])),
+            "action component 0 is NaN",
+        ),
+        (
+            changed(&|m| m.state = Some(vec![f32::INFINITY])),
+            "state component 0 is inf",
+        ),
+        (
+            changed(&|m| m.plan = Some(vec![vec![0.0; 2]; 3])),
+            "plan holds 3 actions",
+        ),
+        (
+            changed(&|m| m.plan = Some(vec![vec![0.0; 3]; 2])),
+            "plan[0] holds 3 numbers",
+        ),
+        (changed(&|m| m.action = None), "action is missing"),
+        (changed(&|m| m.image.0.truncate(5)), "image holds 5 raw bytes"),
+        (
+            changed(&|m| {
+                m.image.0.clone_from(&liar);
+                m.format = ImageFormat::Png;
+            }),
+            "image is",
+        ),
+    ] {
+        let answer = client.ask(&message).await;
+        let ServerMessage::Error {
+            code,
+            detail: found,
+            next_seq,
+        } = answer
+        else {
+            panic!("{answer:?}")
+        };
+        assert_eq!((code, next_seq), (ErrorCode::Invalid, 0), "{found}");
+        assert!(found.contains(detail), "{found}");
+    }
+    client.send_text("{}").await;
+    assert_eq!(code(&client.receive().await), (ErrorCode::Malformed, 0));
+    assert_eq!(get(&app, &session.path("/state")).await.json(), before);
+    assert!(matches!(
+        client.ask(&send_frame(0)).await,
+        ServerMessage::Warming { have: 1, .. }
+    ));
+    server.stop().await;
+}

@@ -1,0 +1,242 @@
+//! Streams predict what single requests do, whoever shares their batches.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use candle_core::{Device, Tensor};
+use foreframe::frame::{Frame, codec};
+use foreframe::registry::{self, LoadedModel};
+use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMessage};
+use foreframe::server::{App, ImageBytes, ImageFormat, ServerConfig};
+use foreframe::serving::{self, PredictionInput};
+use foreframe::types::{Action, RobotState, Seed};
+use rand::Rng as _;
+use serde_json::{Value, json};
+
+use crate::client::{Client, Opened};
+use crate::service::{Running, get, run, with_data};
+
+fn shipped(name: &str) -> LoadedModel {
+    registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
+}
+
+/// What one robot saw and did.
+struct Trip {
+    frames: Vec<Frame>,
+    actions: Vec<Vec<f32>>,
+    states: Vec<Vec<f32>>,
+}
+
+impl Trip {
+    /// The frames that come with the program.
+    fn example() -> Self {
+        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/frames");
+        let told: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
+        let numbers = |field: &str| serde_json::from_value::<Vec<Vec<f32>>>(told[field].clone()).unwrap();
+        let frame = |index| codec::decode(&std::fs::read(dir.join(format!("frame-{index:03}.png"))).unwrap()).unwrap();
+        Self {
+            frames: (0..15).map(frame).collect(),
+            actions: numbers("actions"),
+            states: numbers("states"),
+        }
+    }
+
+    /// Noise, different for every robot.
+    fn noise(model: &LoadedModel, robot: u64, steps: usize) -> Self {
+        let spec = &model.manifest.spec;
+        let mut rng = Seed(11).derive("robot", robot).rng();
+        let (width, height) = (spec.frame_width_px, spec.frame_height_px);
+        let frame = |rng: &mut rand_chacha::ChaCha8Rng| {
+            let pixels = (0..width * height).map(|_| rng.random()).collect();
+            Frame::new(width, height, pixels).unwrap()
+        };
+        let frames = (0..steps).map(|_| frame(&mut rng)).collect();
+        let mut numbers = |count: usize| -> Vec<Vec<f32>> {
+            let row = |rng: &mut rand_chacha::ChaCha8Rng| (0..count).map(|_| rng.random_range(-1.0..1.0)).collect();
+            (0..steps).map(|_| row(&mut rng)).collect()
+        };
+        let (actions, states) = (numbers(spec.actions.len()), numbers(spec.states.len()));
+        Self {
+            frames,
+            actions,
+            states,
+        }
+    }
+
+    fn message(&self, seq: usize) -> ClientMessage {
+        ClientMessage::Frame(FrameMessage {
+            seq: seq as u64,
+            timestamp_us: seq as i64,
+            image: ImageBytes(self.frames[seq].pixels().to_vec()),
+            format: ImageFormat::Raw,
+            action: Some(self.actions[seq].clone()),
+            state: Some(self.states[seq].clone()),
+            plan: None,
+        })
+    }
+
+    /// The prediction after frame `seq` without any session.
+    fn stateless(&self, model: &LoadedModel, seq: usize) -> Vec<Frame> {
+        let input = PredictionInput {
+            frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
+            actions: Action::try_from(self.actions[seq].clone()).into_iter().collect(),
+            state: RobotState::try_from(self.states[seq].clone()).ok(),
+            future_actions: None,
+        };
+        serving::predict(model, &[&input]).unwrap().remove(0)
+    }
+
+    /// Whether a prediction is the stateless one: 1e-5 apart, so at most one intensity after rounding.
+    fn check(&self, model: &LoadedModel, seq: usize, frames: &[ImageBytes]) {
+        let expected = self.stateless(model, seq);
+        assert_eq!(frames.len(), expected.len());
+        for (found, expected) in frames.iter().zip(&expected) {
+            let apart = found.0.iter().zip(expected.pixels()).filter(|(a, b)| a != b);
+            assert!(apart.clone().all(|(a, b)| a.abs_diff(*b) == 1), "frame {seq}");
+            assert!(apart.count() <= expected.pixels().len() / 100, "frame {seq}");
+        }
+    }
+
+    /// Whether an exported state holds the features of the last frames, to 1e-5.
+    fn check_state(&self, model: &LoadedModel, state: &Value) {
+        let spec = &model.manifest.spec;
+        let features: Vec<Vec<f32>> = serde_json::from_value(state["memory"]["features"].clone()).unwrap();
+        assert_eq!(state["memory"]["next_seq"], self.frames.len());
+        let last = &self.frames[self.frames.len() - spec.context..];
+        for (frame, found) in last.iter().zip(&features) {
+            let pixels = Tensor::from_vec(spec.preprocess.forward(frame), (1, spec.pixels()), &Device::Cpu).unwrap();
+            let expected = model.model.encode_frames(&pixels).unwrap().flatten_all().unwrap();
+            for (found, expected) in found.iter().zip(expected.to_vec1::<f32>().unwrap()) {
+                assert!((found - expected).abs() <= 1e-5, "{found} {expected}");
+            }
+        }
+    }
+}
+
+async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
+    let app = App::start(with_data(dir, ServerConfig::default()), models.to_vec()).unwrap();
+    let server = run(app.clone()).await;
+    (app, server)
+}
+
+#[tokio::test]
+async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_request_does() {
+    let (dir, trip) = (tempfile::tempdir().unwrap(), Trip::example());
+    let models = [shipped("moving"), shipped("paper")];
+    let (app, server) = start(dir.path(), &models).await;
+    for (model, codec) in models
+        .iter()
+        .flat_map(|model| [(model, Codec::Json), (model, Codec::Msgpack)])
+    {
+        let name = &model.manifest.name;
+        let session = Opened::open(&app, &json!({"model": name})).await;
+        let mut client = Client::connect(server.address, &session.path("/stream"), codec)
+            .await
+            .unwrap();
+        for seq in 0..trip.frames.len() {
+            match client.ask(&trip.message(seq)).await {
+                ServerMessage::Warming { have, .. } => assert_eq!(have, seq + 1),
+                ServerMessage::Prediction { frames, .. } => trip.check(model, seq, &frames),
+                other => panic!("{other:?}"),
+            }
+        }
+        trip.check_state(model, &get(&app, &session.path("/state")).await.json());
+    }
+    server.stop().await;
+}
+
+#[test]
+fn a_batch_of_many_windows_is_predicted_to_1e_5_as_each_alone() {
+    for model in [shipped("moving"), shipped("paper")] {
+        let spec = &model.manifest.spec;
+        let mut rng = Seed(5).rng();
+        let mut tensor = |shape: &[usize]| {
+            let values: Vec<f32> = (0..shape.iter().product())
+                .map(|_| rng.random_range(-1.0..1.0))
+                .collect();
+            Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+        };
+        let features = tensor(&[24, spec.context, spec.features]);
+        let windows: Vec<u32> = (0..64).map(|future| future * 7 % 24).collect();
+        let condition = foreframe::nn::Condition {
+            actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
+            state: Some(tensor(&[64, spec.states.len().max(1)])),
+        };
+        let together = model.model.predict_futures(&features, &windows, &condition).unwrap();
+        for (future, &window) in windows.iter().enumerate() {
+            let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
+            let condition = foreframe::nn::Condition {
+                actions: row(&condition.actions),
+                state: row(&condition.state),
+            };
+            let window = features.narrow(0, window as usize, 1).unwrap();
+            let alone = model
+                .model
+                .predict(&window, &condition, foreframe::nn::Feedback::Prediction)
+                .unwrap();
+            let apart = (alone - together.narrow(0, future, 1).unwrap()).unwrap().abs().unwrap();
+            let apart = apart.flatten_all().unwrap().max(0).unwrap().to_scalar::<f32>().unwrap();
+            assert!(apart <= 1e-5, "{apart}");
+        }
+    }
+}
+
+/// Robots that send when they like, some of them ahead of their answers; every prediction is held against the stateless.
+async fn interleaved(steps: usize) {
+    const ROBOTS: u64 = 64;
+    let dir = tempfile::tempdir().unwrap();
+    let model = Arc::new(shipped("moving"));
+    let (app, server) = start(dir.path(), &[LoadedModel::clone(&model)]).await;
+    let drive = |robot: u64| {
+        let (app, model, address) = (app.clone(), Arc::clone(&model), server.address);
+        async move {
+            let trip = Trip::noise(&model, robot, steps);
+            let session = Opened::open(&app, &json!({"model": "moving"})).await;
+            let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
+                .await
+                .unwrap();
+            let mut rng = Seed(12).derive("pace", robot).rng();
+            let (mut sent, mut answers) = (0, Vec::with_capacity(steps));
+            while answers.len() < steps {
+                let ahead = rng.random_range(1..8usize);
+                while sent < steps && sent < answers.len() + ahead {
+                    client.send(&trip.message(sent)).await;
+                    sent += 1;
+                }
+                for _ in 0..rng.random_range(0..4u8) {
+                    tokio::task::yield_now().await;
+                }
+                answers.push(client.receive().await);
+            }
+            let state = get(&app, &session.path("/state")).await.json();
+            (trip, answers, state)
+        }
+    };
+    let robots = futures_util::future::join_all((0..ROBOTS).map(drive)).await;
+    for (trip, answers, state) in robots {
+        trip.check_state(&model, &state);
+        for (seq, answer) in answers.iter().enumerate() {
+            match answer {
+                ServerMessage::Warming { have, .. } => assert_eq!(*have, seq + 1),
+                ServerMessage::Prediction { frames, seq: found, .. } => {
+                    assert_eq!(*found, seq as u64);
+                    trip.check(&model, seq, frames);
+                }
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn sixty_four_interleaved_sessions_predict_what_each_would_alone() {
+    interleaved(12).await;
+}
+
+/// `cargo test --release --test it -- --ignored sixty_four_interleaved_sessions_for_a_thousand_steps`
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "64,000 predictions twice over: minutes"]
+async fn sixty_four_interleaved_sessions_for_a_thousand_steps() {
+    interleaved(1000).await;
+}

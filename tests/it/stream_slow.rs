@@ -1,0 +1,123 @@
+//! Clients that read slowly or never, beside others.
+
+use std::time::{Duration, Instant};
+
+use foreframe::nn::{Conditioning, ModelSpec};
+use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMessage, ServerMessage, WarningCode};
+use foreframe::server::{App, ImageBytes, ImageFormat, ServerConfig};
+
+use crate::client::Client;
+use crate::service::{PATIENCE, Running, model, run, spec, until, with_data};
+
+const SIDE: u32 = 256;
+const SEND: Duration = Duration::from_millis(500);
+
+/// A server of a model whose answers, half a megabyte each, soon fill a socket.
+async fn start(dir: &std::path::Path) -> Running {
+    let config = ServerConfig {
+        stream_send_ms: SEND.as_millis() as u64,
+        max_stream_buffer_bytes: 1 << 20,
+        ..with_data(dir, ServerConfig::default())
+    };
+    let large = ModelSpec {
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        context: 1,
+        horizon: 8,
+        ..spec(Conditioning::None)
+    };
+    run(App::start(config, vec![model(dir, "large", large)]).unwrap()).await
+}
+
+async fn connect(server: &Running) -> Client {
+    Client::connect(server.address, "/v1/models/large/stream", Codec::Msgpack)
+        .await
+        .unwrap()
+}
+
+fn frame(seq: u64) -> ClientMessage {
+    ClientMessage::Frame(FrameMessage {
+        seq,
+        timestamp_us: 0,
+        image: ImageBytes(vec![seq as u8; (SIDE * SIDE) as usize]),
+        format: ImageFormat::Raw,
+        action: None,
+        state: None,
+        plan: None,
+    })
+}
+
+/// Reads nothing for longer than the server waits, then everything: the end, as far as it could still be told.
+async fn read_nothing_then_all(server: &Running) -> (Option<ClosingReason>, Option<u16>) {
+    let mut client = connect(server).await;
+    client.ask(&frame(0)).await;
+    // The kept answer is sent again for each.
+    let flood = async { while client.try_send(&frame(0)).await.is_ok() {} };
+    let _ = tokio::time::timeout(SEND + SEND / 2, flood).await;
+    let end = tokio::time::timeout(4 * SEND, client.end()).await;
+    end.unwrap_or_default()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_reads_nothing_is_told_so_and_left() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = start(dir.path()).await;
+    // On a busy machine the client may begin to read before the server's patience is over, or after it has hung up.
+    let slow = (Some(ClosingReason::Slow), Some(1013));
+    until(async || (read_nothing_then_all(&server).await == slow).then_some(())).await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = start(dir.path()).await;
+    let mut client = connect(&server).await;
+    client.ask(&frame(0)).await;
+    let sent = 100;
+    for _ in 0..sent {
+        client.send(&frame(0)).await;
+    }
+    let (mut told, mut read, mut is_warned) = (0, 0, false);
+    while told + read < sent {
+        match client.receive().await {
+            ServerMessage::Prediction { dropped, .. } => {
+                told += dropped;
+                read += 1;
+            }
+            ServerMessage::Warning { code, .. } => {
+                assert_eq!(code, WarningCode::Slow);
+                is_warned = true;
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    assert!(told > 0 && is_warned, "{told} dropped of {sent}");
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn others_are_answered_while_one_reads_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = start(dir.path()).await;
+    let mut stuck = connect(&server).await;
+    let flood = tokio::spawn(async move { while stuck.try_send(&frame(0)).await.is_ok() {} });
+    let others = (0..20).map(|_| async {
+        let mut client = connect(&server).await;
+        let mut slowest = Duration::ZERO;
+        for seq in 0..10 {
+            let asked = Instant::now();
+            assert!(matches!(
+                client.ask(&frame(seq)).await,
+                ServerMessage::Prediction { .. }
+            ));
+            slowest = slowest.max(asked.elapsed());
+        }
+        slowest
+    });
+    for slowest in futures_util::future::join_all(others).await {
+        assert!(slowest < PATIENCE / 4, "{slowest:?}");
+    }
+    flood.abort();
+    server.stop().await;
+}
