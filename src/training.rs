@@ -157,13 +157,14 @@ pub fn run(
 ) -> Result<Outcome, TrainError> {
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
+    // Before the directory is made, so that what is refused here leaves nothing in the way of the next try.
+    let plan = Plan::new(config, dataset)?;
     let files = RunFiles::open(training.run_dir, config, &dataset.info().content_hash)?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(Outcome::Finished { model_dir, manifest });
     }
-    let plan = Plan::new(config, dataset)?;
     let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
         Some(checkpoint) => checkpoint.into_state(),
         None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
