@@ -24,7 +24,7 @@ pub use self::observer::{Event, Observer, Stage};
 use self::stage::{Flow, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
-use crate::files::{sha256_hex, write_atomically};
+use crate::files::write_atomically;
 use crate::frame::FrameError;
 use crate::nn::{ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError};
@@ -299,9 +299,4 @@ fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
     frames.sort_unstable();
     frames.dedup();
     frames
-}
-
-/// What two runs must share for one to go on from the other's checkpoint.
-fn fingerprint(text: &str) -> String {
-    sha256_hex(text.as_bytes())
 }
