@@ -4,9 +4,11 @@
 
 mod architecture;
 mod cli;
+mod contract;
 mod dataset_collect;
 mod dataset_sampler;
 mod evaluation;
+mod fixtures;
 mod jobs;
 mod nn_cell;
 mod nn_common;
