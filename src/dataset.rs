@@ -28,12 +28,13 @@ pub use collection::Standing;
 pub use error::DatasetError;
 pub use sampler::{Split, Splits, WindowShape};
 
+use crate::files::hex;
 pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
 use crate::wording::listed;
 
 /// What a data set is: sizes, rates, meanings and the hash of its content.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct DatasetInfo {
     /// Its name, for reports.
     pub name: String,
@@ -282,13 +283,4 @@ impl Dataset {
 
 fn item<T>(all: &[T], index: usize, size: usize) -> &[T] {
     &all[index * size..(index + 1) * size]
-}
-
-/// Lower-case hexadecimal digits of the bytes.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
 }

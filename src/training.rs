@@ -24,7 +24,7 @@ pub use self::observer::{Event, Observer, Stage};
 use self::stage::{Flow, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
-use crate::files::{sha256_hex, write_atomically};
+use crate::files::write_atomically;
 use crate::frame::FrameError;
 use crate::nn::{ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError};
@@ -157,13 +157,14 @@ pub fn run(
 ) -> Result<Outcome, TrainError> {
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
+    // Before the directory is made, so that what is refused here leaves nothing in the way of the next try.
+    let plan = Plan::new(config, dataset)?;
     let files = RunFiles::open(training.run_dir, config, &dataset.info().content_hash)?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(Outcome::Finished { model_dir, manifest });
     }
-    let plan = Plan::new(config, dataset)?;
     let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
         Some(checkpoint) => checkpoint.into_state(),
         None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
@@ -298,9 +299,4 @@ fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
     frames.sort_unstable();
     frames.dedup();
     frames
-}
-
-/// What two runs must share for one to go on from the other's checkpoint.
-fn fingerprint(text: &str) -> String {
-    sha256_hex(text.as_bytes())
 }

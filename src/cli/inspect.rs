@@ -93,10 +93,10 @@ fn say_costs(manifest: &Manifest) -> Result<(), CliError> {
         ("CDNA (Finn et al. 2016)", costs::cdna(&manifest.spec)),
     ] {
         say(format!(
-            "              {name} takes {}, {:.0} times as many, with {} parameters",
-            cost.multiply_adds_per_frame,
+            "              {name} takes {:.0} million, {:.0} times as many, with {:.2} million parameters",
+            cost.multiply_adds_per_frame as f64 / 1e6,
             cost.multiply_adds_per_frame as f64 / own as f64,
-            cost.parameters
+            cost.parameters as f64 / 1e6
         ))?;
     }
     Ok(())

@@ -7,12 +7,13 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
-use super::files::{sha256, sha256_of_file, write_atomically};
+use super::files::{sha256_of_file, write_atomically};
 use super::layout::{ARGUMENTS, INFO, Stamp, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
+use crate::files::{partial_path, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -122,7 +123,7 @@ fn is_unused(out: &Path) -> Result<bool, DatasetError> {
         let only_half = is_meta
             && names(&path)?
                 .iter()
-                .all(|inner| *inner == out.join(ARGUMENTS.to_owned() + ".tmp"));
+                .all(|inner| *inner == partial_path(&out.join(ARGUMENTS)));
         if !only_half {
             return Ok(false);
         }
@@ -223,7 +224,7 @@ impl<'a> Collection<'a> {
         let records =
             serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
         self.push(FinishedShard {
-            sha256: sha256(&built.bytes),
+            sha256: sha256_hex(&built.bytes),
             records,
         });
         Ok(())

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::files::sha256;
 use super::{DatasetError, DatasetInfo};
+use crate::files::sha256_hex;
 use crate::types::{Channel, Seed};
 
 /// LeRobot's description; written last, so a directory without it is unfinished.
@@ -126,7 +126,7 @@ impl Stamp {
 /// The hex sha256 over the shards' hex hashes, one after another.
 pub(super) fn content_hash(shards: &[ShardEntry]) -> String {
     let hashes: String = shards.iter().map(|shard| shard.sha256.as_str()).collect();
-    sha256(hashes.as_bytes())
+    sha256_hex(hashes.as_bytes())
 }
 
 /// A JSON object without its line breaks, for a message.

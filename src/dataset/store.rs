@@ -12,6 +12,7 @@ use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
+use crate::files::sha256_hex;
 
 impl Dataset {
     /// Reads a data set whole, after checking that every file is the one that was written.
@@ -159,7 +160,7 @@ pub(super) fn complete(
     }
     let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
     let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
-    let stamp = stamp(info, shards, super::files::sha256(&episodes));
+    let stamp = stamp(info, shards, sha256_hex(&episodes));
     let info = stamp.info();
     write_atomically(&directory.join(EPISODES), &episodes)?;
     let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
@@ -206,9 +207,8 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetE
 
 #[cfg(test)]
 mod tests {
-    use super::super::files::sha256;
+    use super::super::EpisodeData;
     use super::super::shard::{EncodedEpisode, ShardStart, build};
-    use super::super::{EpisodeData, hex};
     use super::*;
     use crate::types::Channel;
 
@@ -219,13 +219,7 @@ mod tests {
             frame_height_px: 2,
             frame_period_s: 0.2,
             action_channels: vec![Channel::new("linear", "m/s")],
-            state_channels: vec![],
-            content_hash: String::new(),
-            scenario: None,
-            seed: None,
-            frame_count: 0,
-            episode_count: 0,
-            has_masks: false,
+            ..DatasetInfo::default()
         }
     }
 
@@ -251,7 +245,7 @@ mod tests {
         let mut built = build(&info(), start, &[encoded]).unwrap();
         change_bytes(&mut built.bytes);
         let shard = FinishedShard {
-            sha256: sha256(&built.bytes),
+            sha256: sha256_hex(&built.bytes),
             records: serde_json::from_str(&built.records).unwrap(),
         };
         write_atomically(&directory.path().join(layout::shard_path(0)), &built.bytes).unwrap();
@@ -327,7 +321,7 @@ mod tests {
         let built = build(&info(), ShardStart { episode: 0, frame: 0 }, &[encoded]).unwrap();
         let path = directory.path().join("shard");
         std::fs::write(&path, &built.bytes).unwrap();
-        let digest = <sha2::Sha256 as sha2::Digest>::digest(super::super::files::sha256_of_file(&path).unwrap());
-        assert_eq!(read.info().content_hash, hex(&digest));
+        let digest = sha256_hex(super::super::files::sha256_of_file(&path).unwrap().as_bytes());
+        assert_eq!(read.info().content_hash, digest);
     }
 }

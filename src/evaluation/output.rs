@@ -7,13 +7,13 @@ use super::{EvaluationError, Report};
 use crate::files::write_atomically;
 
 /// Makes the output directory, to be called before anything is computed.
-/// Errors: `OutputExists` if there is something in it or it is a file, `Io`.
+/// Errors: `OutputExists` if there is something in it or it is no directory, `Io`.
 pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
     let failed = |source| EvaluationError::Io {
         path: dir.to_owned(),
         source,
     };
-    if dir.is_file() {
+    if dir.exists() && !dir.is_dir() {
         return Err(EvaluationError::OutputExists(dir.to_owned()));
     }
     std::fs::create_dir_all(dir).map_err(failed)?;

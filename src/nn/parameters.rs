@@ -112,32 +112,6 @@ impl Parameters {
             .collect::<Result<_, NnError>>()?;
         Ok(Self(tensors))
     }
-
-    /// Sets the codec from the mean frame of the training data, `mean` `[P]` in the model's space: the decoder's bias
-    /// becomes the mean frame, and the encoder sees frames less the mean (its bias becomes −mean · weight). Pre-training
-    /// then starts from the mean frame instead of black.
-    pub fn center_codec(&self, mean: &Tensor) -> Result<(), NnError> {
-        let var = |name: &str| {
-            self.get(name).ok_or_else(|| NnError::TensorMissing {
-                name: name.to_owned(),
-                expected: Vec::new(),
-            })
-        };
-        let (weight, bias) = (var("frame_encoder.weight")?, var("frame_encoder.bias")?);
-        let decoder_bias = var("frame_decoder.bias")?;
-        if mean.dims() != decoder_bias.dims() {
-            return Err(NnError::shape("mean frame", mean, format!("{:?}", decoder_bias.dims())));
-        }
-        decoder_bias.set(&mean.copy()?)?;
-        bias.set(
-            &mean
-                .unsqueeze(0)?
-                .matmul(&weight.as_detached_tensor())?
-                .squeeze(0)?
-                .neg()?,
-        )?;
-        Ok(())
-    }
 }
 
 /// Whether every value is a finite number.

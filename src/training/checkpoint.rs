@@ -8,12 +8,12 @@ use candle_core::{Device, Tensor};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
+use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
 use super::observer::Stage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use super::{TrainError, fingerprint};
-use crate::files::write_atomically;
+use crate::files::{sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// The key of the state's numbers in the file's metadata.
@@ -25,6 +25,7 @@ const OPTIMIZER: &str = "optimizer.";
 /// The directory of one run.
 pub(super) struct RunFiles {
     run_dir: PathBuf,
+    /// What two runs must share for one to go on from the other's checkpoint.
     fingerprint: String,
 }
 
@@ -35,7 +36,7 @@ impl RunFiles {
         let text = config.to_toml()?;
         let files = Self {
             run_dir: run_dir.to_owned(),
-            fingerprint: fingerprint(&format!("{text}\n{content_hash}")),
+            fingerprint: sha256_hex(format!("{text}\n{content_hash}").as_bytes()),
         };
         let (config_path, data_path) = (run_dir.join("config.toml"), run_dir.join("dataset.sha256"));
         if config_path.is_file() && data_path.is_file() {

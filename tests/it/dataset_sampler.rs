@@ -16,13 +16,7 @@ fn info() -> DatasetInfo {
         frame_height_px: 1,
         frame_period_s: PERIOD_S,
         action_channels: vec![Channel::new("linear", "m/s")],
-        state_channels: vec![],
-        content_hash: String::new(),
-        scenario: None,
-        seed: None,
-        frame_count: 0,
-        episode_count: 0,
-        has_masks: false,
+        ..DatasetInfo::default()
     }
 }
 
@@ -38,10 +32,9 @@ fn episode(frames: usize, jumps: &[usize], trial: Option<TrialParameters>) -> Ep
     EpisodeData {
         timestamps_s,
         pixels: vec![7; frames],
-        masks: None,
         actions: vec![0.5; frames],
-        states: vec![],
         trial,
+        ..EpisodeData::default()
     }
 }
 

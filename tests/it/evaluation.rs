@@ -2,58 +2,16 @@
 
 use std::collections::BTreeSet;
 
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::dataset::Dataset;
 use foreframe::evaluation::report::{Outcome, Report};
 use foreframe::evaluation::{self, EvaluateConfig, EvaluationError};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
-use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
-use foreframe::types::{Channel, Seed};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
+use foreframe::registry::{DatasetStamp, LoadedModel};
+use foreframe::types::Seed;
+
+use crate::fixtures::{self, moving_squares};
 
 const SIDE: u32 = 16;
-const FRAMES: u32 = 14;
-
-/// Episodes in which a dark square moves over a ramp, by as many pixels a frame as the action says.
-fn scene(episodes: usize, side: u32, period_s: f64) -> Dataset {
-    let data = (0..episodes).map(|episode| {
-        let speed = (episode % 3) as u32;
-        let inside = |frame: u32, i: u32| (i / side) / 4 == 1 && (i % side + side - (speed * frame) % side) % side < 4;
-        let pixel = |frame: u32, i: u32| {
-            if inside(frame, i) {
-                20
-            } else {
-                (120 + 4 * (i % side)) as u8
-            }
-        };
-        let each = |value: &dyn Fn(u32, u32) -> u8| -> Vec<u8> {
-            (0..FRAMES)
-                .flat_map(|frame| (0..side * side).map(move |i| value(frame, i)))
-                .collect()
-        };
-        EpisodeData {
-            pixels: each(&pixel),
-            masks: Some(each(&|frame, i| u8::from(inside(frame, i)))),
-            actions: vec![speed as f32; FRAMES as usize],
-            states: vec![0.5; FRAMES as usize],
-            timestamps_s: (0..FRAMES).map(|frame| f64::from(frame) * period_s).collect(),
-            ..EpisodeData::default()
-        }
-    });
-    let info = DatasetInfo {
-        name: "squares".to_owned(),
-        frame_width_px: side,
-        frame_height_px: side,
-        frame_period_s: period_s,
-        action_channels: vec![Channel::new("speed", "px/frame")],
-        state_channels: vec![Channel::new("phase", "")],
-        content_hash: String::new(),
-        scenario: None,
-        seed: None,
-        frame_count: 0,
-        episode_count: 0,
-        has_masks: false,
-    };
-    Dataset::from_episodes(info, data.collect()).unwrap()
-}
 
 fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
@@ -76,32 +34,16 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
     }
 }
 
-/// A model that was never trained, published and loaded as any other.
+/// A model that was never trained, whose data set is said to have been this one.
 fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
-    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let manifest = Manifest {
-        name: name.to_owned(),
-        version: 1,
-        weights_sha256: String::new(),
-        dataset: DatasetStamp {
-            name: dataset.info().name.clone(),
-            content_hash: dataset.info().content_hash.clone(),
-            scenario: None,
-            windows: 0,
-            split_seed: Seed(7),
-        },
-        seed: Seed(1),
-        command: "test".to_owned(),
-        training: serde_json::Value::Null,
-        metrics: serde_json::Value::Null,
-        parameters: spec.parameter_count(),
-        multiply_adds_per_frame: spec.multiply_adds_per_frame(),
-        program: ProgramStamp::current(),
-        spec,
+    let trained_on = DatasetStamp {
+        name: dataset.info().name.clone(),
+        content_hash: dataset.info().content_hash.clone(),
+        scenario: None,
+        windows: 0,
+        split_seed: Seed(7),
     };
-    let dir = tempfile::tempdir().unwrap();
-    registry::publish(dir.path(), &parameters, &manifest).unwrap();
-    registry::load(dir.path()).unwrap()
+    fixtures::model(tempfile::tempdir().unwrap().path(), name, spec, trained_on)
 }
 
 fn config() -> EvaluateConfig<'static> {
@@ -124,7 +66,7 @@ fn refusal(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> 
 
 #[test]
 fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
-    let dataset = scene(40, SIDE, 0.2);
+    let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     let twin = untrained("twin", spec(Conditioning::None), &dataset);
     let with_twin = EvaluateConfig {
@@ -149,7 +91,7 @@ fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
 
 #[test]
 fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
-    let dataset = scene(30, SIDE, 0.2);
+    let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let first = evaluate(&model, &dataset, &config()).unwrap();
     let larger = EvaluateConfig { batch: 7, ..config() };
@@ -162,7 +104,7 @@ fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
 
 #[test]
 fn report_and_figures_are_written_and_read_back() {
-    let dataset = scene(30, SIDE, 0.2);
+    let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::Action), &dataset);
     let mut report = evaluate(&model, &dataset, &config()).unwrap();
     let dir = tempfile::tempdir().unwrap();
@@ -201,14 +143,14 @@ fn report_and_figures_are_written_and_read_back() {
 
 #[test]
 fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
-    let dataset = scene(30, SIDE, 0.2);
+    let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     assert_eq!(
-        refusal(&model, &scene(30, 20, 0.2), &config()),
+        refusal(&model, &moving_squares(30, 20, 0.2), &config()),
         "data set \"squares\" has frames of 20×20 px; model \"still\" takes 16×16"
     );
     assert_eq!(
-        refusal(&model, &scene(30, SIDE, 0.1), &config()),
+        refusal(&model, &moving_squares(30, SIDE, 0.1), &config()),
         "data set \"squares\" has a frame every 0.1 s; model \"still\" predicts one every 0.2 s"
     );
     let mut turned = spec(Conditioning::StateAction);
@@ -239,7 +181,7 @@ fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
 
 #[test]
 fn the_markdown_reads_as_agreed() {
-    let dataset = scene(30, SIDE, 0.2);
+    let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::Action), &dataset);
     let mut report = evaluate(&model, &dataset, &config()).unwrap();
     report.stamp.wall_time_s = 1.5;

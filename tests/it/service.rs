@@ -8,14 +8,16 @@ use axum::http::{HeaderMap, Method, Request, StatusCode, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::{Frame, codec};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
-use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
+use foreframe::registry::{DatasetStamp, LoadedModel};
 use foreframe::server::{self, App, ServerConfig};
 use foreframe::types::Seed;
-use serde_json::{Value, json};
+use serde_json::Value;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tower::ServiceExt as _;
+
+use crate::fixtures;
 
 pub(crate) const WIDTH: u32 = 16;
 pub(crate) const HEIGHT: u32 = 12;
@@ -56,30 +58,14 @@ pub(crate) fn slow_spec() -> ModelSpec {
 
 /// Publishes a model with random weights below `dir` and loads it.
 pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
-    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let manifest = Manifest {
-        name: name.to_owned(),
-        version: 1,
-        weights_sha256: String::new(),
-        dataset: DatasetStamp {
-            name: "none".to_owned(),
-            content_hash: String::new(),
-            scenario: None,
-            windows: 1,
-            split_seed: Seed(0),
-        },
-        seed: Seed(1),
-        command: "a test".to_owned(),
-        training: json!({}),
-        metrics: json!({}),
-        parameters: spec.parameter_count(),
-        multiply_adds_per_frame: spec.multiply_adds_per_frame(),
-        program: ProgramStamp::current(),
-        spec,
+    let trained_on = DatasetStamp {
+        name: "none".to_owned(),
+        content_hash: String::new(),
+        scenario: None,
+        windows: 1,
+        split_seed: Seed(0),
     };
-    let model_dir = dir.join(name);
-    registry::publish(&model_dir, &parameters, &manifest).unwrap();
-    registry::load(&model_dir).unwrap()
+    fixtures::model(&dir.join(name), name, spec, trained_on)
 }
 
 /// An unconditioned model `plain` and a conditioned one `moving`.

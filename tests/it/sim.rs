@@ -8,11 +8,11 @@ use foreframe::sim::{
 };
 use foreframe::types::{Action, Seed};
 
-fn action(linear: f32, angular: f32) -> Action {
+pub(crate) fn action(linear: f32, angular: f32) -> Action {
     Action::try_from(vec![linear, angular]).unwrap()
 }
 
-fn small() -> WorldConfig {
+pub(crate) fn small() -> WorldConfig {
     WorldConfig {
         frame_width_px: 16,
         frame_height_px: 16,

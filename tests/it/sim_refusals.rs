@@ -3,17 +3,7 @@
 use foreframe::sim::{Environment, Scenario, SimError, TrialParameters, World, WorldConfig};
 use foreframe::types::{Action, Seed};
 
-fn action(linear: f32, angular: f32) -> Action {
-    Action::try_from(vec![linear, angular]).unwrap()
-}
-
-fn small() -> WorldConfig {
-    WorldConfig {
-        frame_width_px: 16,
-        frame_height_px: 16,
-        ..WorldConfig::default()
-    }
-}
+use crate::sim::{action, small};
 
 #[test]
 fn an_unknown_scenario_is_answered_with_those_there_are() {

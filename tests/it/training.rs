@@ -4,55 +4,17 @@ use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::dataset::Dataset;
 use foreframe::registry;
 use foreframe::training::{Event, Outcome, TrainConfig, TrainError, Training, run};
-use foreframe::types::Channel;
 
-const SIDE: u32 = 12;
+use crate::fixtures::moving_squares;
 
-/// Episodes in which a bright square goes right or left by what the action says.
-pub(crate) fn moving_square(episodes: usize) -> Dataset {
-    let data = (0..episodes).map(|episode| {
-        let direction = if episode % 2 == 0 { 1.0 } else { -1.0 };
-        let column = |frame: usize| (5.0 + direction * frame as f32).rem_euclid(SIDE as f32) as u32;
-        EpisodeData {
-            pixels: (0..12).flat_map(|frame| square(column(frame))).collect(),
-            actions: vec![direction; 12],
-            states: (0..12).map(|frame| column(frame) as f32).collect(),
-            timestamps_s: (0..12).map(|frame| f64::from(frame) * 0.2).collect(),
-            ..EpisodeData::default()
-        }
-    });
-    let info = DatasetInfo {
-        name: "square".to_owned(),
-        frame_width_px: SIDE,
-        frame_height_px: SIDE,
-        frame_period_s: 0.2,
-        action_channels: vec![Channel::new("direction", "px/frame")],
-        state_channels: vec![Channel::new("column", "px")],
-        content_hash: String::new(),
-        scenario: None,
-        seed: None,
-        frame_count: 0,
-        episode_count: 0,
-        has_masks: false,
-    };
-    Dataset::from_episodes(info, data.collect()).unwrap()
+fn squares(episodes: usize) -> Dataset {
+    moving_squares(episodes, 12, 0.2)
 }
 
-fn square(column: u32) -> Vec<u8> {
-    let pixel = |x: u32, y: u32| {
-        if (4..8).contains(&y) && (x + SIDE - column) % SIDE < 3 {
-            30
-        } else {
-            220
-        }
-    };
-    (0..SIDE * SIDE).map(|i| pixel(i % SIDE, i / SIDE)).collect()
-}
-
-pub(crate) fn small_config(extra: &[&str]) -> TrainConfig {
+fn small_config(extra: &[&str]) -> TrainConfig {
     let small = [
         "name=square",
         "model.features=8",
@@ -101,7 +63,7 @@ fn weights(dir: &Path) -> Vec<u8> {
 
 #[test]
 fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
-    let (dataset, config) = (moving_square(20), small_config(&[]));
+    let (dataset, config) = (squares(20), small_config(&[]));
     let dir = tempfile::tempdir().unwrap();
     let unbroken = dir.path().join("unbroken");
     train(&config, &dataset, &unbroken).unwrap();
@@ -129,7 +91,7 @@ fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
 
 #[test]
 fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_manifest() {
-    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "pretrain.steps=300",
         "fit.steps=300",
@@ -164,12 +126,12 @@ fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_mani
     };
     let loaded = registry::load(&model_dir).unwrap();
     assert_eq!(loaded.manifest.weights_sha256, manifest.weights_sha256);
-    assert_eq!(loaded.manifest.spec.actions[0].name, "direction");
+    assert_eq!(loaded.manifest.spec.actions[0].name, "speed");
 }
 
 #[test]
 fn a_finished_run_is_answered_without_training_again() {
-    let (dataset, config, dir) = (moving_square(20), small_config(&[]), tempfile::tempdir().unwrap());
+    let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train(&config, &dataset, dir.path()).unwrap();
     let outcome = train_until(&config, &dataset, dir.path(), 1).unwrap();
     assert!(matches!(outcome, Outcome::Finished { .. }));
@@ -177,7 +139,7 @@ fn a_finished_run_is_answered_without_training_again() {
 
 #[test]
 fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
-    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "fit.learning_rate=1",
         "run.clip_norm=1e6",
@@ -202,13 +164,13 @@ fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
 
 #[test]
 fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
-    let (dataset, dir) = (moving_square(20), tempfile::tempdir().unwrap());
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
     let error = train(&small_config(&["seed=2"]), &dataset, dir.path())
         .unwrap_err()
         .to_string();
     assert!(error.contains("holds a run with another configuration"), "{error}");
-    let error = train(&small_config(&[]), &moving_square(22), dir.path())
+    let error = train(&small_config(&[]), &squares(22), dir.path())
         .unwrap_err()
         .to_string();
     assert!(error.contains("holds a run with another data set"), "{error}");
@@ -218,14 +180,14 @@ fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
 fn a_directory_of_something_else_is_left_alone() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("thesis.tex"), "precious").unwrap();
-    let error = train(&small_config(&[]), &moving_square(20), dir.path()).unwrap_err();
+    let error = train(&small_config(&[]), &squares(20), dir.path()).unwrap_err();
     assert!(matches!(error, TrainError::NotARun(_)), "{error}");
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
 }
 
 #[test]
 fn a_damaged_checkpoint_is_refused_with_what_to_do() {
-    let (dataset, config, dir) = (moving_square(20), small_config(&[]), tempfile::tempdir().unwrap());
+    let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train_until(&config, &dataset, dir.path(), 10).unwrap();
     let path = dir.path().join("checkpoint.safetensors");
     let bytes = std::fs::read(&path).unwrap();
@@ -240,7 +202,7 @@ fn a_damaged_checkpoint_is_refused_with_what_to_do() {
 #[test]
 fn more_windows_than_there_are_is_refused_with_their_number() {
     let dir = tempfile::tempdir().unwrap();
-    let error = train(&small_config(&["data.windows=100000"]), &moving_square(20), dir.path())
+    let error = train(&small_config(&["data.windows=100000"]), &squares(20), dir.path())
         .unwrap_err()
         .to_string();
     assert!(error.contains("100000"), "{error}");
@@ -249,8 +211,8 @@ fn more_windows_than_there_are_is_refused_with_their_number() {
 #[test]
 fn a_window_longer_than_every_episode_is_refused() {
     let dir = tempfile::tempdir().unwrap();
-    let error = train(&small_config(&["model.context=9"]), &moving_square(20), dir.path())
+    let error = train(&small_config(&["model.context=10"]), &squares(20), dir.path())
         .unwrap_err()
         .to_string();
-    assert!(error.contains("14") && error.contains("12"), "{error}");
+    assert!(error.contains("15 frames") && error.contains("14 frames"), "{error}");
 }

@@ -3,11 +3,13 @@
 use std::fmt::Display;
 
 use plotters::coord::Shift;
+use plotters::coord::combinators::BindKeyPoints;
+use plotters::element::DashedPathElement;
 use plotters::prelude::{
     ChartBuilder, Circle, DashedLineSeries, DrawingArea, IntoDrawingArea, IntoLogRange, LineSeries, PathElement,
     RGBColor, SVGBackend, Text, WHITE,
 };
-use plotters::style::Color;
+use plotters::style::{Color, ShapeStyle};
 
 use super::Chart;
 use crate::evaluation::EvaluationError;
@@ -45,9 +47,12 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
     let (low, high) = bounds(chart);
     let mut plot = ChartBuilder::on(area)
         .margin(16)
-        .x_label_area_size(46)
-        .y_label_area_size(70)
-        .build_cartesian_2d(0.8..steps as f64 + 0.2, (low..high).log_scale())
+        .x_label_area_size(50)
+        .y_label_area_size(74)
+        .build_cartesian_2d(
+            0.8..steps as f64 + 0.2,
+            (low..high).log_scale().with_key_points(ticks(low, high)),
+        )
         .map_err(told)?;
     plot.configure_mesh()
         .x_labels(steps.min(12) + 1)
@@ -55,47 +60,66 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
             let whole = (step - step.round()).abs() < 1e-6;
             if whole { format!("t+{step:.0}") } else { String::new() }
         })
-        .y_labels(12)
-        .y_label_formatter(&|value| value.to_string())
+        .y_label_formatter(&|value| format!("{}", (value * 1e6).round() / 1e6))
         .x_desc("frames ahead")
         .y_desc("MSE per pixel, ×10⁻⁴ (log scale)")
-        .label_style(("sans-serif", 14))
+        .label_style(("sans-serif", 16))
         .max_light_lines(0)
         .bold_line_style(RGBColor(225, 225, 225))
         .draw()
         .map_err(told)?;
-    for (method, values) in &chart.series {
+    // The model comes first, so it is drawn last: over the others.
+    for (method, values) in chart.series.iter().rev() {
         let points: Vec<(f64, f64)> = (1..)
             .zip(values)
             .map(|(step, value)| (f64::from(step), shown(*value, low)))
             .collect();
-        let color = color(*method);
-        let style = color.stroke_width(if *method == Method::Model { 4 } else { 2 });
-        if *method == Method::CodecOnly {
-            plot.draw_series(DashedLineSeries::new(points.iter().copied(), 6, 5, style))
+        if is_dashed(*method) {
+            plot.draw_series(DashedLineSeries::new(points.iter().copied(), 6, 5, stroke(*method)))
                 .map_err(told)?;
         } else {
-            plot.draw_series(LineSeries::new(points.iter().copied(), style))
+            plot.draw_series(LineSeries::new(points.iter().copied(), stroke(*method)))
                 .map_err(told)?;
         }
-        plot.draw_series(points.iter().map(|&point| Circle::new(point, 4, color.filled())))
-            .map_err(told)?;
+        plot.draw_series(
+            points
+                .iter()
+                .map(|&point| Circle::new(point, 4, color(*method).filled())),
+        )
+        .map_err(told)?;
     }
     Ok(())
 }
 
 fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
-    for (place, (method, _)) in (0..).zip(&chart.series) {
+    // From the worst to the best at the end, as the lines lie beside it.
+    let last = |(_, values): &&(Method, Vec<f64>)| values.last().copied().unwrap_or(0.0);
+    let mut series: Vec<_> = chart.series.iter().collect();
+    series.sort_by(|one, other| last(other).total_cmp(&last(one)));
+    for (place, &(method, _)) in (0..).zip(series) {
         let y = 40 + place * LEGEND_LINE_PX;
-        let color = color(*method);
-        let style = color.stroke_width(if *method == Method::Model { 4 } else { 2 });
-        area.draw(&PathElement::new(vec![(8, y), (40, y)], style))
+        let ends = [(8, y), (40, y)];
+        if is_dashed(method) {
+            area.draw(&DashedPathElement::new(ends, 6, 5, stroke(method)))
+        } else {
+            area.draw(&PathElement::new(ends, stroke(method)))
+        }
+        .map_err(told)?;
+        area.draw(&Circle::new((24, y), 4, color(method).filled()))
             .map_err(told)?;
-        area.draw(&Circle::new((24, y), 4, color.filled())).map_err(told)?;
-        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 16)))
+        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 18)))
             .map_err(told)?;
     }
     Ok(())
+}
+
+/// No prediction goes below what the codec alone loses.
+fn is_dashed(method: Method) -> bool {
+    method == Method::CodecOnly
+}
+
+fn stroke(method: Method) -> ShapeStyle {
+    color(method).stroke_width(if method == Method::Model { 4 } else { 2 })
 }
 
 fn told(error: impl Display) -> String {
@@ -126,6 +150,14 @@ fn bounds(chart: &Chart) -> (f64, f64) {
     }
 }
 
+/// 1, 2 and 5 of every decade in the range; powers of ten alone where there would be too many.
+fn ticks(low: f64, high: f64) -> Vec<f64> {
+    let decades = low.log10().floor() as i32..=high.log10().ceil() as i32;
+    let steps: &[f64] = if high / low > 1e4 { &[1.0] } else { &[1.0, 2.0, 5.0] };
+    let all = decades.flat_map(|decade| steps.iter().map(move |step| step * 10f64.powi(decade)));
+    all.filter(|tick| (low..=high).contains(tick)).collect()
+}
+
 /// Colours that stay apart for most kinds of colour blindness (Okabe & Ito 2008).
 fn color(method: Method) -> RGBColor {
     match method {
@@ -136,5 +168,33 @@ fn color(method: Method) -> RGBColor {
         Method::LinearExtrapolation => RGBColor(230, 159, 0),
         Method::ConstantShift => RGBColor(86, 180, 233),
         Method::CodecOnly => RGBColor(90, 90, 90),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_axis_within_a_decade_has_ticks_and_one_over_many_has_few() {
+        assert_eq!(ticks(0.9, 30.0), [1.0, 2.0, 5.0, 10.0, 20.0]);
+        assert_eq!(ticks(1.5, 9.0), [2.0, 5.0]);
+        assert_eq!(ticks(1e-4, 1e4).len(), 9);
+    }
+
+    #[test]
+    fn the_legend_stands_in_the_order_in_which_the_lines_end() {
+        let chart = Chart {
+            file: "error.svg".to_owned(),
+            caption: String::new(),
+            series: vec![
+                (Method::Model, vec![1e-4, 2e-4]),
+                (Method::CopyLast, vec![3e-4, 9e-4]),
+                (Method::CodecOnly, vec![1e-4, 1e-4]),
+            ],
+        };
+        let svg = draw(&chart).unwrap();
+        let place = |method: Method| svg.find(method.label()).unwrap();
+        assert!(place(Method::CopyLast) < place(Method::Model) && place(Method::Model) < place(Method::CodecOnly));
     }
 }

@@ -128,19 +128,18 @@ pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameE
 
 fn row_height(row: &Row, style: &Style, line: usize) -> usize {
     let heading = if row.label.is_empty() { 0 } else { line };
-    let frames = row
-        .cells
-        .iter()
-        .map(|(_, frame)| frame.height() as usize)
-        .max()
-        .unwrap_or(0)
-        * style.scale;
     let captions = if row.cells.iter().all(|(caption, _)| caption.is_empty()) {
         0
     } else {
         line
     };
-    heading + frames + captions + GAP_PX
+    heading + frames_height(row, style) + captions + GAP_PX
+}
+
+/// The tallest frame of the row, enlarged.
+fn frames_height(row: &Row, style: &Style) -> usize {
+    let heights = row.cells.iter().map(|(_, frame)| frame.height() as usize);
+    heights.max().unwrap_or(0) * style.scale
 }
 
 fn draw_row(canvas: &mut Canvas, row: &Row, style: &Style, (mut top, column): (usize, usize)) {
@@ -148,13 +147,7 @@ fn draw_row(canvas: &mut Canvas, row: &Row, style: &Style, (mut top, column): (u
         canvas.write((MARGIN_PX, top), &row.label, LETTER_SCALE, INK);
         top += height_px(LETTER_SCALE) + GAP_PX;
     }
-    let frames = row
-        .cells
-        .iter()
-        .map(|(_, frame)| frame.height() as usize)
-        .max()
-        .unwrap_or(0)
-        * style.scale;
+    let frames = frames_height(row, style);
     for (place, (caption, frame)) in row.cells.iter().enumerate() {
         let left = MARGIN_PX + place * column;
         draw_frame(canvas, frame, style, (left, top));

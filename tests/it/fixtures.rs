@@ -1,0 +1,70 @@
+//! What tests of several subjects start from: a small data set in memory, and a model with random weights.
+
+use std::path::Path;
+
+use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::nn::{ModelSpec, Parameters};
+use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe::types::{Channel, Seed};
+
+/// Frames of an episode.
+const FRAMES: u32 = 14;
+
+/// Episodes in which a dark square moves over a ramp, by as many pixels a frame as the action says.
+pub(crate) fn moving_squares(episodes: usize, side: u32, period_s: f64) -> Dataset {
+    let data = (0..episodes).map(|episode| {
+        let speed = (episode % 3) as u32;
+        let inside = |frame: u32, i: u32| (i / side) / 4 == 1 && (i % side + side - (speed * frame) % side) % side < 4;
+        let pixel = |frame: u32, i: u32| {
+            if inside(frame, i) {
+                20
+            } else {
+                (120 + 4 * (i % side)) as u8
+            }
+        };
+        let each = |value: &dyn Fn(u32, u32) -> u8| -> Vec<u8> {
+            (0..FRAMES)
+                .flat_map(|frame| (0..side * side).map(move |i| value(frame, i)))
+                .collect()
+        };
+        EpisodeData {
+            pixels: each(&pixel),
+            masks: Some(each(&|frame, i| u8::from(inside(frame, i)))),
+            actions: vec![speed as f32; FRAMES as usize],
+            states: vec![0.5; FRAMES as usize],
+            timestamps_s: (0..FRAMES).map(|frame| f64::from(frame) * period_s).collect(),
+            ..EpisodeData::default()
+        }
+    });
+    let info = DatasetInfo {
+        name: "squares".to_owned(),
+        frame_width_px: side,
+        frame_height_px: side,
+        frame_period_s: period_s,
+        action_channels: vec![Channel::new("speed", "px/frame")],
+        state_channels: vec![Channel::new("phase", "")],
+        ..DatasetInfo::default()
+    };
+    Dataset::from_episodes(info, data.collect()).unwrap()
+}
+
+/// A model with random weights, published in `model_dir` and loaded as any other.
+pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: DatasetStamp) -> LoadedModel {
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let manifest = Manifest {
+        name: name.to_owned(),
+        version: 1,
+        weights_sha256: String::new(),
+        dataset: trained_on,
+        seed: Seed(1),
+        command: "a test".to_owned(),
+        training: serde_json::json!({}),
+        metrics: serde_json::json!({}),
+        parameters: spec.parameter_count(),
+        multiply_adds_per_frame: spec.multiply_adds_per_frame(),
+        program: ProgramStamp::current(),
+        spec,
+    };
+    registry::publish(model_dir, &parameters, &manifest).unwrap();
+    registry::load(model_dir).unwrap()
+}
