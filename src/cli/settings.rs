@@ -11,22 +11,22 @@ use crate::store::{Store, StoreConfig, StoreError};
 #[derive(clap::Args, Default)]
 pub(super) struct StoreSettings {
     /// A TOML file of settings [default: foreframe.toml, if it is there]
-    #[arg(long, value_name = "FILE")]
+    #[arg(global = true, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Where jobs keep data sets, runs and the models they train [default: data]
-    #[arg(long, value_name = "DIR")]
+    #[arg(global = true, long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
     /// Rows, to share them with other servers: PostgreSQL's URL [default: SQLite in the data directory]
-    #[arg(long, value_name = "URL")]
+    #[arg(global = true, long, value_name = "URL")]
     database_url: Option<String>,
     /// Files, to share them with other servers: an S3 bucket's URL [default: the data directory]
-    #[arg(long, value_name = "URL")]
+    #[arg(global = true, long, value_name = "URL")]
     objects_url: Option<String>,
     /// How log lines look: text or json [default: text]
-    #[arg(long, value_name = "FORMAT")]
+    #[arg(global = true, long, value_name = "FORMAT")]
     log_format: Option<String>,
     /// Any other setting, as in `max_streams=64`; may be given many times
-    #[arg(long = "set", value_name = "KEY=VALUE")]
+    #[arg(global = true, long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
 }
 

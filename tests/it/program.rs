@@ -268,7 +268,8 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
         "{}",
         text(&refused.stderr)
     );
-    let keys = ["robot 7", "robot 8"].map(|name| text(&output(dir.path(), &["keys", "create", name]).stdout));
+    let keys = ["robot 7", "robot 8"]
+        .map(|name| text(&output(dir.path(), &["keys", "create", name, "--data-dir", "data"]).stdout));
     let listed = text(&output(dir.path(), &["keys", "list"]).stdout);
     assert!(
         listed.contains("valid") && listed.contains("robot 7") && !listed.contains(keys[0].trim()),
