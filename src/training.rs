@@ -44,6 +44,9 @@ pub enum TrainError {
     /// The directory holds something else.
     #[error("{dir} exists and holds no training run; name a new directory", dir = .0.display())]
     NotARun(PathBuf),
+    /// Another training writes there.
+    #[error("another training is running in {}; wait for it or name another directory", .0.display())]
+    Busy(PathBuf),
     /// The directory holds a run with other settings or data.
     #[error(
         "{} holds a run with another {what}; go on with that one's ({}/config.toml), or name a new directory",
@@ -157,9 +160,10 @@ pub fn run(
 ) -> Result<Outcome, TrainError> {
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
+    let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
     // Before the directory is made, so that what is refused here leaves nothing in the way of the next try.
     let plan = Plan::new(config, dataset)?;
-    let files = RunFiles::open(training.run_dir, config, &dataset.info().content_hash)?;
+    let _lock = files.claim()?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);

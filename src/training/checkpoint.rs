@@ -1,7 +1,7 @@
 //! A run's directory: its configuration, and the state of its last checkpoint in one safetensors file, replaced whole.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use candle_core::{Device, Tensor};
@@ -18,6 +18,8 @@ use crate::nn::{ModelSpec, Parameters};
 
 /// The key of the state's numbers in the file's metadata.
 const META_KEY: &str = "foreframe.training";
+/// Names the data that the run trains on.
+const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
 const BEST: &str = "best.";
 const OPTIMIZER: &str = "optimizer.";
@@ -25,26 +27,25 @@ const OPTIMIZER: &str = "optimizer.";
 /// The directory of one run.
 pub(super) struct RunFiles {
     run_dir: PathBuf,
-    /// What two runs must share for one to go on from the other's checkpoint.
-    fingerprint: String,
+    config_text: String,
+    content_hash: String,
 }
 
 impl RunFiles {
-    /// Makes the directory of a new run, or checks that an old one is of the same configuration and data.
+    /// Checks that the directory is free, or that the run in it is of the same configuration and data; writes nothing.
     /// Errors: `NotARun`, `OtherRun`, `Io`.
-    pub(super) fn open(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
-        let text = config.to_toml()?;
+    pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let files = Self {
             run_dir: run_dir.to_owned(),
-            fingerprint: sha256_hex(format!("{text}\n{content_hash}").as_bytes()),
+            config_text: config.to_toml()?,
+            content_hash: content_hash.to_owned(),
         };
-        let (config_path, data_path) = (run_dir.join("config.toml"), run_dir.join("dataset.sha256"));
-        if config_path.is_file() && data_path.is_file() {
+        if files.config().is_file() && files.data().is_file() {
             for (path, expected, what) in [
-                (&config_path, text.as_str(), "configuration"),
-                (&data_path, content_hash, "data set"),
+                (files.config(), &files.config_text, "configuration"),
+                (files.data(), &files.content_hash, "data set"),
             ] {
-                if fs::read_to_string(path).map_err(unreadable(path))? != expected {
+                if fs::read_to_string(&path).map_err(io_failed("read", &path))? != *expected {
                     return Err(TrainError::OtherRun {
                         run_dir: run_dir.to_owned(),
                         what,
@@ -53,16 +54,41 @@ impl RunFiles {
             }
             return Ok(files);
         }
-        let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
-            entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != "dataset.sha256"))
-        });
+        let is_occupied = fs::read_dir(run_dir)
+            .is_ok_and(|mut entries| entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != DATA_FILE)));
         if is_occupied || run_dir.is_file() {
             return Err(TrainError::NotARun(run_dir.to_owned()));
         }
-        fs::create_dir_all(run_dir).map_err(unwritable(run_dir))?;
-        write_atomically(&data_path, content_hash.as_bytes()).map_err(unwritable(&data_path))?;
-        write_atomically(&config_path, text.as_bytes()).map_err(unwritable(&config_path))?;
         Ok(files)
+    }
+
+    /// Makes the directory of a new run. Nobody else trains in it until the file is dropped. Errors: `Busy`, `Io`.
+    pub(super) fn claim(&self) -> Result<File, TrainError> {
+        let (config, data) = (self.config(), self.data());
+        if !config.is_file() {
+            fs::create_dir_all(&self.run_dir).map_err(io_failed("make", &self.run_dir))?;
+            write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
+            write_atomically(&config, self.config_text.as_bytes()).map_err(io_failed("write", &config))?;
+        }
+        let lock = File::open(&config).map_err(io_failed("read", &config))?;
+        match lock.try_lock() {
+            Ok(()) => Ok(lock),
+            Err(TryLockError::WouldBlock) => Err(TrainError::Busy(self.run_dir.clone())),
+            Err(TryLockError::Error(source)) => Err(io_failed("lock", &config)(source)),
+        }
+    }
+
+    /// What two runs must share for one to go on from the other's checkpoint.
+    fn fingerprint(&self) -> String {
+        sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
+    }
+
+    fn config(&self) -> PathBuf {
+        self.run_dir.join("config.toml")
+    }
+
+    fn data(&self) -> PathBuf {
+        self.run_dir.join(DATA_FILE)
     }
 
     /// Where the trained model is published.
@@ -80,19 +106,10 @@ impl RunFiles {
     }
 }
 
-fn unreadable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
+fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> TrainError {
     let path = path.to_owned();
     move |source| TrainError::Io {
-        action: "read",
-        path: path.clone(),
-        source,
-    }
-}
-
-fn unwritable(path: &Path) -> impl Fn(std::io::Error) -> TrainError {
-    let path = path.to_owned();
-    move |source| TrainError::Io {
-        action: "write",
+        action,
         path: path.clone(),
         source,
     }
@@ -119,7 +136,7 @@ impl Checkpoint {
     pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
         let path = files.checkpoint();
         let meta = Meta {
-            fingerprint: files.fingerprint.clone(),
+            fingerprint: files.fingerprint().clone(),
             stage: state.stage,
             step: state.step,
             best_step: state.best_step,
@@ -142,7 +159,7 @@ impl Checkpoint {
             .collect();
         let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(META_KEY.to_owned(), text)])))
             .map_err(|error| failed(error.to_string()))?;
-        write_atomically(&path, &bytes).map_err(unwritable(&path))
+        write_atomically(&path, &bytes).map_err(io_failed("write", &path))
     }
 
     /// The run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or of another run.
@@ -155,7 +172,7 @@ impl Checkpoint {
             path: path.clone(),
             reason,
         };
-        let bytes = fs::read(&path).map_err(unreadable(&path))?;
+        let bytes = fs::read(&path).map_err(io_failed("read", &path))?;
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| failed(error.to_string()))?;
         let text = header
             .metadata()
@@ -163,7 +180,7 @@ impl Checkpoint {
             .and_then(|metadata| metadata.get(META_KEY))
             .ok_or_else(|| failed("it carries no training state".to_owned()))?;
         let meta: Meta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
-        if meta.fingerprint != files.fingerprint {
+        if meta.fingerprint != files.fingerprint() {
             return Err(failed("it belongs to another run".to_owned()));
         }
         let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;

@@ -142,6 +142,7 @@ fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "fit.learning_rate=1",
+        "fit.codec=fine-tuned",
         "run.clip_norm=1e6",
         "run.warmup_steps=0",
         "fit.steps=500",
@@ -174,6 +175,18 @@ fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
         .unwrap_err()
         .to_string();
     assert!(error.contains("holds a run with another data set"), "{error}");
+}
+
+#[test]
+fn two_trainings_do_not_share_a_directory() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
+    let config = std::fs::File::open(dir.path().join("config.toml")).unwrap();
+    config.lock().unwrap();
+    let error = train(&small_config(&[]), &dataset, dir.path()).unwrap_err();
+    assert!(error.to_string().contains("another training is running"), "{error}");
+    drop(config);
+    train(&small_config(&[]), &dataset, dir.path()).unwrap();
 }
 
 #[test]
