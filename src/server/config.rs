@@ -211,4 +211,23 @@ mod tests {
         let error = config.validate().unwrap_err().to_string();
         assert_eq!(error, "max_streams is 0; it must be 1 to 1000000");
     }
+
+    #[test]
+    fn no_bound_of_a_session_may_be_zero() {
+        type Field = fn(&mut ServerConfig);
+        let fields: [(&str, Field); 6] = [
+            ("max_sessions", |config| config.max_sessions = 0),
+            ("max_pipelined_frames", |config| config.max_pipelined_frames = 0),
+            ("max_stream_buffer_bytes", |config| config.max_stream_buffer_bytes = 0),
+            ("max_candidates", |config| config.max_candidates = 0),
+            ("max_rollout_bytes", |config| config.max_rollout_bytes = 0),
+            ("session_grace_ms", |config| config.session_grace_ms = 0),
+        ];
+        for (name, clear) in fields {
+            let mut config = ServerConfig::default();
+            clear(&mut config);
+            let error = config.validate().unwrap_err().to_string();
+            assert!(error.starts_with(&format!("{name} is 0; it must be")), "{error}");
+        }
+    }
 }
