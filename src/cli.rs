@@ -9,6 +9,7 @@ mod predict;
 mod progress;
 mod serve;
 mod train;
+mod worker;
 
 use std::fmt::Display;
 use std::io::Write;
@@ -43,6 +44,8 @@ enum Command {
     Predict(predict::Args),
     /// Serve models over HTTP and WebSocket (the default)
     Serve(serve::Args),
+    /// Work on jobs without serving
+    Worker(worker::Args),
     /// Describe a model or a data set
     Inspect(inspect::Args),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -97,6 +100,7 @@ pub fn main() -> ExitCode {
         Some(Command::Evaluate(args)) => evaluate::run(&args),
         Some(Command::Predict(args)) => predict::run(&args),
         Some(Command::Serve(args)) => serve::run(&args),
+        Some(Command::Worker(args)) => worker::run(&args),
         Some(Command::Inspect(args)) => inspect::run(&args),
         Some(Command::Export(args)) => export::run(&args),
         None => serve::run(&serve::Args::default()),

@@ -24,6 +24,8 @@ pub mod serving;
 
 pub mod store;
 
+pub mod versions;
+
 pub mod jobs;
 
 pub mod server;

@@ -3,7 +3,9 @@
 
 mod config;
 mod dashboard;
+mod datasets;
 mod error;
+mod events;
 mod extract;
 mod health;
 mod images;
@@ -27,7 +29,7 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::routing::{get, post};
+use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
@@ -43,6 +45,8 @@ use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{JobError, Jobs};
 use crate::registry::LoadedModel;
 use crate::serving::{Predictor, ServingError};
+use crate::store::{Store, StoreError};
+use crate::versions::{VersionError, Versions};
 
 /// Why the server could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -65,6 +69,12 @@ pub enum ServerError {
     /// The job runner could not start.
     #[error(transparent)]
     Jobs(#[from] JobError),
+    /// The store could not be opened.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The models could not be listed.
+    #[error(transparent)]
+    Versions(#[from] VersionError),
     /// The listener failed.
     #[error("could not listen for connections")]
     Listen(#[source] std::io::Error),
@@ -72,6 +82,8 @@ pub enum ServerError {
 
 /// What [`finish`] may take past the deadline to say what did not end.
 const GRACE: Duration = Duration::from_millis(200);
+/// How often it is asked which versions other servers of the store activated.
+const FOLLOW_EVERY: Duration = Duration::from_secs(1);
 
 /// What the handlers share; clones are the same.
 #[derive(Clone)]
@@ -83,33 +95,48 @@ struct Shared {
     config: ServerConfig,
     predictor: Predictor,
     jobs: Jobs,
+    store: Store,
+    versions: Versions,
     streams: Streams,
     request_ids: RequestIds,
     contract: String,
 }
 
 impl App {
-    /// Starts the threads that predict with these models and that run jobs. Errors: `Config`, `Serving`, `Jobs`.
-    pub fn start(config: ServerConfig, models: Vec<LoadedModel>) -> Result<Self, ServerError> {
+    /// Opens the store, loads the models that are to serve, and starts. To be called within a tokio runtime.
+    /// Errors: `Config`, `Store`, `Versions`, `Serving`, `Jobs`.
+    pub async fn open(config: ServerConfig) -> Result<Self, ServerError> {
+        config.validate()?;
+        let store = Store::open(&config.store()).await?;
+        let models = Versions::new(store.clone(), &config.models_dir).serving().await?;
+        Self::start(config, models, store)
+    }
+
+    /// Starts the threads that predict with these models and that run jobs. To be called within a tokio runtime.
+    /// Errors: `Config`, `Serving`, `Jobs`.
+    pub fn start(config: ServerConfig, models: Vec<LoadedModel>, store: Store) -> Result<Self, ServerError> {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
-        let pipeline = Pipeline {
-            data_dir: config.data_dir.clone(),
-            predictor: predictor.clone(),
-        };
-        let jobs = Jobs::start(config.jobs(), Box::new(pipeline))?;
-        Ok(Self::with_parts(config, predictor, jobs))
+        let versions = Versions::new(store.clone(), &config.models_dir);
+        let pipeline = Pipeline::new(store.clone(), versions, config.job_threads);
+        let jobs = Jobs::start(store.clone(), config.jobs(), Arc::new(pipeline), config.run_jobs)?;
+        let app = Self::with_parts(config, predictor, jobs, store);
+        tokio::spawn(follow(app.clone()));
+        Ok(app)
     }
 
     /// From parts that have been started, for example a job runner with other work. The configuration is not checked.
     #[must_use]
-    pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs) -> Self {
+    pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs, store: Store) -> Self {
         let streams = Streams::new(config.max_streams);
+        let versions = Versions::new(store.clone(), &config.models_dir);
         Self {
             shared: Arc::new(Shared {
                 config,
                 predictor,
                 jobs,
+                store,
+                versions,
                 streams,
                 request_ids: RequestIds::new(),
                 contract: openapi::document(),
@@ -127,6 +154,18 @@ impl App {
     #[must_use]
     pub fn jobs(&self) -> &Jobs {
         &self.shared.jobs
+    }
+
+    /// Where state is kept.
+    #[must_use]
+    pub fn store(&self) -> &Store {
+        &self.shared.store
+    }
+
+    /// The versions of the models.
+    #[must_use]
+    pub fn versions(&self) -> &Versions {
+        &self.shared.versions
     }
 
     /// The settings.
@@ -157,12 +196,29 @@ pub fn router(app: App) -> Router {
         .route("/openapi.json", get(openapi::openapi_json))
         .route("/v1/models", get(models::list))
         .route("/v1/models/{model}", get(models::get))
+        .route("/v1/models/{model}/versions/{version}", delete(models::delete))
+        .route("/v1/models/{model}/versions/{version}/activate", post(models::activate))
         .route("/v1/models/{model}/predict", post(predict::predict))
         .route("/v1/models/{model}/preview.png", get(preview::preview))
         .route("/v1/models/{model}/stream", get(stream::stream))
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
+        .route("/v1/jobs/{id}/resume", post(jobs::resume))
+        .route("/v1/jobs/{id}/events", get(events::events))
+        .route("/v1/jobs/{id}/logs", get(jobs::logs))
+        .route("/v1/jobs/{id}/metrics", get(jobs::metrics))
+        .route("/v1/jobs/{id}/files/{file}", get(jobs::file))
+        .route("/v1/datasets", get(datasets::list))
+        .route("/v1/datasets/{dataset}", get(datasets::get).delete(datasets::delete))
+        .route(
+            "/v1/datasets/{dataset}/episodes/{episode}/preview.png",
+            get(datasets::sheet),
+        )
+        .route(
+            "/v1/datasets/{dataset}/episodes/{episode}/preview.gif",
+            get(datasets::animation),
+        )
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
@@ -171,7 +227,8 @@ pub fn router(app: App) -> Router {
 }
 
 /// Answers on the listener until `shutdown` completes; then takes no more connections, answers the requests it has,
-/// closes every stream with 1001, cancels the jobs, and returns when all have ended or the deadline has passed.
+/// closes every stream with 1001, has the running job write its checkpoint, and returns when all have ended or the
+/// deadline has passed.
 /// Errors: `Listen`.
 pub async fn serve(
     listener: TcpListener,
@@ -221,13 +278,25 @@ async fn finish(app: App, deadline: Instant) {
     if streams.await.is_err() {
         warn!("some streams did not end within the deadline");
     }
-    let ended = blocking(move || {
-        let ended = app.jobs().finish_stop(deadline);
-        app.predictor().stop();
-        ended
-    });
-    if ended.await == Ok(true) {
+    let ended = app.jobs().finish_stop(deadline).await;
+    let stopped = blocking(move || app.predictor().stop()).await;
+    if ended && stopped.is_ok() {
         info!("stopped");
+    }
+}
+
+/// Loads the versions that were activated elsewhere, or published by a job as the first of their name, until stopped.
+async fn follow(app: App) {
+    let (mut stopping, mut refused) = (app.streams().stopping(), std::collections::BTreeSet::new());
+    loop {
+        tokio::select! {
+            () = app.jobs().ended() => {}
+            () = tokio::time::sleep(FOLLOW_EVERY) => {}
+            () = streams::told(&mut stopping) => return,
+        }
+        if let Err(error) = app.versions().follow(app.predictor(), &mut refused).await {
+            warn!(%error, "could not look for newly activated versions");
+        }
     }
 }
 

@@ -5,7 +5,7 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use utoipa::OpenApi;
 
-use super::{App, dashboard, error, health, jobs, models, predict, preview, stream};
+use super::{App, dashboard, datasets, error, events, health, jobs, models, predict, preview, stream};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -20,6 +20,8 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
         health::readyz,
         models::list,
         models::get,
+        models::activate,
+        models::delete,
         predict::predict,
         preview::preview,
         stream::stream,
@@ -27,13 +29,24 @@ use super::{App, dashboard, error, health, jobs, models, predict, preview, strea
         jobs::list,
         jobs::get,
         jobs::cancel,
+        jobs::resume,
+        jobs::logs,
+        jobs::metrics,
+        jobs::file,
+        events::events,
+        datasets::list,
+        datasets::get,
+        datasets::delete,
+        datasets::sheet,
+        datasets::animation,
         openapi_json,
         dashboard::page,
     ),
     components(schemas(error::Problem)),
     tags(
         (name = "models", description = "Models and their predictions"),
-        (name = "jobs", description = "Collection and training in the background"),
+        (name = "jobs", description = "Collection, training and evaluation in the background"),
+        (name = "datasets", description = "What was collected"),
         (name = "health", description = "Whether the server lives and is ready"),
         (name = "about", description = "This contract and a page for people"),
     )

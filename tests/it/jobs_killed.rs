@@ -1,0 +1,179 @@
+//! Jobs of processes that are killed without warning: the real program, `kill -9`, and the weights in the end.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use foreframe::types::Seed;
+use rand::Rng as _;
+use serde_json::{Value, json};
+
+use crate::service::PATIENCE;
+
+const KILLS: u32 = 10;
+
+/// A running program that is killed when it is dropped.
+struct Program(Child);
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // On Unix this is SIGKILL.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Starts the program with a data directory and no shipped models; returns the rest of its first line too.
+fn start(data_dir: &Path, arguments: &[&str]) -> (Program, String) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
+        .args(arguments)
+        .arg("--data-dir")
+        .arg(data_dir)
+        .arg("--models")
+        .arg(data_dir.join("none-shipped"))
+        .env("RUST_LOG", "warn")
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    let stdout = child.stdout.take().unwrap();
+    BufReader::new(stdout).read_line(&mut line).unwrap();
+    (Program(child), line)
+}
+
+fn serve(data_dir: &Path, more: &[&str]) -> (Program, String) {
+    let (program, line) = start(data_dir, &[&["serve", "--bind", "127.0.0.1:0"], more].concat());
+    let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
+    (program, address.to_owned())
+}
+
+/// Asks and gives the JSON of the answer.
+fn ask(address: &str, request: &str, body: &Value) -> Value {
+    let body = if body.is_null() { String::new() } else { body.to_string() };
+    let mut stream = TcpStream::connect(address).unwrap();
+    let head = "Host: x\r\nConnection: close\r\nContent-Type: application/json";
+    write!(stream, "{request} HTTP/1.1\r\n{head}\r\nContent-Length: {}\r\n\r\n{body}", body.len()).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap_or_else(|_| panic!("{answer}"))
+}
+
+fn wait_for(address: &str, id: &str, state: &str) -> Value {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let job = ask(address, &format!("GET /v1/jobs/{id}"), &Value::Null);
+        if job["state"] == state {
+            return job;
+        }
+        assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn collect() -> Value {
+    json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40})
+}
+
+fn train() -> Value {
+    let settings = json!({
+        "model": {"features": 16, "hidden": 16},
+        "data": {"windows": 64, "validation_windows": 8},
+        "pretrain": {"steps": 100, "batch_size": 16},
+        "fit": {"steps": 400, "batch_size": 16},
+        "run": {"validate_every_steps": 50, "checkpoint_every_steps": 5},
+    });
+    json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
+}
+
+fn weights(data_dir: &Path) -> Vec<u8> {
+    std::fs::read(data_dir.join("models/m/1/model.safetensors")).unwrap()
+}
+
+/// A data directory in which the collection and the training ran through, and how long the training took.
+fn unbroken() -> (tempfile::TempDir, Duration) {
+    let dir = tempfile::tempdir().unwrap();
+    let (_server, address) = serve(dir.path(), &[]);
+    ask(&address, "POST /v1/jobs", &collect());
+    wait_for(&address, "job-1", "succeeded");
+    ask(&address, "POST /v1/jobs", &train());
+    let job = wait_for(&address, "job-2", "succeeded");
+    let took_s = job["ended_unix_s"].as_f64().unwrap() - job["started_unix_s"].as_f64().unwrap();
+    (dir, Duration::from_secs_f64(took_s))
+}
+
+fn copy_dataset(from: &Path, to: &Path) {
+    let mut dirs = vec![PathBuf::from("datasets/seen")];
+    while let Some(dir) = dirs.pop() {
+        std::fs::create_dir_all(to.join(&dir)).unwrap();
+        for entry in std::fs::read_dir(from.join(&dir)).unwrap() {
+            let relative = dir.join(entry.unwrap().file_name());
+            if from.join(&relative).is_dir() {
+                dirs.push(relative);
+            } else {
+                std::fs::copy(from.join(&relative), to.join(&relative)).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
+fn a_training_killed_at_ten_random_points_ends_in_the_weights_of_an_unbroken_one() {
+    let (whole, took) = unbroken();
+    let dir = tempfile::tempdir().unwrap();
+    copy_dataset(whole.path(), dir.path());
+    let mut rng = Seed(3).rng();
+    for kill in 0..KILLS {
+        let (server, address) = serve(dir.path(), &[]);
+        if kill == 0 {
+            ask(&address, "POST /v1/jobs", &train());
+        }
+        // Taken up again at once, not when the lease of 30 s has run out.
+        let job = wait_for(&address, "job-1", "running");
+        assert!(job["attempts"].as_u64().unwrap() <= u64::from(kill) + 1, "{job}");
+        std::thread::sleep(took.mul_f64(rng.random_range(0.01..1.0 / f64::from(KILLS))));
+        let job = ask(&address, "GET /v1/jobs/job-1", &Value::Null);
+        assert_eq!(job["state"], "running", "{job}");
+        drop(server);
+    }
+    let (_server, address) = serve(dir.path(), &[]);
+    let job = wait_for(&address, "job-1", "succeeded");
+    assert_eq!(job["attempts"], KILLS + 1);
+    assert!(weights(dir.path()) == weights(whole.path()), "the weights differ");
+    let curve = |address: &str, id: &str| ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
+    let killed = curve(&address, "job-1");
+    let (_server, address) = serve(whole.path(), &[]);
+    assert_eq!(killed, curve(&address, "job-2"));
+}
+
+#[test]
+fn another_machines_worker_goes_on_from_a_dead_ones_checkpoint() {
+    let (whole, took) = unbroken();
+    let (of_server, first, second) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let shared = tempfile::tempdir().unwrap();
+    let database = format!("sqlite:{}", shared.path().join("jobs.db").display());
+    let objects = shared.path().join("objects").display().to_string();
+    let place = ["--database", &database, "--objects", &objects, "--job-lease-ms", "1000"];
+    copy_dataset(whole.path(), &shared.path().join("objects"));
+    let (_server, address) = serve(of_server.path(), &[&place[..], &["--no-jobs"]].concat());
+    let work = |dir: &Path| start(dir, &[&["worker"], &place[..]].concat()).0;
+    ask(&address, "POST /v1/jobs", &train());
+    assert_eq!(ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"], "queued");
+    let worker = work(first.path());
+    wait_for(&address, "job-1", "running");
+    std::thread::sleep(took / 2);
+    drop(worker);
+    let _worker = work(second.path());
+    let job = wait_for(&address, "job-1", "succeeded");
+    assert_eq!(job["attempts"], 2);
+    assert!(weights(second.path()) == weights(whole.path()), "the weights differ");
+    // The server, which never saw the files, loads the new model by itself.
+    let deadline = Instant::now() + PATIENCE;
+    while ask(&address, "GET /v1/models", &Value::Null)["models"][0]["name"] != "m" {
+        assert!(Instant::now() < deadline);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let log = ask(&address, "GET /v1/jobs/job-1/logs", &Value::Null).to_string();
+    assert!(log.contains("taken up again") && !log.contains("pretrain from step 0, on 64 windows\"},{\"seq\":9"), "{log}");
+}
