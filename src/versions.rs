@@ -134,6 +134,9 @@ impl Versions {
         let mut serving = Vec::new();
         for (model, mut versions) in self.all().await? {
             // The newest first, but before them the shipped one, and before all the one that was chosen.
+            if versions.is_empty() {
+                warn!(model, "its manifest cannot be read");
+            }
             versions.reverse();
             let shipped = self.shipped(&model);
             versions.sort_by_key(|&version| (active.get(&model) != Some(&version), shipped != Some(version)));

@@ -13,7 +13,7 @@ use foreframe::server::{App, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
 use serde_json::{Value, json};
 
-use crate::service::{app, context, get, model, post, run, send, spec, store, until, with_data};
+use crate::service::{app, get, model, post, run, send, spec, store, until, with_data};
 
 const JOBS: &str = "/v1/jobs";
 

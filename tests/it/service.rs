@@ -91,7 +91,13 @@ pub(crate) fn app(dir: &Path, config: ServerConfig) -> App {
         model(&dir.join("models"), "plain", spec(Conditioning::None)),
         model(&dir.join("models"), "moving", spec(Conditioning::StateAction)),
     ];
-    App::start(with_data(dir, config), models, store(dir)).unwrap()
+    start(with_data(dir, config), models)
+}
+
+/// With a store in the data directory.
+pub(crate) fn start(config: ServerConfig, models: Vec<LoadedModel>) -> App {
+    let store = store(&config.data_dir);
+    App::start(config, models, store).unwrap()
 }
 
 /// The store of a data directory, opened on a runtime of its own, since this is no async function.
