@@ -74,10 +74,16 @@ pub enum ServerError {
     Store(#[from] StoreError),
     /// The models could not be listed.
     #[error(transparent)]
-    Versions(#[from] VersionError),
+    Versions(Box<VersionError>),
     /// The listener failed.
     #[error("could not listen for connections")]
     Listen(#[source] std::io::Error),
+}
+
+impl From<VersionError> for ServerError {
+    fn from(error: VersionError) -> Self {
+        Self::Versions(Box::new(error))
+    }
 }
 
 /// What [`finish`] may take past the deadline to say what did not end.

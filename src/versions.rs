@@ -156,7 +156,10 @@ impl Versions {
     /// Loads the version that serves, or else the one that would. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn load_active(&self, model: &str) -> Result<LoadedModel, VersionError> {
         let active = self.store.active_versions().await?;
-        let chosen = active.into_iter().find(|(name, _)| name == model).map(|(_, version)| version);
+        let chosen = active
+            .into_iter()
+            .find(|(name, _)| name == model)
+            .map(|(_, version)| version);
         let version = match chosen.or_else(|| self.shipped(model)) {
             Some(version) => version,
             None => self.of(model).await?.last().copied().unwrap_or_default(),
@@ -177,9 +180,13 @@ impl Versions {
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
             .map_err(|error| refused(error.to_string()))?;
-        let Manifest { name, version: found, .. } = &loaded.manifest;
+        let Manifest {
+            name, version: found, ..
+        } = &loaded.manifest;
         if (name.as_str(), *found) != (model, version) {
-            return Err(refused(format!("its manifest says that it is version {found} of \"{name}\"")));
+            return Err(refused(format!(
+                "its manifest says that it is version {found} of \"{name}\""
+            )));
         }
         Ok(loaded)
     }
@@ -207,7 +214,12 @@ impl Versions {
     /// Writes a trained model as the version of its name that is its job's, and returns the version and whether it is the
     /// first of its name; it counts once the job's end is written. `None` if the lease is lost.
     /// Errors: `Registry`, `Io`, `Store`.
-    pub async fn write(&self, lease: Lease, model: &str, trained_dir: &Path) -> Result<Option<(u32, bool)>, VersionError> {
+    pub async fn write(
+        &self,
+        lease: Lease,
+        model: &str,
+        trained_dir: &Path,
+    ) -> Result<Option<(u32, bool)>, VersionError> {
         let shipped = self.shipped(model);
         let reserved = self.store.reserve_version(lease, model, shipped.unwrap_or(0)).await?;
         let Some(version) = reserved else { return Ok(None) };
@@ -218,7 +230,10 @@ impl Versions {
             move |source| VersionError::Io { action, path, source }
         };
         std::fs::create_dir_all(&dir).map_err(failed("make", &dir))?;
-        let (from, to) = (trained_dir.join(registry::WEIGHTS_FILE), dir.join(registry::WEIGHTS_FILE));
+        let (from, to) = (
+            trained_dir.join(registry::WEIGHTS_FILE),
+            dir.join(registry::WEIGHTS_FILE),
+        );
         let weights = std::fs::read(&from).map_err(failed("read", &from))?;
         write_atomically(&to, &weights).map_err(failed("write", &to))?;
         let manifest = Manifest {
@@ -280,7 +295,9 @@ impl Versions {
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         for (model, version) in self.store.active_versions().await? {
-            let serves = predictor.model(&model).is_ok_and(|manifest| manifest.version == version);
+            let serves = predictor
+                .model(&model)
+                .is_ok_and(|manifest| manifest.version == version);
             if serves || refused.contains(&(model.clone(), version)) {
                 continue;
             }

@@ -41,11 +41,17 @@ pub(super) struct StateArgs {
     /// Where jobs keep data sets, runs and the models they train
     #[arg(long, value_name = "DIR", default_value = "data")]
     data_dir: PathBuf,
-    /// sqlite:FILE or postgres://USER@HOST/NAME [default: foreframe.db in --data-dir]
-    #[arg(long, value_name = "URL")]
+    #[arg(
+        long,
+        value_name = "URL",
+        help = "sqlite:FILE or postgres://USER@HOST/NAME [default: foreframe.db in --data-dir]"
+    )]
     database: Option<String>,
-    /// A directory or s3://BUCKET/PREFIX that holds the files that several machines share [default: --data-dir]
-    #[arg(long, value_name = "URL")]
+    #[arg(
+        long,
+        value_name = "URL",
+        help = "A directory or s3://BUCKET/PREFIX for the files that several machines share [default: --data-dir]"
+    )]
     objects: Option<String>,
     /// How long a process that works on a job may be silent before others take it up, in milliseconds
     #[arg(long, value_name = "MS", default_value_t = ServerConfig::default().job_lease_ms)]

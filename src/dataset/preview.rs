@@ -37,7 +37,10 @@ impl Dataset {
         let shard = shard.ok_or_else(missing)?;
         let table = directory.join(EPISODES);
         verify(&table, &stamp.episodes_sha256)?;
-        let wanted = read_episodes(&table, &info)?.into_iter().nth(episode).ok_or_else(missing)?;
+        let wanted = read_episodes(&table, &info)?
+            .into_iter()
+            .nth(episode)
+            .ok_or_else(missing)?;
         let path = directory.join(&shard.path);
         verify(&path, &shard.sha256)?;
         let size = info.frame_pixels();

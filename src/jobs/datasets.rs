@@ -62,5 +62,10 @@ pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
 }
 
 fn is_here(objects: &Objects, name: &str) -> bool {
-    objects.data_dir().join(key(name)).join("meta").join(LAST_FILE).is_file()
+    objects
+        .data_dir()
+        .join(key(name))
+        .join("meta")
+        .join(LAST_FILE)
+        .is_file()
 }

@@ -87,7 +87,11 @@ impl JobFilter {
         if let Some(kind) = self.kind.as_deref().filter(|kind| !kinds.contains(kind)) {
             return Err(JobError::Invalid {
                 field: "kind",
-                reason: format!("\"{}\" is no kind; there are: {}", kind.escape_default(), kinds.join(", ")),
+                reason: format!(
+                    "\"{}\" is no kind; there are: {}",
+                    kind.escape_default(),
+                    kinds.join(", ")
+                ),
             });
         }
         let before = self.before.map(|id| {

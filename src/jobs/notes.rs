@@ -112,8 +112,14 @@ impl Notes {
     /// Puts back what could not be written, before what came since.
     pub(super) fn put_back(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
         let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
-        lines.into_iter().chain(later.0).for_each(|line| push(&mut self.lines, line));
-        points.into_iter().chain(later.1).for_each(|point| push(&mut self.points, point));
+        lines
+            .into_iter()
+            .chain(later.0)
+            .for_each(|line| push(&mut self.lines, line));
+        points
+            .into_iter()
+            .chain(later.1)
+            .for_each(|point| push(&mut self.points, point));
     }
 }
 

@@ -26,7 +26,7 @@ const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// Points of a stage's training loss, besides those of its validations.
 const CURVE_POINTS: usize = 500;
 /// How long a collection waits for a process that was taken for dead to let go of the directory.
-const BUSY_PATIENCE: Duration = Duration::from_secs(60);
+const BUSY_PATIENCE: Duration = Duration::from_mins(1);
 
 /// What works on jobs.
 pub struct Pipeline {
@@ -243,10 +243,24 @@ impl Watch<'_> {
         match event {
             Event::Started { stage, step, windows } => {
                 self.progress(stage, step);
-                self.report.line(format!("{stage} from step {step}, on {windows} windows"));
+                self.report
+                    .line(format!("{stage} from step {step}, on {windows} windows"));
+            }
+            // What was not written before the process died must be in the curves all the same.
+            Event::Recalled {
+                stage,
+                step,
+                train_loss,
+                validation_loss,
+            } => {
+                self.train_loss = Some(train_loss);
+                self.point(stage, step, Some(validation_loss));
             }
             Event::Step {
-                stage, step, steps, loss,
+                stage,
+                step,
+                steps,
+                loss,
             } => {
                 if step == 1 {
                     self.report.stage();
@@ -262,7 +276,10 @@ impl Watch<'_> {
                 }
             }
             Event::Validated {
-                stage, step, loss, is_best,
+                stage,
+                step,
+                loss,
+                is_best,
             } => {
                 self.report.losses(Losses {
                     train: None,

@@ -12,8 +12,7 @@ use super::job::number_of;
 use super::notes::Standing;
 use super::runner::{self, Execute};
 use super::{Event, Job, JobError, JobFilter, JobSpec, JobState, unix_s};
-use crate::store::jobs::{Enqueued, LogRow};
-use crate::store::{JobRow, LossRow, NewJob, Store};
+use crate::store::{Enqueued, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// An idempotency key's characters at most.
 const MAX_KEY_LENGTH: usize = 128;

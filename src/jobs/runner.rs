@@ -14,8 +14,7 @@ use super::job::id_of;
 use super::notes::{Notes, Standing};
 use super::queue::Shared;
 use super::{Event, Job, JobError, JobSpec, JobState, Losses, unix_s};
-use crate::store::jobs::{Account, Ending};
-use crate::store::{JobRow, Lease, LossRow};
+use crate::store::{Account, Ending, JobRow, Lease, LossRow};
 
 /// How often a job's standing is written, unless the lease asks for more.
 const WRITE_EVERY: Duration = Duration::from_millis(500);
@@ -298,7 +297,10 @@ impl<'a> Work<'a> {
     async fn write_end(&self, id: &str, ending: Ending) {
         let account = self.account();
         for attempt in 1..=END_ATTEMPTS {
-            let written = self.shared.store.end(self.report.lease, ending.clone(), account.clone());
+            let written = self
+                .shared
+                .store
+                .end(self.report.lease, ending.clone(), account.clone());
             match written.await {
                 Ok(true) => return self.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its end was written"),

@@ -303,7 +303,11 @@ fn check_range(field: &'static str, value: usize, range: RangeInclusive<usize>) 
     }
     Err(JobError::Invalid {
         field,
-        reason: format!("{value} is out of range; it must be {} to {}", range.start(), range.end()),
+        reason: format!(
+            "{value} is out of range; it must be {} to {}",
+            range.start(),
+            range.end()
+        ),
     })
 }
 

@@ -117,7 +117,12 @@ pub(super) async fn delete(State(app): State<App>, Path(name): Path<String>) -> 
     let open = app.jobs().open().await?;
     if let Some(job) = open.into_iter().find(|job| job.spec.dataset() == name) {
         let kind = "data set";
-        return Err(JobError::InUse { kind, name, job: job.id }.into());
+        return Err(JobError::InUse {
+            kind,
+            name,
+            job: job.id,
+        }
+        .into());
     }
     datasets::delete(app.store().objects(), &name).await.map_err(absent)?;
     Ok(StatusCode::NO_CONTENT)

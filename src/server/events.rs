@@ -42,7 +42,9 @@ pub(super) async fn events(
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
     app.jobs().get(&id).await?;
-    let last_seen = headers.get("last-event-id").and_then(|seen| seen.to_str().ok()?.parse().ok());
+    let last_seen = headers
+        .get("last-event-id")
+        .and_then(|seen| seen.to_str().ok()?.parse().ok());
     let watch = Watch {
         _place: app.streams().enter()?,
         stopping: app.streams().stopping(),
@@ -111,7 +113,9 @@ impl Watch {
 
     fn push(&mut self, name: &str, id: Option<i64>, data: &impl serde::Serialize) {
         // These are plain structs: they are always writable.
-        let Ok(event) = Event::default().event(name).json_data(data) else { return };
+        let Ok(event) = Event::default().event(name).json_data(data) else {
+            return;
+        };
         self.waiting.push_back(match id {
             Some(id) => event.id(id.to_string()),
             None => event,

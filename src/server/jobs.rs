@@ -10,8 +10,7 @@ use super::extract::{Json, Path, Query};
 use super::{App, blocking};
 use crate::jobs::pipeline::report_key;
 use crate::jobs::{Job, JobFilter, JobSpec, JobState};
-use crate::store::LossRow;
-use crate::store::jobs::LogRow;
+use crate::store::{LogRow, LossRow};
 
 /// Jobs on a page unless asked otherwise.
 const PAGE: usize = 50;
@@ -133,7 +132,9 @@ pub(super) async fn create(
     headers: HeaderMap,
     Json(spec): Json<JobSpec>,
 ) -> Result<Response, ApiError> {
-    let key = headers.get("idempotency-key").map(|key| key.to_str().map(str::to_owned));
+    let key = headers
+        .get("idempotency-key")
+        .map(|key| key.to_str().map(str::to_owned));
     let key = key
         .transpose()
         .map_err(|_| ApiError::Unprocessable("Idempotency-Key: a key is visible ASCII characters".to_owned()))?;
@@ -290,5 +291,7 @@ fn page(limit: Option<usize>, default: usize) -> Result<usize, ApiError> {
     if (1..=MAX_PAGE).contains(&limit) {
         return Ok(limit);
     }
-    Err(ApiError::Unprocessable(format!("limit: {limit} is out of range; it must be 1 to {MAX_PAGE}")))
+    Err(ApiError::Unprocessable(format!(
+        "limit: {limit} is out of range; it must be 1 to {MAX_PAGE}"
+    )))
 }

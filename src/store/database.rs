@@ -8,7 +8,7 @@ use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow};
-use sqlx::{AssertSqlSafe, Decode, Encode, Postgres, Row as _, Sqlite, SqlSafeStr as _, SqlStr, Transaction, Type};
+use sqlx::{AssertSqlSafe, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction, Type};
 
 use super::StoreError;
 
@@ -113,8 +113,12 @@ impl Database {
     async fn open_sqlite(options: SqliteConnectOptions) -> Result<Self, StoreError> {
         // SQLite's migrations lock nothing, and two processes may start at once.
         let lock_path = options.get_filename().with_extension("lock");
-        let lock = std::fs::File::create(&lock_path).map_err(StoreError::io("make", &lock_path))?;
-        lock.lock().map_err(StoreError::io("lock", &lock_path))?;
+        let failed = StoreError::io("lock", &lock_path);
+        let locked = tokio::task::spawn_blocking(move || {
+            let lock = std::fs::File::create(&lock_path)?;
+            lock.lock().map(|()| lock)
+        });
+        let _lock = locked.await.unwrap_or_else(|error| Err(error.into())).map_err(failed)?;
         let options = options
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
@@ -198,18 +202,16 @@ impl Tx {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(tx) => bind::<Sqlite>(sql, values).execute(&mut **tx).await?.rows_affected(),
-            Self::Postgres(tx) => bind::<Postgres>(sql, values)
-                .execute(&mut **tx)
-                .await?
-                .rows_affected(),
+            Self::Postgres(tx) => bind::<Postgres>(sql, values).execute(&mut **tx).await?.rows_affected(),
         })
     }
 
     pub(super) async fn commit(self) -> Result<(), StoreError> {
-        Ok(match self {
-            Self::Sqlite(tx) => tx.commit().await?,
-            Self::Postgres(tx) => tx.commit().await?,
-        })
+        let committed = match self {
+            Self::Sqlite(tx) => tx.commit().await,
+            Self::Postgres(tx) => tx.commit().await,
+        };
+        committed.map_err(StoreError::Query)
     }
 }
 

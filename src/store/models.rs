@@ -23,12 +23,7 @@ fn version_of(row: &Row) -> Result<u32, StoreError> {
 impl Store {
     /// The version that a job is to publish: the next of the name above `shipped`; asked again, the same.
     /// `None` if the lease is lost. Errors: `Query`.
-    pub async fn reserve_version(
-        &self,
-        lease: Lease,
-        model: &str,
-        shipped: u32,
-    ) -> Result<Option<u32>, StoreError> {
+    pub async fn reserve_version(&self, lease: Lease, model: &str, shipped: u32) -> Result<Option<u32>, StoreError> {
         let mut tx = self.database.begin().await?;
         // Held until the commit, so that two jobs never reserve one number.
         let sql = "UPDATE counters SET value = value WHERE name = 'job' \

@@ -86,7 +86,9 @@ impl Objects {
 
     /// The directories right below one, where objects are kept. Errors: `Object`.
     pub async fn directories(&self, dir: &str) -> Result<Vec<String>, StoreError> {
-        let Some(shared) = &self.shared else { return Ok(Vec::new()) };
+        let Some(shared) = &self.shared else {
+            return Ok(Vec::new());
+        };
         let key = Key::from(dir);
         let found = shared.list_with_delimiter(Some(&key)).await;
         let names = found.map_err(failed("list", &key))?.common_prefixes;
@@ -111,7 +113,9 @@ impl Objects {
     }
 
     async fn keys(&self, dir: &str) -> Result<Vec<Key>, StoreError> {
-        let Some(shared) = &self.shared else { return Ok(Vec::new()) };
+        let Some(shared) = &self.shared else {
+            return Ok(Vec::new());
+        };
         let prefix = Key::from(dir);
         let listed = shared.list(Some(&prefix)).map(|found| found.map(|meta| meta.location));
         listed.try_collect().await.map_err(failed("list", &prefix))
@@ -130,7 +134,7 @@ fn directory(dir: &Path) -> Result<Arc<dyn ObjectStore>, StoreError> {
         key: dir.display().to_string(),
         source,
     })?;
-    Ok(Arc::new(store.with_fsync(true)))
+    Ok(Arc::new(store.with_fsync(true).with_automatic_cleanup(true)))
 }
 
 /// Credentials, region and endpoint come from the environment, as for every S3 client.

@@ -1,8 +1,8 @@
 //! Jobs over HTTP: with work that the test holds in its hand, and with the real collection and training.
 
-use std::sync::{Arc, Mutex};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -184,7 +184,10 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
     assert_eq!(early, "job job-1 has started; it cannot be resumed any more");
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
     state_becomes(&app, "job-1", "cancelled").await;
-    assert_eq!(post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"], "queued");
+    assert_eq!(
+        post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"],
+        "queued"
+    );
     order.send(Err(Failure::Failed("no luck".to_owned()))).unwrap();
     let path = "/v1/jobs/job-1";
     let failed = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
@@ -195,7 +198,10 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
     assert_eq!((&done["error"], &done["attempts"]), (&Value::Null, &json!(3)));
     assert_eq!(post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.status, 409);
     let lines = get(&app, "/v1/jobs/job-1/logs?after=1&limit=1").await.json();
-    assert_eq!((&lines["lines"][0]["seq"], &lines["lines"][0]["line"]), (&json!(2), &json!("attempt 1")));
+    assert_eq!(
+        (&lines["lines"][0]["seq"], &lines["lines"][0]["line"]),
+        (&json!(2), &json!("attempt 1"))
+    );
     assert_eq!(lines["lines"].as_array().unwrap().len(), 1);
 }
 
@@ -216,7 +222,10 @@ async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
     state_becomes(&app, "job-1", "succeeded").await;
     assert_eq!(ask(collect("a"), "k-1").await.json()["state"], "succeeded");
     let other = ask(collect("b"), "k-1").await.detail(422);
-    assert!(other.starts_with("Idempotency-Key: it was used for another job, job-1"), "{other}");
+    assert!(
+        other.starts_with("Idempotency-Key: it was used for another job, job-1"),
+        "{other}"
+    );
     let long = ask(collect("b"), &"k".repeat(129)).await.detail(422);
     assert_eq!(long, "Idempotency-Key: a key is 1 to 128 visible ASCII characters");
     assert_eq!(ask(collect("b"), "k-2").await.json()["id"], "job-2");
@@ -234,15 +243,28 @@ async fn jobs_are_listed_by_kind_and_state_page_by_page() {
     }
     let ids = async |query: &str| {
         let answer = get(&app, &format!("{JOBS}?{query}")).await.json();
-        let ids = answer["jobs"].as_array().unwrap().iter().map(|job| job["id"].as_str().unwrap().to_owned());
+        let ids = answer["jobs"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|job| job["id"].as_str().unwrap().to_owned());
         (ids.collect::<Vec<_>>(), answer["next"].clone())
     };
-    assert_eq!(ids("limit=2").await, (vec!["job-3".to_owned(), "job-2".to_owned()], json!("job-2")));
-    assert_eq!(ids("limit=2&before=job-2").await, (vec!["job-1".to_owned()], Value::Null));
+    assert_eq!(
+        ids("limit=2").await,
+        (vec!["job-3".to_owned(), "job-2".to_owned()], json!("job-2"))
+    );
+    assert_eq!(
+        ids("limit=2&before=job-2").await,
+        (vec!["job-1".to_owned()], Value::Null)
+    );
     assert_eq!(ids("state=running").await.0, ["job-1"]);
     assert_eq!(ids("kind=train").await.0, [""; 0]);
     for (query, part) in [
-        ("kind=dream", "\"dream\" is no kind; there are: collect, train, evaluate"),
+        (
+            "kind=dream",
+            "\"dream\" is no kind; there are: collect, train, evaluate",
+        ),
         ("state=asleep", "unknown variant `asleep`"),
         ("before=7", "\"7\" is no job's id"),
         ("limit=0", "limit: 0 is out of range; it must be 1 to 1000"),
@@ -264,7 +286,14 @@ async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
     let text = String::from_utf8(seen.body).unwrap();
     assert!(text.contains("event: log\ndata: {\"seq\":1,"), "{text}");
     assert!(text.contains("\"line\":\"attempt 1\""), "{text}");
-    assert!(text.trim_end().rsplit("event: ").next().unwrap().contains("\"state\":\"succeeded\""), "{text}");
+    assert!(
+        text.trim_end()
+            .rsplit("event: ")
+            .next()
+            .unwrap()
+            .contains("\"state\":\"succeeded\""),
+        "{text}"
+    );
     assert_eq!(get(&app, "/v1/jobs/job-9/events").await.status, 404);
 
     post(&app, JOBS, &collect("b")).await;
@@ -324,4 +353,3 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
     }
     assert_eq!(get(&app, JOBS).await.json()["jobs"], json!([]));
 }
-

@@ -53,10 +53,19 @@ fn serve(data_dir: &Path, more: &[&str]) -> (Program, String) {
 
 /// Asks and gives the JSON of the answer.
 fn ask(address: &str, request: &str, body: &Value) -> Value {
-    let body = if body.is_null() { String::new() } else { body.to_string() };
+    let body = if body.is_null() {
+        String::new()
+    } else {
+        body.to_string()
+    };
     let mut stream = TcpStream::connect(address).unwrap();
     let head = "Host: x\r\nConnection: close\r\nContent-Type: application/json";
-    write!(stream, "{request} HTTP/1.1\r\n{head}\r\nContent-Length: {}\r\n\r\n{body}", body.len()).unwrap();
+    write!(
+        stream,
+        "{request} HTTP/1.1\r\n{head}\r\nContent-Length: {}\r\n\r\n{body}",
+        body.len()
+    )
+    .unwrap();
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
     serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap_or_else(|_| panic!("{answer}"))
@@ -86,9 +95,9 @@ fn train() -> Value {
     let settings = json!({
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 64, "validation_windows": 8},
-        "pretrain": {"steps": 100, "batch_size": 16},
-        "fit": {"steps": 400, "batch_size": 16},
-        "run": {"validate_every_steps": 50, "checkpoint_every_steps": 5},
+        "pretrain": {"steps": 40, "batch_size": 16},
+        "fit": {"steps": 120, "batch_size": 16},
+        "run": {"validate_every_steps": 10, "checkpoint_every_steps": 4},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
 }
@@ -125,10 +134,15 @@ fn copy_dataset(from: &Path, to: &Path) {
 }
 
 #[test]
-fn a_training_killed_at_ten_random_points_ends_in_the_weights_of_an_unbroken_one() {
+fn a_training_whose_process_is_killed_ends_in_the_weights_of_an_unbroken_one() {
     let (whole, took) = unbroken();
+    killed_at_random_points(whole.path(), took);
+    taken_over_by_another_machine(whole.path(), took);
+}
+
+fn killed_at_random_points(whole: &Path, took: Duration) {
     let dir = tempfile::tempdir().unwrap();
-    copy_dataset(whole.path(), dir.path());
+    copy_dataset(whole, dir.path());
     let mut rng = Seed(3).rng();
     for kill in 0..KILLS {
         let (server, address) = serve(dir.path(), &[]);
@@ -136,8 +150,13 @@ fn a_training_killed_at_ten_random_points_ends_in_the_weights_of_an_unbroken_one
             ask(&address, "POST /v1/jobs", &train());
         }
         let started = Instant::now();
-        wait_until(&address, "job-1", |job| job["state"] == "running" && job["attempts"] == kill + 1);
-        assert!(started.elapsed() < LEASE, "it was taken up only when the lease had run out");
+        wait_until(&address, "job-1", |job| {
+            job["state"] == "running" && job["attempts"] == kill + 1
+        });
+        assert!(
+            started.elapsed() < LEASE,
+            "it was taken up only when the lease had run out"
+        );
         std::thread::sleep(took.mul_f64(rng.random_range(0.01..0.06)));
         let job = ask(&address, "GET /v1/jobs/job-1", &Value::Null);
         assert_eq!(job["state"], "running", "{job}");
@@ -146,22 +165,39 @@ fn a_training_killed_at_ten_random_points_ends_in_the_weights_of_an_unbroken_one
     let (_server, address) = serve(dir.path(), &[]);
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], KILLS + 1);
-    assert!(weights(dir.path()) == weights(whole.path()), "the weights differ");
-    let curve = |address: &str, id: &str| ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
-    let killed = curve(&address, "job-1");
-    let (_server, address) = serve(whole.path(), &[]);
-    assert_eq!(killed, curve(&address, "job-2"));
+    assert!(weights(dir.path()) == weights(whole), "the weights differ");
+    let killed = validations(&address, "job-1");
+    let (_server, address) = serve(whole, &[]);
+    assert_eq!(killed, validations(&address, "job-2"));
+    assert_eq!(killed.len(), 4 + 12);
 }
 
-#[test]
-fn another_machines_worker_goes_on_from_a_dead_ones_checkpoint() {
-    let (whole, took) = unbroken();
-    let (of_server, first, second) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+/// The points of the loss curves at which the validation windows were predicted.
+fn validations(address: &str, id: &str) -> Vec<Value> {
+    let curves = ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
+    let points = curves["points"].as_array().unwrap().iter();
+    points
+        .filter(|point| point["validation"].is_number())
+        .cloned()
+        .collect()
+}
+
+/// Data directories of their own, one database, one place for objects.
+fn taken_over_by_another_machine(whole: &Path, took: Duration) {
+    let (of_server, first, second) = (
+        tempfile::tempdir().unwrap(),
+        tempfile::tempdir().unwrap(),
+        tempfile::tempdir().unwrap(),
+    );
     let shared = tempfile::tempdir().unwrap();
-    let database = format!("sqlite:{}", shared.path().join("jobs.db").display());
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let database = match runtime.block_on(crate::store::postgres("killed")) {
+        Some(url) => url,
+        None => format!("sqlite:{}", shared.path().join("jobs.db").display()),
+    };
     let objects = shared.path().join("objects").display().to_string();
     let place = ["--database", &database, "--objects", &objects, "--job-lease-ms", "1000"];
-    copy_dataset(whole.path(), &shared.path().join("objects"));
+    copy_dataset(whole, &shared.path().join("objects"));
     let (_server, address) = serve(of_server.path(), &[&place[..], &["--no-jobs"]].concat());
     let work = |dir: &Path| start(dir, &[&["worker"], &place[..]].concat()).0;
     ask(&address, "POST /v1/jobs", &train());
@@ -173,7 +209,7 @@ fn another_machines_worker_goes_on_from_a_dead_ones_checkpoint() {
     let _worker = work(second.path());
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], 2);
-    assert!(weights(second.path()) == weights(whole.path()), "the weights differ");
+    assert!(weights(second.path()) == weights(whole), "the weights differ");
     // The server, which never saw the files, loads the new model by itself.
     let deadline = Instant::now() + PATIENCE;
     while ask(&address, "GET /v1/models", &Value::Null)["models"][0]["name"] != "m" {
@@ -181,7 +217,15 @@ fn another_machines_worker_goes_on_from_a_dead_ones_checkpoint() {
         std::thread::sleep(Duration::from_millis(20));
     }
     let log = ask(&address, "GET /v1/jobs/job-1/logs", &Value::Null);
-    let lines: Vec<&str> = log["lines"].as_array().unwrap().iter().map(|line| line["line"].as_str().unwrap()).collect();
+    let lines: Vec<&str> = log["lines"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|line| line["line"].as_str().unwrap())
+        .collect();
     let begun: Vec<&str> = lines.into_iter().filter(|line| line.contains(" from step ")).collect();
-    assert!(begun.len() == 2 && !begun[1].starts_with("pretrain from step 0,"), "{begun:?}");
+    assert!(
+        begun.len() == 2 && !begun[1].starts_with("pretrain from step 0,"),
+        "{begun:?}"
+    );
 }

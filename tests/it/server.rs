@@ -13,8 +13,8 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
 use crate::service::{
-    CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, send, slow_spec, spec, start,
-    until, with_data,
+    CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, send, slow_spec, spec,
+    start, until, with_data,
 };
 
 const PLAIN: &str = "/v1/models/plain/predict";

@@ -3,18 +3,14 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use foreframe::store::jobs::{Account, Ending, Enqueued};
-use foreframe::store::{JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
+use foreframe::store::{Account, Ending, Enqueued, JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
 /// Where to open a store of each kind, empty. `name` is the test's.
 async fn places(name: &str) -> Vec<(TempDir, StoreConfig)> {
     let mut places = vec![place(None)];
-    match std::env::var("FOREFRAME_TEST_POSTGRES") {
-        Ok(url) => places.push(place(Some(postgres(&url, name).await))),
-        Err(_) => println!("skipped on PostgreSQL: FOREFRAME_TEST_POSTGRES holds no URL"),
-    }
+    places.extend(postgres(name).await.map(|url| place(Some(url))));
     places
 }
 
@@ -28,15 +24,22 @@ fn place(database: Option<String>) -> (TempDir, StoreConfig) {
     (dir, config)
 }
 
-/// A new database beside the one that the URL names.
-async fn postgres(url: &str, name: &str) -> String {
-    let mut connection = PgConnection::connect(url).await.unwrap();
+/// The URL of a new database beside the one that `FOREFRAME_TEST_POSTGRES` names.
+pub(crate) async fn postgres(name: &str) -> Option<String> {
+    let Ok(url) = std::env::var("FOREFRAME_TEST_POSTGRES") else {
+        println!("skipped on PostgreSQL: FOREFRAME_TEST_POSTGRES holds no URL");
+        return None;
+    };
+    let mut connection = PgConnection::connect(&url).await.unwrap();
     let database = format!("foreframe_{name}");
-    let drop = format!("DROP DATABASE IF EXISTS {database} WITH (FORCE)");
-    connection.execute(AssertSqlSafe(drop)).await.unwrap();
-    connection.execute(AssertSqlSafe(format!("CREATE DATABASE {database}"))).await.unwrap();
+    for statement in [
+        format!("DROP DATABASE IF EXISTS {database} WITH (FORCE)"),
+        format!("CREATE DATABASE {database}"),
+    ] {
+        connection.execute(AssertSqlSafe(statement)).await.unwrap();
+    }
     let (server, _) = url.rsplit_once('/').unwrap();
-    format!("{server}/{database}")
+    Some(format!("{server}/{database}"))
 }
 
 async fn stores(name: &str) -> Vec<(TempDir, Store)> {
@@ -94,7 +97,10 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
         let row = enqueued(&store).await;
         assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
         let (row, lease) = store.take_up("me", 2.0, 10.0).await.unwrap().unwrap();
-        assert_eq!((row.state.as_str(), row.started_s, row.token), ("running", Some(2.0), 1));
+        assert_eq!(
+            (row.state.as_str(), row.started_s, row.token),
+            ("running", Some(2.0), 1)
+        );
         assert_eq!(store.take_up("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
             assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
@@ -103,8 +109,14 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
         assert_eq!(store.renew(lease, 20.0, Account::default()).await.unwrap(), Some(true));
         assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
-        assert_eq!((row.state.as_str(), row.cancelling, row.ended_s), ("cancelled", false, Some(9.0)));
-        assert_eq!((row.progress.as_str(), row.outcome.as_deref()), ("{\"done\":1}", Some("{}")));
+        assert_eq!(
+            (row.state.as_str(), row.cancelling, row.ended_s),
+            ("cancelled", false, Some(9.0))
+        );
+        assert_eq!(
+            (row.progress.as_str(), row.outcome.as_deref()),
+            ("{\"done\":1}", Some("{}"))
+        );
         let lines = store.job_log(1, 3, 10).await.unwrap();
         let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
         assert_eq!(lines, [(4, "four"), (5, "five")]);
@@ -123,7 +135,12 @@ async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
         let (row, fresh) = store.take_up("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
         assert_eq!(store.renew(stale, 99.0, account("from the dead")).await.unwrap(), None);
-        assert!(!store.end(stale, ending("failed"), account("from the dead")).await.unwrap());
+        assert!(
+            !store
+                .end(stale, ending("failed"), account("from the dead"))
+                .await
+                .unwrap()
+        );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
         assert_eq!(store.renew(fresh, 40.0, Account::default()).await.unwrap(), Some(false));
@@ -137,7 +154,10 @@ async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
 async fn places_keys_and_names_are_given_once() {
     for (_dir, store) in stores("once").await {
         let enqueue = async |new: NewJob| store.enqueue(new, 2, 0.0).await.unwrap();
-        assert!(matches!(enqueue(job(Some("data set a"), Some("k"))).await, Enqueued::New(_)));
+        assert!(matches!(
+            enqueue(job(Some("data set a"), Some("k"))).await,
+            Enqueued::New(_)
+        ));
         assert!(matches!(enqueue(job(Some("data set b"), Some("k"))).await, Enqueued::Same(row) if row.number == 1));
         assert_eq!(enqueue(job(Some("data set a"), None)).await, Enqueued::Taken);
         assert!(matches!(enqueue(job(None, None)).await, Enqueued::New(_)));
@@ -214,8 +234,23 @@ async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
             state: None,
         };
         assert_eq!(numbers(page).await, [3, 2]);
-        assert_eq!(store.forget_ended(1).await.unwrap().into_iter().collect::<BTreeSet<_>>(), [1, 2].into());
-        assert_eq!(numbers(JobPage { limit: 9, ..JobPage::default() }).await, [5, 4, 3]);
+        assert_eq!(
+            store
+                .forget_ended(1)
+                .await
+                .unwrap()
+                .into_iter()
+                .collect::<BTreeSet<_>>(),
+            [1, 2].into()
+        );
+        assert_eq!(
+            numbers(JobPage {
+                limit: 9,
+                ..JobPage::default()
+            })
+            .await,
+            [5, 4, 3]
+        );
         enqueued(&store).await;
         assert_eq!(store.job(6).await.unwrap().unwrap().number, 6);
     }
@@ -232,7 +267,10 @@ async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
 async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_ended() {
     for (_dir, store) in stores("versions").await {
         let (lease, version) = reserve(&store, "m").await;
-        assert_eq!((version, store.reserve_version(lease, "m", 4).await.unwrap()), (5, Some(5)));
+        assert_eq!(
+            (version, store.reserve_version(lease, "m", 4).await.unwrap()),
+            (5, Some(5))
+        );
         assert_eq!(store.published_versions().await.unwrap(), []);
         let published = |version, activates| Ending {
             published: Some(("m".to_owned(), version, activates)),
@@ -259,7 +297,13 @@ async fn keys_are_found_by_id_and_revoked_once() {
         store.create_key("b", "robot", "hash-b", 2.0).await.unwrap();
         store.create_key("a", "room", "hash-a", 1.0).await.unwrap();
         assert!(store.create_key("a", "other", "hash", 3.0).await.is_err());
-        let names: Vec<_> = store.list_keys().await.unwrap().into_iter().map(|key| key.name).collect();
+        let names: Vec<_> = store
+            .list_keys()
+            .await
+            .unwrap()
+            .into_iter()
+            .map(|key| key.name)
+            .collect();
         assert_eq!(names, ["room", "robot"]);
         assert!(store.revoke_key("b", 5.0).await.unwrap() && !store.revoke_key("b", 6.0).await.unwrap());
         assert_eq!(store.find_key("b").await.unwrap().unwrap().revoked_s, Some(5.0));
@@ -309,7 +353,11 @@ async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
 #[tokio::test]
 async fn what_one_machine_pushes_another_pulls_lists_and_deletes() {
     let shared = tempfile::tempdir().unwrap();
-    let url = if cfg!(feature = "cloud") { std::env::var("FOREFRAME_TEST_S3").ok() } else { None };
+    let url = if cfg!(feature = "cloud") {
+        std::env::var("FOREFRAME_TEST_S3").ok()
+    } else {
+        None
+    };
     if url.is_none() {
         println!("skipped on S3: built without the feature cloud, or FOREFRAME_TEST_S3 holds no URL");
     }
@@ -330,7 +378,13 @@ async fn what_one_machine_pushes_another_pulls_lists_and_deletes() {
         assert!(theirs.pull("models/m/1", "manifest.json").await.unwrap());
         let read = |path: &str| std::fs::read_to_string(there.0.path().join(path)).ok();
         assert_eq!(read("models/m/1/deep/weights").as_deref(), Some("first"));
-        assert_eq!((read("models/m/1/manifest.json").as_deref(), read("models/m/1/half.partial")), (Some("last"), None));
+        assert_eq!(
+            (
+                read("models/m/1/manifest.json").as_deref(),
+                read("models/m/1/half.partial")
+            ),
+            (Some("last"), None)
+        );
         write("models/m/1/manifest.json", "newer");
         ours.push("models/m/1", "manifest.json").await.unwrap();
         theirs.pull("models/m/1", "manifest.json").await.unwrap();
