@@ -16,5 +16,5 @@ fn main() {
         .filter(|output| output.status.success())
         .and_then(|output| String::from_utf8(output.stdout).ok())
         .unwrap_or_default();
-    println!("cargo::rustc-env=FOREFRAME_GIT_COMMIT={}", commit.trim());
+    println!("cargo::rustc-env=GIT_COMMIT_AT_BUILD={}", commit.trim());
 }

@@ -14,6 +14,7 @@ mod progress;
 mod serve;
 mod settings;
 mod train;
+mod worker;
 
 use std::fmt::Display;
 use std::io::Write;
@@ -58,6 +59,8 @@ enum Command {
     Config(config::Args),
     /// Ask a running server whether it is ready
     Healthcheck(healthcheck::Args),
+    /// Work on jobs without serving
+    Worker(worker::Args),
     /// Describe a model or a data set
     Inspect(inspect::Args),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -78,9 +81,9 @@ pub fn main() -> ExitCode {
 
 fn run(command: Option<Command>) -> Result<(), CliError> {
     let command = command.unwrap_or_else(|| Command::Serve(serve::Args::default()));
-    // Only the server's logs have settings.
+    // The logs of those that run long have settings.
     let _telemetry = match &command {
-        Command::Serve(_) => None,
+        Command::Serve(_) | Command::Worker(_) => None,
         _ => Some(telemetry::init(LogFormat::Text, None)?),
     };
     match command {
@@ -89,6 +92,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),
         Command::Serve(args) => serve::run(&args),
+        Command::Worker(args) => worker::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),

@@ -85,14 +85,6 @@ pub enum ConfigError {
 pub struct Config {
     /// Where to listen.
     pub bind: SocketAddr,
-    /// The directory of the models to serve.
-    pub models_dir: PathBuf,
-    /// Where jobs, keys and versions are kept: `postgres://…` or `sqlite://…`. Without: SQLite in `data_dir`.
-    pub database_url: Option<String>,
-    /// Where data sets, checkpoints and models are kept: `s3://bucket/prefix`. Without: `data_dir`.
-    pub objects_url: Option<String>,
-    /// Serve only: jobs are left to workers.
-    pub no_jobs: bool,
     /// Listen on other than a loopback address although nobody needs a key.
     pub insecure: bool,
     /// `text` or `json`.
@@ -108,10 +100,6 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             bind: SocketAddr::from((Ipv4Addr::LOCALHOST, 8642)),
-            models_dir: PathBuf::from("models"),
-            database_url: None,
-            objects_url: None,
-            no_jobs: false,
             insecure: false,
             log_format: LogFormat::Text,
             otlp_endpoint: None,
@@ -161,7 +149,7 @@ impl Loaded {
                 origin: origin(&values, field),
             });
         }
-        let server: ServerConfig = extract(&values)?;
+        let mut server: ServerConfig = extract(&values)?;
         if let Some((field, value, range)) = server.out_of_bounds() {
             return Err(ConfigError::Range {
                 field,
@@ -173,8 +161,8 @@ impl Loaded {
         }
         let mut config: Config = extract(&values)?;
         for url in [
-            &mut config.database_url,
-            &mut config.objects_url,
+            &mut server.database_url,
+            &mut server.objects_url,
             &mut config.otlp_endpoint,
         ] {
             url.take_if(|url| url.is_empty());

@@ -10,6 +10,7 @@ mod collection;
 mod error;
 mod files;
 mod layout;
+mod preview;
 pub mod sampler;
 mod shard;
 mod shard_reader;
@@ -26,6 +27,7 @@ use check::{check_description, check_episode};
 pub use collect::{CollectConfig, Progress, collect};
 pub use collection::Standing;
 pub use error::DatasetError;
+pub use preview::describe;
 pub use sampler::{Split, Splits, WindowShape};
 
 use crate::files::hex;

@@ -1,17 +1,26 @@
-//! Collection and training in the background: [`state`] says which transitions are legal, [`table`] holds the jobs,
-//! [`spec`] checks what is asked for, [`runner`] runs one job at a time on a thread of its own, [`pipeline`] does the
-//! work and publishes what came of it.
+//! Collection, training and evaluation in the background. [`state`] says which transitions are legal, [`spec`] checks what
+//! is asked for, [`queue`] is the handle that enqueues and tells, `runner` takes jobs up one after another and writes of
+//! them what `notes` gathered, [`pipeline`] does the work. The jobs themselves lie in the store, so that they outlast the
+//! process and several processes can share them.
 
+pub mod datasets;
+mod instance;
+pub mod job;
+mod notes;
 pub mod pipeline;
-pub mod runner;
+pub mod queue;
+mod runner;
 pub mod spec;
 pub mod state;
-pub mod table;
 
-pub use runner::{Execute, Failure, Jobs, Report};
-pub use spec::{CollectSpec, JobSpec, TrainSpec};
+use crate::store::StoreError;
+
+pub use job::{Job, JobFilter};
+pub use notes::{Losses, Progress};
+pub use queue::{JobLimits, Jobs};
+pub use runner::{Execute, Failure, Outcome, Report};
+pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
 pub use state::{Event, JobState};
-pub use table::{Job, JobTable, Losses, Progress, TableLimits};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]
@@ -61,7 +70,7 @@ pub enum JobError {
     /// What the job would make is there, or another job makes it.
     #[error("name: {kind} \"{name}\" {why}; choose another name")]
     Taken {
-        /// `data set`, `model`, …
+        /// `data set`, …
         kind: &'static str,
         /// The name asked for.
         name: String,
@@ -74,12 +83,36 @@ pub enum JobError {
         /// What is there.
         reason: String,
     },
+    /// A job that has not ended needs it.
+    #[error("{kind} \"{name}\" is in use by {job}; wait for its end or cancel it")]
+    InUse {
+        /// `data set`, …
+        kind: &'static str,
+        /// Its name.
+        name: String,
+        /// The job's id.
+        job: String,
+    },
     /// The server is stopping.
     #[error("the server is stopping and takes no more jobs")]
     Stopping,
-    /// The runner's thread could not be started.
-    #[error("could not start the job runner's thread")]
-    Thread(#[source] std::io::Error),
+    /// What the store holds of a job cannot be read by this program.
+    #[error("the store's record of job {id} cannot be read: {reason}")]
+    Record {
+        /// The job.
+        id: String,
+        /// Where it went wrong.
+        reason: String,
+    },
+    /// No identity could be had in the data directory.
+    #[error("could not register in the data directory: {0}")]
+    Instance(#[source] std::io::Error),
+    /// The runner's threads could not be started.
+    #[error("could not start the threads for jobs: {0}")]
+    Threads(#[source] rayon::ThreadPoolBuildError),
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
 }
 
 fn list(names: &[String]) -> String {
@@ -88,4 +121,10 @@ fn list(names: &[String]) -> String {
     } else {
         names.join(", ")
     }
+}
+
+/// The time, in seconds since 1970.
+fn unix_s() -> f64 {
+    let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);
+    since_1970.unwrap_or_default().as_secs_f64()
 }

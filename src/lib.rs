@@ -27,6 +27,8 @@ pub mod serving;
 
 pub mod store;
 
+pub mod versions;
+
 pub mod jobs;
 
 pub mod server;

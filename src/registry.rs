@@ -176,7 +176,8 @@ pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<()
     write_manifest(model_dir, &manifest)
 }
 
-fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), RegistryError> {
+/// Writes the manifest into a model's directory. Errors: `Manifest`, `Io`.
+pub fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), RegistryError> {
     let path = model_dir.join(MANIFEST_FILE);
     let mut text = serde_json::to_string_pretty(manifest).map_err(|source| RegistryError::Manifest {
         path: path.clone(),

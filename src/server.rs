@@ -4,9 +4,11 @@
 mod config;
 mod connections;
 mod dashboard;
+mod datasets;
 mod docs;
 mod environments;
 mod error;
+mod events;
 mod extract;
 mod health;
 mod images;
@@ -57,6 +59,8 @@ use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{JobError, Jobs};
 use crate::registry::LoadedModel;
 use crate::serving::{Predictor, ServingError};
+use crate::store::{Store, StoreError};
+use crate::versions::{VersionError, Versions};
 
 /// Why the server could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -79,10 +83,24 @@ pub enum ServerError {
     /// The job runner could not start.
     #[error(transparent)]
     Jobs(#[from] JobError),
+    /// The store could not be opened.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The models could not be listed.
+    #[error(transparent)]
+    Versions(Box<VersionError>),
+}
+
+impl From<VersionError> for ServerError {
+    fn from(error: VersionError) -> Self {
+        Self::Versions(Box::new(error))
+    }
 }
 
 /// What [`serve`] may take past the deadline to say what did not end.
 const GRACE: Duration = Duration::from_millis(200);
+/// How often it is asked which versions other servers of the store activated.
+const FOLLOW_EVERY: Duration = Duration::from_secs(1);
 
 /// What the handlers share; clones are the same.
 #[derive(Clone)]
@@ -95,6 +113,8 @@ struct Shared {
     config: ServerConfig,
     predictor: Predictor,
     jobs: Jobs,
+    store: Store,
+    versions: Versions,
     streams: Streams,
     environments: Environments,
     draining: AtomicBool,
@@ -104,30 +124,43 @@ struct Shared {
 }
 
 impl App {
-    /// Starts the threads that predict with these models and that run jobs. Errors: `Config`, `Serving`, `Jobs`.
-    pub fn start(config: ServerConfig, models: Vec<LoadedModel>) -> Result<Self, ServerError> {
+    /// Opens the store, loads the models that are to serve, and starts. To be called within a tokio runtime.
+    /// Errors: `Config`, `Store`, `Versions`, `Serving`, `Jobs`.
+    pub async fn open(config: ServerConfig) -> Result<Self, ServerError> {
+        config.validate()?;
+        let store = Store::open(&config.store()).await?;
+        let models = Versions::new(store.clone(), &config.models_dir).serving().await?;
+        Self::start(config, models, store)
+    }
+
+    /// Starts the threads that predict with these models and that run jobs. To be called within a tokio runtime.
+    /// Errors: `Config`, `Serving`, `Jobs`.
+    pub fn start(config: ServerConfig, models: Vec<LoadedModel>, store: Store) -> Result<Self, ServerError> {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
-        let pipeline = Pipeline {
-            data_dir: config.data_dir.clone(),
-            predictor: predictor.clone(),
-        };
-        let jobs = Jobs::start(config.jobs(), Box::new(pipeline))?;
-        Ok(Self::with_parts(config, predictor, jobs))
+        let versions = Versions::new(store.clone(), &config.models_dir);
+        let pipeline = Pipeline::new(store.clone(), versions, config.job_threads);
+        let jobs = Jobs::start(store.clone(), config.jobs(), Arc::new(pipeline), !config.no_jobs)?;
+        let app = Self::with_parts(config, predictor, jobs, store);
+        tokio::spawn(follow(app.clone()));
+        Ok(app)
     }
 
     /// From parts that have been started, for example a job runner with other work. The configuration is not checked.
     #[must_use]
-    pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs) -> Self {
+    pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs, store: Store) -> Self {
         let streams = Streams::new(config.max_streams);
         let idle = Duration::from_millis(config.environment_idle_ms);
         let environments = Environments::new(config.max_environments, idle);
         let sessions = Table::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
+        let versions = Versions::new(store.clone(), &config.models_dir);
         Self {
             shared: Arc::new(Shared {
                 config,
                 predictor,
                 jobs,
+                store,
+                versions,
                 streams,
                 environments,
                 draining: AtomicBool::new(false),
@@ -155,6 +188,18 @@ impl App {
     #[must_use]
     pub fn jobs(&self) -> &Jobs {
         &self.shared.jobs
+    }
+
+    /// Where state is kept.
+    #[must_use]
+    pub fn store(&self) -> &Store {
+        &self.shared.store
+    }
+
+    /// The versions of the models.
+    #[must_use]
+    pub fn versions(&self) -> &Versions {
+        &self.shared.versions
     }
 
     /// The settings.
@@ -222,6 +267,8 @@ fn api(app: &App) -> Router<App> {
     Router::new()
         .route("/v1/models", get(models::list))
         .route("/v1/models/{model}", get(models::get))
+        .route("/v1/models/{model}/versions/{version}", delete(models::delete))
+        .route("/v1/models/{model}/versions/{version}/activate", post(models::activate))
         .route("/v1/models/{model}/predict", post(predict::predict))
         .route("/v1/models/{model}/preview.png", get(preview::preview))
         .route("/v1/models/{model}/rollouts", post(rollouts::of_model))
@@ -234,6 +281,21 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/jobs", post(jobs::create).get(jobs::list))
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
+        .route("/v1/jobs/{id}/resume", post(jobs::resume))
+        .route("/v1/jobs/{id}/events", get(events::events))
+        .route("/v1/jobs/{id}/logs", get(jobs::logs))
+        .route("/v1/jobs/{id}/metrics", get(jobs::metrics))
+        .route("/v1/jobs/{id}/files/{file}", get(jobs::file))
+        .route("/v1/datasets", get(datasets::list))
+        .route("/v1/datasets/{dataset}", get(datasets::get).delete(datasets::delete))
+        .route(
+            "/v1/datasets/{dataset}/episodes/{episode}/preview.png",
+            get(datasets::sheet),
+        )
+        .route(
+            "/v1/datasets/{dataset}/episodes/{episode}/preview.gif",
+            get(datasets::animation),
+        )
         .route("/v1/environments", post(environments::create))
         .route("/v1/environments/{id}", delete(environments::delete))
         .route("/v1/environments/{id}/reset", post(environments::reset))
@@ -242,8 +304,8 @@ fn api(app: &App) -> Router<App> {
 }
 
 /// Answers on the listener until `shutdown` completes. Then it is not ready but goes on for `drain_ms`; takes no more
-/// connections, answers the requests it has, closes every stream with 1001, cancels the jobs, and returns when all have
-/// ended or the deadline has passed.
+/// connections, answers the requests it has, closes every stream with 1001, has the running job write its
+/// checkpoint, and returns when all have ended or the deadline has passed.
 pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
     let config = app.config();
     let limit = Duration::from_millis(config.shutdown_deadline_ms);
@@ -270,15 +332,30 @@ pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output
     if timeout_at(deadline.into(), app.streams().ended()).await.is_err() {
         warn!("some streams did not end within the deadline");
     }
-    let ended = blocking(move || {
-        let ended = app.jobs().finish_stop(deadline);
-        app.predictor().stop();
-        ended
-    });
-    if let Ok(Ok(true)) = timeout_at((deadline + GRACE).into(), ended).await {
+    let ended = async {
+        let left = app.jobs().finish_stop(deadline).await;
+        let predictor = app.predictor().clone();
+        left && blocking(move || predictor.stop()).await.is_ok()
+    };
+    if timeout_at((deadline + GRACE).into(), ended).await == Ok(true) {
         info!("stopped");
     } else {
         warn!("a computation did not end within the deadline");
+    }
+}
+
+/// Loads the versions that were activated elsewhere, or published by a job as the first of their name, until stopped.
+async fn follow(app: App) {
+    let (mut stopping, mut refused) = (app.streams().stopping(), std::collections::BTreeSet::new());
+    loop {
+        tokio::select! {
+            () = app.jobs().ended() => {}
+            () = tokio::time::sleep(FOLLOW_EVERY) => {}
+            () = streams::told(&mut stopping) => return,
+        }
+        if let Err(error) = app.versions().follow(app.predictor(), &mut refused).await {
+            warn!(%error, "could not look for newly activated versions");
+        }
     }
 }
 

@@ -13,7 +13,6 @@ mod worker;
 pub mod batch;
 pub mod session;
 
-use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -22,7 +21,7 @@ use tokio::sync::oneshot;
 
 use crate::frame::{Frame, FrameError};
 use crate::nn::NnError;
-use crate::registry::{self, LoadedModel, Manifest, RegistryError};
+use crate::registry::{LoadedModel, Manifest};
 
 use catalog::Catalog;
 pub use compute::{Features, predict};
@@ -267,16 +266,6 @@ impl Predictor {
             let _ = worker.join();
         }
     }
-}
-
-/// Loads every model below the directories; of two with one name, the later directory's. Errors: the first model that
-/// cannot be loaded. A directory that is not there holds none.
-pub fn load_models(directories: &[&Path]) -> Result<Vec<LoadedModel>, RegistryError> {
-    let mut found = std::collections::BTreeMap::new();
-    for directory in directories.iter().filter(|directory| directory.is_dir()) {
-        found.extend(registry::list(directory)?);
-    }
-    found.values().map(|path| registry::load(path)).collect()
 }
 
 /// A small model with random weights.

@@ -1,6 +1,7 @@
-//! Where state lives that outlasts the process: rows in a database ([`jobs`], [`models`], [`keys`]), whole files in
-//! [`objects`]. `database` alone knows that there are two kinds of database; SQL is written nowhere but here.
+//! Where state lives that outlasts the process: rows in a database ([`jobs`] with their [`accounts`], [`models`], [`keys`]),
+//! whole files in [`objects`]. `database` alone knows that there are two kinds of database; SQL is written nowhere but here.
 
+pub mod accounts;
 mod database;
 pub mod jobs;
 pub mod keys;
@@ -9,8 +10,9 @@ pub mod objects;
 
 use std::path::{Path, PathBuf};
 
+pub use self::accounts::{Account, LogRow, LossRow};
 use self::database::Database;
-pub use self::jobs::{JobPage, JobRow, Lease, LossRow, NewJob};
+pub use self::jobs::{Ending, Enqueued, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
 pub use self::models::VersionRow;
 pub use self::objects::Objects;
@@ -68,7 +70,7 @@ pub enum StoreError {
 }
 
 impl StoreError {
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }

@@ -173,6 +173,14 @@ pub fn run(
         Some(checkpoint) => checkpoint.into_state(),
         None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
     };
+    for point in &state.history {
+        observer.on_event(Event::Recalled {
+            stage: point.stage,
+            step: point.step,
+            train_loss: point.train_loss,
+            validation_loss: point.validation_loss,
+        });
+    }
     observer.on_event(Event::Started {
         stage: state.stage,
         step: state.step,

@@ -2,10 +2,8 @@
 
 use std::path::PathBuf;
 
-use serde_json::{Map, Value, json};
-
 use super::{CliError, command_line, load_model, open_dataset, progress::Progress, say};
-use crate::evaluation::{self, EvaluateConfig, Report, Stage};
+use crate::evaluation::{self, EvaluateConfig, Stage};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
@@ -78,9 +76,9 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
     let [markdown, _] = evaluation::write(&out, &mut report, &inputs)?;
     if args.record {
-        registry::record_metrics(&model_dir, metrics(&report))?;
+        registry::record_metrics(&model_dir, report.headline())?;
     }
-    for (split, score) in metrics(&report).as_object().into_iter().flatten() {
+    for (split, score) in report.headline().as_object().into_iter().flatten() {
         say(format!("{split}: {score}"))?;
     }
     say(markdown.display())
@@ -95,26 +93,4 @@ fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
             manifest.name, manifest.dataset.name
         ))
     })
-}
-
-/// The report's headline, for the manifest.
-fn metrics(report: &Report) -> Value {
-    let mut metrics = Map::new();
-    for set in &report.sets {
-        let Some(scores) = set.outcome.scores() else { continue };
-        let Some(model) = scores.methods.first() else { continue };
-        let interval = scores.skill.mean_interval.as_ref();
-        let summary = json!({
-            "skill": scores.skill.skill.mean,
-            "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
-            "mse": model.mse.mean,
-            "psnr_db": model.psnr_db.mean,
-            "ssim": model.ssim.mean,
-            "windows": scores.windows,
-            "trials": scores.trials,
-            "dataset_content_hash": report.stamp.dataset_content_hash,
-        });
-        metrics.insert(set.split.clone(), summary);
-    }
-    Value::Object(metrics)
 }

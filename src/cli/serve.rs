@@ -8,7 +8,7 @@ use super::{CliError, say};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App};
-use crate::{serving, telemetry};
+use crate::telemetry;
 
 /// Serve models over HTTP and WebSocket.
 ///
@@ -38,8 +38,6 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
 
 async fn listen(config: Config) -> Result<(), CliError> {
     let keys = keys(&config).await?;
-    let published = config.server.data_dir.join("models");
-    let models = serving::load_models(&[config.models_dir.as_path(), published.as_path()])?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
         CliError::Failed(format!(
             "could not listen on {}: {error}; try another --bind",
@@ -47,16 +45,17 @@ async fn listen(config: Config) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    for model in &models {
-        let manifest = &model.manifest;
+    let app = App::open(config.server)
+        .await
+        .map_err(CliError::failed)?
+        .with_keys(keys);
+    let models = app.predictor().models();
+    for manifest in &models {
         info!(model.id = %manifest.name, model.version = manifest.version, "model loaded");
     }
     if models.is_empty() {
-        info!(directory = %config.models_dir.display(), "no models there; train one by POST /v1/jobs or foreframe train");
+        info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs or foreframe train");
     }
-    let app = App::start(config.server, models)
-        .map_err(CliError::failed)?
-        .with_keys(keys);
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
     server::serve(listener, app, server::shutdown::requested()).await;
     Ok(())

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::CliError;
 use crate::config::{Config, ConfigError, Layer, Loaded};
-use crate::store::{Store, StoreConfig, StoreError};
+use crate::store::{Store, StoreError};
 
 /// Where state is kept.
 #[derive(clap::Args, Default)]
@@ -89,12 +89,7 @@ fn given<const N: usize>(flags: [(&str, &str, Option<String>); N]) -> Vec<Layer>
 
 /// The store that the settings name.
 pub(super) async fn open_store(config: &Config) -> Result<Store, CliError> {
-    let store = StoreConfig {
-        data_dir: config.server.data_dir.clone(),
-        database: config.database_url.clone(),
-        objects: config.objects_url.clone(),
-    };
-    Ok(Store::open(&store).await?)
+    Ok(Store::open(&config.server.store()).await?)
 }
 
 impl From<ConfigError> for CliError {

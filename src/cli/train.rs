@@ -135,7 +135,7 @@ impl<'a> Watch<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
             }
-            Event::Checkpointed { .. } => {}
+            Event::Recalled { .. } | Event::Checkpointed { .. } => {}
         }
     }
 

@@ -247,6 +247,16 @@ pub enum DatasetError {
         /// The arguments it was begun with.
         arguments: String,
     },
+    /// There is no such episode.
+    #[error("there is no episode {episode} in \"{name}\"; it has {count}, counted from 0")]
+    NoEpisode {
+        /// The data set's name.
+        name: String,
+        /// The episode asked for.
+        episode: usize,
+        /// How many there are.
+        count: usize,
+    },
 }
 
 impl DatasetError {

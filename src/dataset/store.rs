@@ -90,7 +90,7 @@ fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) 
     slots
 }
 
-fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
+pub(super) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
     let corrupt = |reason: String| DatasetError::Corrupt {
         path: path.to_owned(),
         reason,

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
 use super::bootstrap::{Bootstrap, Trials};
@@ -38,6 +39,29 @@ impl Report {
     #[must_use]
     pub fn scores(&self, split: &str) -> Option<&SetScores> {
         self.sets.iter().find(|set| set.split == split)?.outcome.scores()
+    }
+
+    /// The scores in a few numbers for each test set, for the model's manifest.
+    #[must_use]
+    pub fn headline(&self) -> Value {
+        let mut headline = Map::new();
+        for set in &self.sets {
+            let Some(scores) = set.outcome.scores() else { continue };
+            let Some(model) = scores.methods.first() else { continue };
+            let interval = scores.skill.mean_interval.as_ref();
+            let summary = json!({
+                "skill": scores.skill.skill.mean,
+                "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
+                "mse": model.mse.mean,
+                "psnr_db": model.psnr_db.mean,
+                "ssim": model.ssim.mean,
+                "windows": scores.windows,
+                "trials": scores.trials,
+                "dataset_content_hash": self.stamp.dataset_content_hash,
+            });
+            headline.insert(set.split.clone(), summary);
+        }
+        Value::Object(headline)
     }
 }
 

@@ -1,42 +1,76 @@
-//! The work itself: collections and trainings below the data directory. A finished training's model is published under
-//! `models/NAME` there and serves at once.
+//! The work itself, below the data directory: collections into `datasets/NAME`, trainings in `runs/JOB`, whose model
+//! becomes the next version of its name, evaluations into `reports/JOB`.
 
 use std::error::Error;
-use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
-use super::runner::{Execute, Failure, Report};
-use super::{CollectSpec, JobError, JobSpec, Losses, TrainSpec};
-use crate::dataset::{self, Dataset};
-use crate::files::write_atomically;
-use crate::registry;
-use crate::serving::Predictor;
-use crate::training::{self, Event, Outcome, Stage, Training};
+use serde_json::json;
+use tokio::runtime::Handle;
+
+use super::runner::{Execute, Failure, Outcome, Report};
+use super::spec::Ground;
+use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
+use crate::dataset::{self, Dataset, DatasetError};
+use crate::evaluation::{self, EvaluateConfig};
+use crate::registry::LoadedModel;
+use crate::store::{LossRow, Store, StoreError};
+use crate::training::{self, Event, Stage, Training};
+use crate::types::Seed;
+use crate::versions::{VersionError, Versions};
 use crate::wording;
 
-/// Collects and trains below `data_dir`: `datasets/NAME`, `runs/NAME`, `models/NAME`.
+/// The file of a report that is written last.
+const REPORT_FILE: &str = "report.json";
+/// The file of a run that says how far it is.
+const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
+/// Points of a stage's training loss, besides those of its validations.
+const CURVE_POINTS: usize = 500;
+/// How long a collection waits for a process that was taken for dead to let go of the directory.
+const BUSY_PATIENCE: Duration = Duration::from_mins(1);
+
+/// What works on jobs.
 pub struct Pipeline {
-    /// Where everything is written.
-    pub data_dir: PathBuf,
-    /// Where trained models serve.
-    pub predictor: Predictor,
+    store: Store,
+    versions: Versions,
+    threads: usize,
+    runtime: Handle,
+}
+
+impl Pipeline {
+    /// One that collects on so many threads. To be called within a tokio runtime.
+    #[must_use]
+    pub fn new(store: Store, versions: Versions, threads: usize) -> Self {
+        Self {
+            store,
+            versions,
+            threads,
+            runtime: Handle::current(),
+        }
+    }
 }
 
 impl Execute for Pipeline {
     fn check(&self, spec: &JobSpec) -> Result<(), JobError> {
-        let models: Vec<String> = self
-            .predictor
-            .models()
-            .iter()
-            .map(|manifest| manifest.name.clone())
-            .collect();
-        spec.check(&self.data_dir, &models)
+        let objects = self.store.objects();
+        let datasets = self.runtime.block_on(datasets::names(objects))?;
+        let models = self.runtime.block_on(self.versions.all());
+        let models = models.map_err(|error| JobError::Invalid {
+            field: "model",
+            reason: error.to_string(),
+        })?;
+        spec.check(Ground {
+            data_dir: objects.data_dir(),
+            datasets: &datasets,
+            models: &models,
+        })
     }
 
-    fn execute(&self, spec: &JobSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
+    fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
+            JobSpec::Evaluate(spec) => self.evaluate(spec, report),
         };
         match result {
             Err(Failure::Failed(_)) if cancelled.load(Ordering::Acquire) => Err(Failure::Cancelled),
@@ -46,86 +80,248 @@ impl Execute for Pipeline {
 }
 
 impl Pipeline {
-    fn collect(&self, spec: &CollectSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
-        let config = spec
-            .config(&self.make_dir("datasets")?)
-            .map_err(|error| failed(&error))?;
+    fn collect(&self, spec: &CollectSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+        let parent = self.store.objects().data_dir().join("datasets");
+        let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
+        config.threads = self.threads;
         let on_progress = |progress: dataset::Progress| report.progress(progress.done, progress.total, "simulating");
-        dataset::collect(&config, &on_progress, cancelled).map_err(|error| failed(&error))?;
-        Ok(())
+        let began = Instant::now();
+        let info = loop {
+            match dataset::collect(&config, &on_progress, cancelled) {
+                Err(DatasetError::Busy { .. }) if began.elapsed() < BUSY_PATIENCE => {
+                    std::thread::sleep(Duration::from_millis(200));
+                }
+                other => break other.map_err(|error| failed(&error))?,
+            }
+        };
+        self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
+        Ok(Outcome {
+            result: json!({
+                "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
+                "content_hash": info.content_hash,
+            }),
+            published: None,
+        })
     }
 
-    fn train(&self, spec: &TrainSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
+    fn train(&self, spec: &TrainSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
         let config = spec.config().map_err(|error| failed(&error))?;
-        let run_dir = self.make_dir("runs")?.join(&spec.name);
+        let run = format!("runs/{}", report.id());
         report.progress(0, 0, "reading the data set");
-        let dataset_dir = self.data_dir.join("datasets").join(&spec.dataset);
-        let dataset = Dataset::open(&dataset_dir).map_err(|error| failed(&error))?;
+        self.prepare_run(&run, report)?;
+        let dataset = self.dataset(&spec.dataset)?;
+        let run_dir = self.store.objects().data_dir().join(&run);
         let training = Training {
             config: &config,
             dataset: &dataset,
             run_dir: &run_dir,
             command: &command(spec),
         };
-        let steps = (config.pretrain.steps as u64, config.fit.steps as u64);
-        let mut observer = |event: Event| tell(event, steps, report);
+        let mut watch = Watch {
+            report,
+            steps: [config.pretrain.steps, config.fit.steps],
+            train_loss: None,
+        };
+        let mut unsaved = None;
+        let mut observer = |event: Event| {
+            watch.on_event(event);
+            if matches!(event, Event::Checkpointed { .. }) {
+                unsaved = self.push(&run, CHECKPOINT_FILE).err();
+            }
+        };
         match training::run(&training, &mut observer, cancelled).map_err(|error| failed(&error))? {
-            Outcome::Interrupted { .. } => Err(Failure::Cancelled),
-            Outcome::Finished { model_dir, .. } => self.publish(&model_dir, &spec.name),
+            training::Outcome::Interrupted { .. } => Err(Failure::Cancelled),
+            training::Outcome::Finished { model_dir, manifest } => {
+                if let Some(Failure::Failed(reason)) = unsaved {
+                    report.line(format!("the checkpoint is kept on this machine only: {reason}"));
+                }
+                report.progress(0, 0, "publishing");
+                let written = self.versions.write(report.lease(), &spec.name, &model_dir);
+                let written = self.runtime.block_on(written).map_err(|error| failed(&error))?;
+                let (version, activates) = written.ok_or(Failure::Cancelled)?;
+                report.line(format!("published as version {version} of \"{}\"", spec.name));
+                Ok(Outcome {
+                    result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
+                    published: Some((spec.name.clone(), version, activates)),
+                })
+            }
         }
     }
 
-    /// Copies a run's model to where models are loaded from and has it serve.
-    fn publish(&self, model_dir: &Path, name: &str) -> Result<(), Failure> {
-        let published = self.make_dir("models")?.join(name);
-        std::fs::create_dir_all(&published).map_err(|error| failed(&error))?;
-        // The manifest last: a directory without one is no model.
-        for file in [registry::WEIGHTS_FILE, registry::MANIFEST_FILE] {
-            let bytes = std::fs::read(model_dir.join(file)).map_err(|error| failed(&error))?;
-            write_atomically(&published.join(file), &bytes).map_err(|error| failed(&error))?;
-        }
-        let loaded = registry::load(&published).map_err(|error| failed(&error))?;
-        self.predictor.load(loaded).map_err(|error| failed(&error))
+    /// Has the run's directory hold its last checkpoint, and at its first taking up nothing.
+    fn prepare_run(&self, run: &str, report: &Report) -> Result<(), Failure> {
+        let objects = self.store.objects();
+        let prepared = self.runtime.block_on(async {
+            if report.lease().token == 1 {
+                return objects.delete(run).await;
+            }
+            objects.pull(run, CHECKPOINT_FILE).await.map(drop)
+        });
+        prepared.map_err(|error: StoreError| failed(&error))
     }
 
-    fn make_dir(&self, name: &str) -> Result<PathBuf, Failure> {
-        let dir = self.data_dir.join(name);
-        std::fs::create_dir_all(&dir)
-            .map_err(|error| Failure::Failed(format!("could not make {}: {error}", dir.display())))?;
-        Ok(dir)
+    fn evaluate(&self, spec: &EvaluateSpec, report: &Report) -> Result<Outcome, Failure> {
+        let loaded = self.model(&spec.model, spec.version)?;
+        let twin = spec.twin.as_deref().map(|twin| self.model(twin, None)).transpose()?;
+        report.progress(0, 0, "reading the data set");
+        let dataset = self.dataset(&spec.dataset)?;
+        let config = EvaluateConfig {
+            max_windows: spec.windows,
+            bootstrap_samples: spec.resamples,
+            seed: Seed(spec.seed),
+            twin: twin.as_ref(),
+            command: posted(&JobSpec::Evaluate(spec.clone())),
+            ..EvaluateConfig::default()
+        };
+        let found = evaluation::run(&loaded, &dataset, &config, &|now| {
+            let what = match now.stage {
+                evaluation::Stage::Scores => "scores",
+                evaluation::Stage::Actions => "actions",
+            };
+            report.progress(now.done as u64, now.total as u64, &format!("{} {what}", now.split));
+        });
+        let mut found = found.map_err(|error| failed(&error))?;
+        let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
+        let dir = report_key(&report.id());
+        // What an attempt that broke off left is of no use.
+        let cleared = self.runtime.block_on(self.store.objects().delete(&dir));
+        cleared.map_err(|error| failed(&error))?;
+        let out = self.store.objects().data_dir().join(&dir);
+        evaluation::prepare(&out)
+            .and_then(|()| evaluation::write(&out, &mut found, &figures))
+            .map_err(|error| failed(&error))?;
+        self.push(&dir, REPORT_FILE)?;
+        let mut files: Vec<String> = std::fs::read_dir(&out)
+            .map_err(|error| failed(&error))?
+            .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+            .collect();
+        files.sort();
+        Ok(Outcome {
+            result: json!({
+                "model": spec.model, "version": loaded.manifest.version, "scores": found.headline(), "files": files,
+            }),
+            published: None,
+        })
+    }
+
+    fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, Failure> {
+        let loaded: Result<LoadedModel, VersionError> = self.runtime.block_on(async {
+            match version {
+                Some(version) => self.versions.load(name, version).await,
+                None => self.versions.load_active(name).await,
+            }
+        });
+        loaded.map_err(|error| failed(&error))
+    }
+
+    fn dataset(&self, name: &str) -> Result<Dataset, Failure> {
+        let fetched = self.runtime.block_on(datasets::fetch(self.store.objects(), name));
+        Dataset::open(&fetched.map_err(|error| failed(&error))?).map_err(|error| failed(&error))
+    }
+
+    fn push(&self, dir: &str, last: &str) -> Result<(), Failure> {
+        let pushed = self.runtime.block_on(self.store.objects().push(dir, last));
+        pushed.map_err(|error| failed(&error))
     }
 }
 
-fn tell(event: Event, (pretrain_steps, fit_steps): (u64, u64), report: &Report<'_>) {
-    let total = pretrain_steps + fit_steps;
-    let done = |stage: Stage, step: usize| match stage {
-        Stage::Pretrain => step as u64,
-        Stage::Fit => pretrain_steps + step as u64,
-    };
-    match event {
-        Event::Started { stage, step, .. } => report.progress(done(stage, step), total, &stage.to_string()),
-        Event::Step { stage, step, loss, .. } => {
-            if step == 1 {
-                report.stage();
+/// The directory of a job's report among the objects.
+#[must_use]
+pub fn report_key(id: &str) -> String {
+    format!("reports/{id}")
+}
+
+/// Writes a training's events down.
+struct Watch<'a> {
+    report: &'a Report,
+    /// Of each stage.
+    steps: [usize; 2],
+    train_loss: Option<f64>,
+}
+
+impl Watch<'_> {
+    fn on_event(&mut self, event: Event) {
+        match event {
+            Event::Started { stage, step, windows } => {
+                self.progress(stage, step);
+                self.report
+                    .line(format!("{stage} from step {step}, on {windows} windows"));
             }
-            report.progress(done(stage, step), total, &stage.to_string());
-            report.losses(Losses {
-                train: Some(loss),
-                validation: None,
-            });
+            // What was not written before the process died must be in the curves all the same.
+            Event::Recalled {
+                stage,
+                step,
+                train_loss,
+                validation_loss,
+            } => {
+                self.train_loss = Some(train_loss);
+                self.point(stage, step, Some(validation_loss));
+            }
+            Event::Step {
+                stage,
+                step,
+                steps,
+                loss,
+            } => {
+                if step == 1 {
+                    self.report.stage();
+                }
+                self.progress(stage, step);
+                self.train_loss = Some(loss);
+                self.report.losses(Losses {
+                    train: Some(loss),
+                    validation: None,
+                });
+                if step.is_multiple_of(steps.div_ceil(CURVE_POINTS)) {
+                    self.point(stage, step, None);
+                }
+            }
+            Event::Validated {
+                stage,
+                step,
+                loss,
+                is_best,
+            } => {
+                self.report.losses(Losses {
+                    train: None,
+                    validation: Some(loss),
+                });
+                self.point(stage, step, Some(loss));
+                let best = if is_best { ", the best so far" } else { "" };
+                self.report
+                    .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
+            }
+            Event::Checkpointed { .. } => {}
         }
-        Event::Validated { loss, .. } => report.losses(Losses {
-            train: None,
-            validation: Some(loss),
-        }),
-        Event::Checkpointed { .. } => {}
+    }
+
+    fn progress(&self, stage: Stage, step: usize) {
+        let [pretrain, fit] = self.steps;
+        let done = match stage {
+            Stage::Pretrain => step,
+            Stage::Fit => pretrain + step,
+        };
+        self.report
+            .progress(done as u64, (pretrain + fit) as u64, &stage.to_string());
+    }
+
+    fn point(&self, stage: Stage, step: usize, validation: Option<f64>) {
+        self.report.point(LossRow {
+            stage: stage.to_string(),
+            step: step as i64,
+            train: self.train_loss,
+            validation,
+        });
     }
 }
 
 /// What the manifest tells of how the model was made.
 fn command(spec: &TrainSpec) -> String {
-    let body = JobSpec::Train(spec.clone());
-    format!("POST /v1/jobs {}", serde_json::to_string(&body).unwrap_or_default())
+    posted(&JobSpec::Train(spec.clone()))
+}
+
+fn posted(spec: &JobSpec) -> String {
+    format!("POST /v1/jobs {}", serde_json::to_string(spec).unwrap_or_default())
 }
 
 fn failed(error: &dyn Error) -> Failure {

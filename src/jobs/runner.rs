@@ -1,24 +1,46 @@
-//! Runs the jobs of the table one after another on a thread of its own.
+//! Takes jobs up one after another: works on them on threads of their own, renews the lease meanwhile, writes what they
+//! say of themselves, and ends them.
 
-use std::sync::atomic::AtomicBool;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
-use std::time::{Duration, Instant, SystemTime};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use metrics::{counter, gauge};
+use rayon::ThreadPool;
+use tokio::sync::{oneshot, watch};
 use tracing::{info, warn};
 
+use super::instance::Instance;
+use super::job::id_of;
+use super::notes::{Notes, Standing};
+use super::queue::Shared;
+use super::{Event, Job, JobError, JobSpec, JobState, Losses, unix_s};
+use crate::store::{Account, Ending, JobRow, Lease, LossRow};
 use crate::telemetry::names;
 
-use super::{Event, Job, JobError, JobSpec, JobState, JobTable, Losses, TableLimits};
+/// How often a job's standing is written, unless the lease asks for more.
+const WRITE_EVERY: Duration = Duration::from_millis(500);
+/// How often the store is asked for jobs of other processes.
+const POLL_EVERY: Duration = Duration::from_secs(1);
+/// How often it is tried to write how a job ended.
+const END_ATTEMPTS: u32 = 5;
 
 /// How a job's work ended without what was asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Failure {
-    /// It was asked to stop and did.
+    /// It was asked to stop and did, or its lease was lost.
     Cancelled,
     /// What went wrong, in a sentence.
     Failed(String),
+}
+
+/// What came of a job.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outcome {
+    /// What is told of it.
+    pub result: serde_json::Value,
+    /// A model's name and version, and whether that is to serve unless another does.
+    pub published: Option<(String, u32, bool)>,
 }
 
 /// What does the work of a job.
@@ -26,27 +48,42 @@ pub trait Execute: Send + Sync + 'static {
     /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`.
     fn check(&self, spec: &JobSpec) -> Result<(), JobError>;
 
-    /// Does the work; returns `Cancelled` soon after `cancelled` is raised.
-    fn execute(&self, spec: &JobSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure>;
+    /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.
+    fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure>;
 }
 
 /// Where a job's work says how far it is.
-pub struct Report<'a> {
-    shared: &'a Shared,
-    id: &'a str,
+#[derive(Clone)]
+pub struct Report {
+    notes: Arc<Mutex<Notes>>,
+    lease: Lease,
 }
 
-impl Report<'_> {
+impl Report {
+    fn notes(&self) -> MutexGuard<'_, Notes> {
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The job's id.
+    #[must_use]
+    pub fn id(&self) -> String {
+        id_of(self.lease.number)
+    }
+
+    /// The right to work on the job.
+    #[must_use]
+    pub fn lease(&self) -> Lease {
+        self.lease
+    }
+
     /// Notes units done of a total, and what is being done.
     pub fn progress(&self, done: u64, total: u64, message: &str) {
-        self.shared
-            .table()
-            .note_progress(self.id, (done, total), message, unix_s());
+        self.notes().progress((done, total), message, unix_s());
     }
 
     /// Measures the rate anew, for a stage whose units take another time.
     pub fn stage(&self) {
-        self.shared.table().note_stage(self.id);
+        self.notes().stage();
     }
 
     /// Notes the latest losses.
@@ -56,170 +93,244 @@ impl Report<'_> {
                 gauge!(names::TRAINING_LOSS, "split" => split).set(loss);
             }
         }
-        self.shared.table().note_losses(self.id, losses);
+        self.notes().losses(losses);
+    }
+
+    /// Adds a line to the job's log.
+    pub fn line(&self, line: String) {
+        self.notes().line(line, unix_s());
+    }
+
+    /// Adds a point to the loss curves.
+    pub fn point(&self, point: LossRow) {
+        self.notes().point(point);
     }
 }
 
-struct Shared {
-    table: Mutex<JobTable>,
-    changed: Condvar,
-    stopping: AtomicBool,
-    execute: Box<dyn Execute>,
+/// The threads that jobs work on, and no others: what predicts has its own. Errors: `Threads`.
+pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .thread_name(|index| format!("jobs-{index}"))
+        .build()
+        .map_err(JobError::Threads)
 }
 
-impl Shared {
-    fn table(&self) -> MutexGuard<'_, JobTable> {
-        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+pub(super) async fn run(shared: Arc<Shared>, instance: Instance, pool: ThreadPool) {
+    let pool = Arc::new(pool);
+    let mut stop = shared.stop.subscribe();
+    // Nobody else holds this identity, so what runs under it is what this process's predecessor left.
+    if let Err(error) = shared.store.release_leases(&instance.id).await {
+        warn!(%error, "jobs of an earlier run are taken up when their leases have run out");
     }
-
-    fn is_stopping(&self) -> bool {
-        self.stopping.load(std::sync::atomic::Ordering::Acquire)
-    }
-}
-
-/// The handle to the jobs; clones share them.
-#[derive(Clone)]
-pub struct Jobs {
-    shared: Arc<Shared>,
-    runner: Arc<Mutex<Option<JoinHandle<()>>>>,
-}
-
-impl Jobs {
-    /// Starts the thread that runs them. Errors: `Thread`.
-    pub fn start(limits: TableLimits, execute: Box<dyn Execute>) -> Result<Self, JobError> {
-        let shared = Arc::new(Shared {
-            table: Mutex::new(JobTable::new(limits)),
-            changed: Condvar::new(),
-            stopping: AtomicBool::new(false),
-            execute,
-        });
-        let of_thread = Arc::clone(&shared);
-        let runner = std::thread::Builder::new()
-            .name("jobs".to_owned())
-            .spawn(move || run(&of_thread))
-            .map_err(JobError::Thread)?;
-        Ok(Self {
-            shared,
-            runner: Arc::new(Mutex::new(Some(runner))),
-        })
-    }
-
-    /// Takes a job. Blocks for the disk. Errors: what [`Execute::check`] refuses, `QueueFull`, `Taken`, `Stopping`.
-    pub fn submit(&self, spec: JobSpec) -> Result<Job, JobError> {
-        if self.shared.is_stopping() {
-            return Err(JobError::Stopping);
-        }
-        self.shared.execute.check(&spec)?;
-        let job = self.shared.table().add(spec, unix_s())?;
-        self.shared.changed.notify_all();
-        info!(job.id = %job.id, "job queued");
-        Ok(job)
-    }
-
-    /// Every job, the newest first.
-    #[must_use]
-    pub fn all(&self) -> Vec<Job> {
-        self.shared.table().all().cloned().collect()
-    }
-
-    /// One job. Errors: `Unknown`.
-    pub fn get(&self, id: &str) -> Result<Job, JobError> {
-        self.shared.table().get(id).cloned()
-    }
-
-    /// Asks a job to stop. Errors: `Unknown`, `IllegalTransition`.
-    pub fn cancel(&self, id: &str) -> Result<Job, JobError> {
-        self.shared.table().cancel(id, unix_s())
-    }
-
-    /// Cancels every job that has not ended and takes no more; returns at once.
-    pub fn begin_stop(&self) {
-        self.shared.stopping.store(true, std::sync::atomic::Ordering::Release);
-        let mut table = self.shared.table();
-        let open: Vec<String> = table
-            .all()
-            .filter(|job| !job.state.is_final())
-            .map(|job| job.id.clone())
-            .collect();
-        for id in open {
-            // Listed under the same lock as open, so it can be cancelled.
-            let _ = table.cancel(&id, unix_s());
-        }
-        self.shared.changed.notify_all();
-    }
-
-    /// Waits until no job runs and the thread has ended, at most until `deadline`; says whether it has. Blocks.
-    #[must_use]
-    pub fn finish_stop(&self, deadline: Instant) -> bool {
-        let mut table = self.shared.table();
-        while table.all().any(|job| job.state == JobState::Running) {
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left == Duration::ZERO {
-                warn!("a job did not reach its checkpoint within the deadline");
-                return false;
+    while !*stop.borrow() {
+        let now_s = unix_s();
+        let until_s = now_s + shared.limits.lease.as_secs_f64();
+        match shared.store.take_up(&instance.id, now_s, until_s).await {
+            Ok(Some((row, lease))) => Work::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
+            Ok(None) => pause(&shared, &mut stop).await,
+            Err(error) => {
+                warn!(%error, "could not ask for jobs");
+                pause(&shared, &mut stop).await;
             }
-            table = self
-                .shared
-                .changed
-                .wait_timeout(table, left)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
         }
-        drop(table);
-        let runner = self.runner.lock().unwrap_or_else(PoisonError::into_inner).take();
-        if let Some(runner) = runner {
-            // A panic of the runner has already been printed; there is nothing left to stop.
-            let _ = runner.join();
-        }
-        true
     }
 }
 
-fn run(shared: &Shared) {
-    while let Some((id, spec, cancelled)) = next(shared) {
-        info!(job.id = %id, "job started");
-        let report = Report { shared, id: &id };
-        let result = shared.execute.execute(&spec, &report, &cancelled);
-        let (event, error) = match result {
-            Ok(()) => (Event::Succeed, None),
-            Err(Failure::Cancelled) => (Event::Cancel, None),
-            Err(Failure::Failed(reason)) => (Event::Fail, Some(reason)),
+async fn pause(shared: &Shared, stop: &mut watch::Receiver<bool>) {
+    tokio::select! {
+        () = shared.wake.notified() => {}
+        () = tokio::time::sleep(POLL_EVERY) => {}
+        () = told(stop) => {}
+    }
+}
+
+async fn told(stop: &mut watch::Receiver<bool>) {
+    // The sender lives as long as the jobs' handle does.
+    let _ = stop.wait_for(|stop| *stop).await;
+}
+
+/// One taking up of a job.
+struct Work<'a> {
+    shared: &'a Shared,
+    report: Report,
+    cancelled: Arc<AtomicBool>,
+    /// Whether the row says that someone asked it to stop.
+    asked: bool,
+    lost: bool,
+}
+
+/// Stops the work when the one who watches it goes, whatever the reason.
+impl Drop for Work<'_> {
+    fn drop(&mut self) {
+        self.cancelled.store(true, Ordering::Release);
+    }
+}
+
+impl<'a> Work<'a> {
+    fn new(shared: &'a Shared, row: &JobRow, lease: Lease) -> Self {
+        let standing: Standing = serde_json::from_str(&row.progress).unwrap_or_default();
+        Self {
+            shared,
+            report: Report {
+                notes: Arc::new(Mutex::new(Notes::new(standing))),
+                lease,
+            },
+            cancelled: Arc::new(AtomicBool::new(false)),
+            asked: row.cancelling,
+            lost: false,
+        }
+    }
+
+    async fn run(mut self, row: &JobRow, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
+        let id = self.report.id();
+        info!(job.id = %id, job.attempt = row.token, "job started");
+        self.report.line(match row.token {
+            1 => "started".to_owned(),
+            attempt => format!("taken up again, for the {attempt}. time"),
+        });
+        let result = match Job::of(row) {
+            Ok(_) if self.asked => Err(Failure::Cancelled),
+            Ok(job) => self.watch(job.spec, pool, stop).await,
+            Err(error) => Err(Failure::Failed(error.to_string())),
         };
-        counter!(names::JOBS_ENDED, "outcome" => outcome(event)).increment(1);
+        if result == Err(Failure::Cancelled) && !self.asked {
+            // Someone may have asked since the last renewal, and must not be forgotten.
+            self.renew().await;
+        }
+        if self.lost {
+            warn!(job.id = %id, "the job's lease was lost; another goes on with it");
+            return;
+        }
+        self.end(result).await;
+    }
+
+    /// Works on threads of its own and writes how far it is, until the work returns.
+    async fn watch(
+        &mut self,
+        spec: JobSpec,
+        pool: &Arc<ThreadPool>,
+        mut stop: watch::Receiver<bool>,
+    ) -> Result<Outcome, Failure> {
+        let (sender, mut result) = oneshot::channel();
+        let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
+        let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
+        let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
+            let result = pool.install(|| execute.execute(&spec, &report, &cancelled));
+            // Nobody waits for it if the runner is gone.
+            let _ = sender.send(result);
+        });
+        if let Err(error) = thread {
+            return Err(Failure::Failed(format!("could not start a thread: {error}")));
+        }
+        let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut is_told = false;
+        loop {
+            tokio::select! {
+                result = &mut result => {
+                    let panicked = || Failure::Failed("the work broke off; the server's log says why".to_owned());
+                    return result.unwrap_or_else(|_| Err(panicked()));
+                }
+                () = told(&mut stop), if !is_told => {
+                    is_told = true;
+                    self.cancelled.store(true, Ordering::Release);
+                }
+                _ = ticks.tick() => self.renew().await,
+            }
+        }
+    }
+
+    /// Renews the lease and writes what the work said since the last time.
+    async fn renew(&mut self) {
+        let account = self.account();
+        let (lines, losses) = (account.lines.clone(), account.losses.clone());
+        let until_s = unix_s() + self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease, until_s, account).await {
+            Ok(Some(cancelling)) => self.asked |= cancelling,
+            Ok(None) => self.lost = true,
+            Err(error) => {
+                warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
+                self.report.notes().put_back(lines, losses);
+            }
+        }
+        if self.asked || self.lost {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    fn account(&self) -> Account {
+        let mut notes = self.report.notes();
+        let (lines, losses) = notes.take();
+        Account {
+            // A standing is two structs of numbers and texts: it is always writable.
+            progress: serde_json::to_string(notes.standing()).unwrap_or_default(),
+            lines,
+            losses,
+            max_lines: self.shared.limits.log_lines as i64,
+        }
+    }
+
+    async fn end(&self, result: Result<Outcome, Failure>) {
+        let id = self.report.id();
+        let (event, error, outcome) = match result {
+            Ok(outcome) => (Event::Succeed, None, Some(outcome)),
+            Err(Failure::Cancelled) if self.asked => (Event::Cancel, None, None),
+            Err(Failure::Cancelled) => (Event::Leave, None, None),
+            Err(Failure::Failed(reason)) => (Event::Fail, Some(reason), None),
+        };
+        // A running job can do all of these.
+        let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
+        counter!(names::JOBS_ENDED, "outcome" => if state.is_final() { state.name() } else { "left" }).increment(1);
         match &error {
             None => info!(job.id = %id, job.outcome = ?event, "job ended"),
             Some(reason) => warn!(job.id = %id, reason, "job failed"),
         }
-        // A running job can succeed, fail and be cancelled: every event here is legal.
-        let _ = shared.table().end(&id, event, error, unix_s());
-        shared.changed.notify_all();
+        self.report.line(match &error {
+            None if state == JobState::Queued => "left, to be gone on with".to_owned(),
+            None => state.name().to_owned(),
+            Some(reason) => format!("failed: {reason}"),
+        });
+        let ending = Ending {
+            state: state.name(),
+            error,
+            outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
+            ended_s: state.is_final().then(unix_s),
+            published: outcome.and_then(|outcome| outcome.published),
+        };
+        self.write_end(&id, ending).await;
+        self.shared.ended.notify_one();
     }
-}
 
-fn outcome(event: Event) -> &'static str {
-    match event {
-        Event::Cancel => "cancelled",
-        Event::Fail => "failed",
-        Event::Succeed => "succeeded",
-        Event::Start | Event::Leave | Event::Resume => "left",
-    }
-}
-
-/// The next job, or `None` when stopping. Blocks.
-fn next(shared: &Shared) -> Option<(String, JobSpec, Arc<AtomicBool>)> {
-    let mut table = shared.table();
-    loop {
-        if shared.is_stopping() {
-            return None;
+    async fn write_end(&self, id: &str, ending: Ending) {
+        let account = self.account();
+        for attempt in 1..=END_ATTEMPTS {
+            let written = self
+                .shared
+                .store
+                .end(self.report.lease, ending.clone(), account.clone());
+            match written.await {
+                Ok(true) => return self.forget_oldest().await,
+                Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its end was written"),
+                Err(error) => warn!(job.id = %id, %error, attempt, "could not write how a job ended"),
+            }
+            tokio::time::sleep(POLL_EVERY).await;
         }
-        if let Some(next) = table.start_next(unix_s()) {
-            return Some(next);
-        }
-        table = shared.changed.wait(table).unwrap_or_else(PoisonError::into_inner);
     }
-}
 
-fn unix_s() -> f64 {
-    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since_1970.unwrap_or_default().as_secs_f64()
+    /// What ended jobs leave is deleted with the last memory of them.
+    async fn forget_oldest(&self) {
+        let store = &self.shared.store;
+        let forgotten = match store.forget_ended(self.shared.limits.ended as i64).await {
+            Ok(forgotten) => forgotten,
+            Err(error) => return warn!(%error, "could not forget old jobs"),
+        };
+        for id in forgotten.into_iter().map(id_of) {
+            for dir in ["runs", "reports"] {
+                if let Err(error) = store.objects().delete(&format!("{dir}/{id}")).await {
+                    warn!(job.id = %id, %error, "could not delete what a job left");
+                }
+            }
+        }
+    }
 }

@@ -1,11 +1,14 @@
 //! What a job is asked to do, checked when it is posted so that mistakes come to light at once.
 
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
 use crate::dataset::{CollectConfig, Standing};
+use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
@@ -14,7 +17,12 @@ use crate::types::Seed;
 /// Trials of one collection at most.
 pub const MAX_TRIALS: u64 = 1_000_000;
 
-/// What to do.
+/// Windows of each test set of an evaluation at most.
+pub const MAX_WINDOWS: usize = 100_000;
+/// Resamples of an evaluation at most.
+pub const MAX_RESAMPLES: usize = 10_000;
+
+/// What to do. The import of recordings will be a variant beside these.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum JobSpec {
@@ -22,10 +30,12 @@ pub enum JobSpec {
     Collect(CollectSpec),
     /// Train a model on a data set.
     Train(TrainSpec),
+    /// Measure a model on the held-out trials of a data set.
+    Evaluate(EvaluateSpec),
 }
 
-/// A collection: writes the data set `name`. A collection that was cancelled goes on where it was when the same is asked
-/// again.
+/// A collection: writes the data set `name`. A collection that was cancelled goes on where it was when it is resumed, or
+/// when the same is asked again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CollectSpec {
@@ -42,8 +52,8 @@ pub struct CollectSpec {
     pub seed: u64,
 }
 
-/// A training: writes the run `name` and publishes the model `name`. A training that was cancelled goes on from its
-/// checkpoint when the same is asked again.
+/// A training: publishes the next version of the model `name`. One that was cancelled goes on from its checkpoint when it
+/// is resumed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
@@ -60,23 +70,113 @@ pub struct TrainSpec {
     pub settings: serde_json::Map<String, serde_json::Value>,
 }
 
+/// An evaluation: leaves a report with figures, to be had from the job.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluateSpec {
+    /// The model's name.
+    pub model: String,
+    /// Its version; the active one where none is given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub version: Option<u32>,
+    /// Name of a data set in the data directory.
+    pub dataset: String,
+    /// A model without conditioning, of the same budget, for the table that tells whether the action matters.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub twin: Option<String>,
+    /// Windows of each test set at most, 1 to 100,000.
+    #[serde(default = "default_windows")]
+    #[schema(minimum = 1, maximum = 100_000)]
+    pub windows: usize,
+    /// Resamples of the trials for the intervals, 100 to 10,000.
+    #[serde(default = "default_resamples")]
+    #[schema(minimum = 100, maximum = 10_000)]
+    pub resamples: usize,
+    /// Seed of the resamples and the shuffled actions.
+    #[serde(default)]
+    pub seed: u64,
+}
+
+fn default_windows() -> usize {
+    EvaluateConfig::default().max_windows
+}
+
+fn default_resamples() -> usize {
+    EvaluateConfig::default().bootstrap_samples
+}
+
+/// What there is that jobs can start from.
+#[derive(Clone, Copy, Debug)]
+pub struct Ground<'a> {
+    /// The data directory.
+    pub data_dir: &'a Path,
+    /// The finished data sets.
+    pub datasets: &'a [String],
+    /// The versions of each model.
+    pub models: &'a BTreeMap<String, Vec<u32>>,
+}
+
 impl JobSpec {
-    /// The kind and name of what the job makes.
+    /// The kinds there are.
+    pub const KINDS: [&'static str; 3] = ["collect", "train", "evaluate"];
+
+    /// Its kind.
     #[must_use]
-    pub fn makes(&self) -> (&'static str, &str) {
+    pub fn kind(&self) -> &'static str {
         match self {
-            Self::Collect(spec) => ("data set", &spec.name),
-            Self::Train(spec) => ("model", &spec.name),
+            Self::Collect(_) => "collect",
+            Self::Train(_) => "train",
+            Self::Evaluate(_) => "evaluate",
         }
     }
 
-    /// Checks all that can be known before the work begins. `models` are the names of the loaded models.
-    /// Errors: `Invalid` and `NotFound`, which name the field; `Taken`.
-    pub fn check(&self, data_dir: &Path, models: &[String]) -> Result<(), JobError> {
+    /// Kind and name of what no other job may make at the same time. Versions and reports never meet.
+    #[must_use]
+    pub fn makes(&self) -> Option<(&'static str, &str)> {
         match self {
-            Self::Collect(spec) => spec.check(data_dir),
-            Self::Train(spec) => spec.check(data_dir, models),
+            Self::Collect(spec) => Some(("data set", &spec.name)),
+            Self::Train(_) | Self::Evaluate(_) => None,
         }
+    }
+
+    /// The data set that it makes or reads.
+    #[must_use]
+    pub fn dataset(&self) -> &str {
+        match self {
+            Self::Collect(spec) => &spec.name,
+            Self::Train(spec) => &spec.dataset,
+            Self::Evaluate(spec) => &spec.dataset,
+        }
+    }
+
+    /// Checks all that can be known before the work begins. Errors: `Invalid` and `NotFound`, which name the field; `Taken`.
+    pub fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
+        match self {
+            Self::Collect(spec) => spec.check(ground.data_dir),
+            Self::Train(spec) => spec.check(ground.datasets),
+            Self::Evaluate(spec) => spec.check(ground),
+        }
+    }
+}
+
+impl EvaluateSpec {
+    fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
+        check_dataset(&self.dataset, ground.datasets)?;
+        check_model("model", &self.model, ground.models)?;
+        if let Some(twin) = &self.twin {
+            check_model("twin", twin, ground.models)?;
+        }
+        let versions = ground.models.get(&self.model).map_or(&[][..], Vec::as_slice);
+        if let Some(version) = self.version.filter(|version| !versions.contains(version)) {
+            return Err(JobError::NotFound {
+                field: "version",
+                kind: "version",
+                name: version.to_string(),
+                known: versions.iter().map(u32::to_string).collect(),
+            });
+        }
+        check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
+        check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
     }
 }
 
@@ -123,27 +223,10 @@ impl CollectSpec {
 }
 
 impl TrainSpec {
-    fn check(&self, data_dir: &Path, models: &[String]) -> Result<(), JobError> {
+    fn check(&self, datasets: &[String]) -> Result<(), JobError> {
         check_name("name", &self.name)?;
-        check_name("dataset", &self.dataset)?;
         self.config()?;
-        let datasets = data_dir.join("datasets");
-        if !is_dataset(&datasets.join(&self.dataset)) {
-            return Err(JobError::NotFound {
-                field: "dataset",
-                kind: "data set",
-                name: self.dataset.clone(),
-                known: datasets_in(&datasets),
-            });
-        }
-        if models.contains(&self.name) || data_dir.join("models").join(&self.name).exists() {
-            return Err(JobError::Taken {
-                kind: "model",
-                name: self.name.clone(),
-                why: "exists",
-            });
-        }
-        Ok(())
+        check_dataset(&self.dataset, datasets)
     }
 
     /// The preset with the settings laid over it. Errors: `Invalid`, which names the presets or the setting.
@@ -186,19 +269,46 @@ fn check_name(field: &'static str, name: &str) -> Result<(), JobError> {
     })
 }
 
-/// Whether a finished data set is there.
-fn is_dataset(dir: &Path) -> bool {
-    dir.join("meta").join("info.json").is_file()
+fn check_dataset(name: &str, known: &[String]) -> Result<(), JobError> {
+    check_name("dataset", name)?;
+    check_known("dataset", "data set", name, known.iter())
 }
 
-fn datasets_in(dir: &Path) -> Vec<String> {
-    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
-    let mut names: Vec<String> = entries
-        .filter(|entry| is_dataset(&entry.path()))
-        .filter_map(|entry| entry.file_name().into_string().ok())
-        .collect();
-    names.sort();
-    names
+fn check_model(field: &'static str, name: &str, known: &BTreeMap<String, Vec<u32>>) -> Result<(), JobError> {
+    check_name(field, name)?;
+    check_known(field, "model", name, known.keys())
+}
+
+fn check_known<'a>(
+    field: &'static str,
+    kind: &'static str,
+    name: &str,
+    mut known: impl Iterator<Item = &'a String> + Clone,
+) -> Result<(), JobError> {
+    let all = known.clone();
+    if known.any(|known| known == name) {
+        return Ok(());
+    }
+    Err(JobError::NotFound {
+        field,
+        kind,
+        name: name.to_owned(),
+        known: all.cloned().collect(),
+    })
+}
+
+fn check_range(field: &'static str, value: usize, range: RangeInclusive<usize>) -> Result<(), JobError> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    Err(JobError::Invalid {
+        field,
+        reason: format!(
+            "{value} is out of range; it must be {} to {}",
+            range.start(),
+            range.end()
+        ),
+    })
 }
 
 #[cfg(test)]
@@ -228,7 +338,7 @@ mod tests {
             dataset: "d".to_owned(),
             settings: serde_json::Map::new(),
         };
-        let error = spec.check(Path::new("nowhere"), &[]).unwrap_err().to_string();
+        let error = spec.check(&[]).unwrap_err().to_string();
         assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
     }
 }

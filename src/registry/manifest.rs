@@ -71,7 +71,7 @@ impl ProgramStamp {
     /// This program.
     #[must_use]
     pub fn current() -> Self {
-        let commit = env!("FOREFRAME_GIT_COMMIT");
+        let commit = env!("GIT_COMMIT_AT_BUILD");
         Self {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             git_commit: (!commit.is_empty()).then(|| commit.to_owned()),

@@ -7,15 +7,25 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::ServerError;
-use crate::jobs::TableLimits;
+use crate::jobs::JobLimits;
 use crate::serving::PredictorConfig;
+use crate::store::StoreConfig;
 
 /// All settings of the server, with their defaults.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ServerConfig {
-    /// Where jobs write: `datasets`, `runs` and `models` below it.
+    /// Where jobs write: `datasets`, `runs`, `reports` and `models` below it.
     pub data_dir: PathBuf,
+    /// The directory of the models that are served without having been published by a job.
+    pub models_dir: PathBuf,
+    /// `sqlite:FILE` or `postgres://…`; a file in the data directory where it is not given.
+    pub database_url: Option<String>,
+    /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share; the data directory where it is not
+    /// given.
+    pub objects_url: Option<String>,
+    /// Whether this process only takes jobs, and leaves them to workers.
+    pub no_jobs: bool,
     /// Bytes of a request's body, and of a message on a socket, at most.
     pub max_body_bytes: usize,
     /// Images in one request at most.
@@ -44,6 +54,12 @@ pub struct ServerConfig {
     pub max_queued_jobs: usize,
     /// Ended jobs that are remembered.
     pub max_ended_jobs: usize,
+    /// Lines of a job's log that are kept.
+    pub max_job_log_lines: usize,
+    /// Threads that the work of jobs may use.
+    pub job_threads: usize,
+    /// How long a process that works on a job may be silent before others take it, in milliseconds.
+    pub job_lease_ms: u64,
     /// How long a prediction may take, queue and all, in milliseconds.
     pub prediction_deadline_ms: u64,
     /// How long a request may take to arrive and be answered, in milliseconds.
@@ -80,6 +96,10 @@ impl Default for ServerConfig {
     fn default() -> Self {
         Self {
             data_dir: PathBuf::from("data"),
+            models_dir: PathBuf::from("models"),
+            database_url: None,
+            objects_url: None,
+            no_jobs: false,
             max_body_bytes: 8 << 20,
             max_frames: 64,
             max_queued_predictions: 256,
@@ -94,6 +114,9 @@ impl Default for ServerConfig {
             max_rollout_bytes: 64 << 20,
             max_queued_jobs: 16,
             max_ended_jobs: 100,
+            max_job_log_lines: 1000,
+            job_threads: spare_cores(),
+            job_lease_ms: 30_000,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
             environment_idle_ms: 600_000,
@@ -109,6 +132,11 @@ impl Default for ServerConfig {
             cors_origins: Vec::new(),
         }
     }
+}
+
+/// One core less than there are, which is left to predictions, but one at least.
+fn spare_cores() -> usize {
+    std::thread::available_parallelism().map_or(1, |cores| (cores.get() - 1).max(1))
 }
 
 /// A day: no deadline is longer.
@@ -162,6 +190,9 @@ impl ServerConfig {
             ("max_rollout_bytes", self.max_rollout_bytes as u64, 1024..=1 << 32),
             ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
+            ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
+            ("job_threads", self.job_threads as u64, 1..=1024),
+            ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
             ("request_deadline_ms", self.request_deadline_ms, deadline.clone()),
@@ -185,10 +216,25 @@ impl ServerConfig {
         }
     }
 
-    pub(super) fn jobs(&self) -> TableLimits {
-        TableLimits {
+    /// The bounds of jobs.
+    #[must_use]
+    pub fn jobs(&self) -> JobLimits {
+        JobLimits {
             queued: self.max_queued_jobs,
             ended: self.max_ended_jobs,
+            log_lines: self.max_job_log_lines,
+            threads: self.job_threads,
+            lease: Duration::from_millis(self.job_lease_ms),
+        }
+    }
+
+    /// Where state is kept.
+    #[must_use]
+    pub fn store(&self) -> StoreConfig {
+        StoreConfig {
+            data_dir: self.data_dir.clone(),
+            database: self.database_url.clone(),
+            objects: self.objects_url.clone(),
         }
     }
 }
@@ -229,5 +275,21 @@ mod tests {
             let error = config.validate().unwrap_err().to_string();
             assert!(error.starts_with(&format!("{name} is 0; it must be")), "{error}");
         }
+    }
+
+    #[test]
+    fn jobs_without_threads_or_with_a_lease_that_runs_out_at_once_are_refused() {
+        let threadless = ServerConfig {
+            job_threads: 0,
+            ..ServerConfig::default()
+        };
+        let error = threadless.validate().unwrap_err().to_string();
+        assert_eq!(error, "job_threads is 0; it must be 1 to 1024");
+        let hasty = ServerConfig {
+            job_lease_ms: 10,
+            ..ServerConfig::default()
+        };
+        let error = hasty.validate().unwrap_err().to_string();
+        assert_eq!(error, "job_lease_ms is 10; it must be 1000 to 86400000");
     }
 }

@@ -13,9 +13,11 @@ use super::environments::EnvironmentError;
 use super::images::ImageError;
 use super::predict::PredictError;
 use super::sessions::table::TableError;
+use crate::dataset::DatasetError;
 use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
+use crate::versions::VersionError;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -230,11 +232,37 @@ impl From<JobError> for ApiError {
         match error {
             JobError::Unknown { .. } => Self::NotFound(error.to_string()),
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
-            JobError::IllegalTransition { .. } | JobError::Taken { .. } | JobError::Occupied { .. } => {
-                Self::Conflict(error.to_string())
-            }
+            JobError::IllegalTransition { .. }
+            | JobError::Taken { .. }
+            | JobError::Occupied { .. }
+            | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            JobError::Thread(_) => Self::Internal(with_cause(&error)),
+            JobError::Record { .. } | JobError::Instance(_) | JobError::Threads(_) | JobError::Store(_) => {
+                Self::Internal(with_cause(&error))
+            }
+        }
+    }
+}
+
+impl From<VersionError> for ApiError {
+    fn from(error: VersionError) -> Self {
+        match error {
+            VersionError::Unknown { .. } => Self::NotFound(error.to_string()),
+            VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
+            VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
+            VersionError::Serving(serving) => serving.into(),
+            VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
+                Self::Internal(with_cause(&error))
+            }
+        }
+    }
+}
+
+impl From<DatasetError> for ApiError {
+    fn from(error: DatasetError) -> Self {
+        match error {
+            DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
+            _ => Self::Internal(with_cause(&error)),
         }
     }
 }

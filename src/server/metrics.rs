@@ -7,6 +7,7 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
 use metrics::gauge;
+use tracing::warn;
 
 use super::App;
 use crate::jobs::JobState;
@@ -24,16 +25,18 @@ const FOLD_INTERVAL: Duration = Duration::from_secs(5);
 pub(super) async fn metrics(State(app): State<App>) -> impl IntoResponse {
     gauge!(names::STREAMS).set(app.streams().count() as f64);
     gauge!(names::MODELS_LOADED).set(app.predictor().models().len() as f64);
-    let jobs = app.jobs().all();
-    for (state, name) in [
-        (JobState::Queued, "queued"),
-        (JobState::Running, "running"),
-        (JobState::Succeeded, "succeeded"),
-        (JobState::Failed, "failed"),
-        (JobState::Cancelled, "cancelled"),
-    ] {
-        let count = jobs.iter().filter(|job| job.state == state).count();
-        gauge!(names::JOBS, "state" => name).set(count as f64);
+    match app.store().jobs_by_state().await {
+        Ok(counts) => {
+            for state in JobState::ALL.map(JobState::name) {
+                let count = counts
+                    .iter()
+                    .find(|(name, _)| name == state)
+                    .map_or(0, |(_, count)| *count);
+                gauge!(names::JOBS, "state" => state).set(count as f64);
+            }
+        }
+        // The rest is worth reading all the same.
+        Err(error) => warn!(%error, "could not count the jobs"),
     }
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], telemetry::render())
 }

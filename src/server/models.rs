@@ -1,6 +1,7 @@
 //! What models there are.
 
 use axum::extract::State;
+use axum::http::StatusCode;
 use serde::Serialize;
 
 use super::App;
@@ -59,11 +60,16 @@ pub(super) struct Lineage {
     git_commit: Option<String>,
 }
 
-impl From<&Manifest> for ModelDescription {
-    fn from(manifest: &Manifest) -> Self {
+impl ModelDescription {
+    /// Of the version that answers, among all there are.
+    fn new(manifest: &Manifest, mut versions: Vec<u32>) -> Self {
+        // One that was handed over when the server started may lie in neither directory.
+        if let Err(place) = versions.binary_search(&manifest.version) {
+            versions.insert(place, manifest.version);
+        }
         Self {
             name: manifest.name.clone(),
-            versions: vec![manifest.version],
+            versions,
             active_version: manifest.version,
             spec: manifest.spec.clone(),
             metrics: manifest.metrics.clone(),
@@ -85,14 +91,16 @@ impl From<&Manifest> for ModelDescription {
 
 /// Lists the loaded models.
 #[utoipa::path(get, path = "/v1/models", tag = "models", responses((status = 200, body = ModelList)))]
-pub(super) async fn list(State(app): State<App>) -> axum::Json<ModelList> {
+pub(super) async fn list(State(app): State<App>) -> Result<axum::Json<ModelList>, ApiError> {
+    let mut versions = app.versions().all().await?;
     let manifests = app.predictor().models();
-    axum::Json(ModelList {
-        models: manifests
-            .iter()
-            .map(|manifest| ModelDescription::from(&**manifest))
-            .collect(),
-    })
+    let models = manifests.iter().map(|manifest| {
+        let versions = versions.remove(&manifest.name).unwrap_or_default();
+        ModelDescription::new(manifest, versions)
+    });
+    Ok(axum::Json(ModelList {
+        models: models.collect(),
+    }))
 }
 
 /// Describes one model.
@@ -108,5 +116,49 @@ pub(super) async fn get(
     State(app): State<App>,
     Path(model): Path<String>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
-    Ok(axum::Json(ModelDescription::from(&*app.predictor().model(&model)?)))
+    let manifest = app.predictor().model(&model)?;
+    let versions = app.versions().of(&model).await?;
+    Ok(axum::Json(ModelDescription::new(&manifest, versions)))
+}
+
+/// Has a version answer from now on, on every server of the store and after a restart. Streams that run keep theirs.
+#[utoipa::path(
+    post, path = "/v1/models/{model}/versions/{version}/activate", tag = "models",
+    params(
+        ("model" = String, Path, description = "The model's name"),
+        ("version" = u32, Path, description = "The version"),
+    ),
+    responses(
+        (status = 200, description = "It answers", body = ModelDescription),
+        (status = 404, description = "No such version; the answer names those there are", body = Problem),
+        (status = 422, description = "Its files are damaged or do not fit; the version before goes on", body = Problem),
+    )
+)]
+pub(super) async fn activate(
+    State(app): State<App>,
+    Path((model, version)): Path<(String, u32)>,
+) -> Result<axum::Json<ModelDescription>, ApiError> {
+    app.versions().activate(app.predictor(), &model, version).await?;
+    get(State(app), Path(model)).await
+}
+
+/// Deletes a version that a job published.
+#[utoipa::path(
+    delete, path = "/v1/models/{model}/versions/{version}", tag = "models",
+    params(
+        ("model" = String, Path, description = "The model's name"),
+        ("version" = u32, Path, description = "The version"),
+    ),
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 404, description = "No such version; the answer names those there are", body = Problem),
+        (status = 409, description = "It is active, or was shipped", body = Problem),
+    )
+)]
+pub(super) async fn delete(
+    State(app): State<App>,
+    Path((model, version)): Path<(String, u32)>,
+) -> Result<StatusCode, ApiError> {
+    app.versions().delete(app.predictor(), &model, version).await?;
+    Ok(StatusCode::NO_CONTENT)
 }

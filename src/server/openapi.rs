@@ -7,7 +7,8 @@ use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::{Modify, OpenApi};
 
 use super::{
-    App, dashboard, environments, error, health, jobs, metrics, models, predict, preview, rollouts, sessions, stream,
+    App, dashboard, datasets, environments, error, events, health, jobs, metrics, models, predict, preview, rollouts,
+    sessions, stream,
 };
 
 #[derive(OpenApi)]
@@ -24,6 +25,8 @@ use super::{
         metrics::metrics,
         models::list,
         models::get,
+        models::activate,
+        models::delete,
         predict::predict,
         preview::preview,
         environments::create,
@@ -43,6 +46,16 @@ use super::{
         jobs::list,
         jobs::get,
         jobs::cancel,
+        jobs::resume,
+        jobs::logs,
+        jobs::metrics,
+        jobs::file,
+        events::events,
+        datasets::list,
+        datasets::get,
+        datasets::delete,
+        datasets::sheet,
+        datasets::animation,
         openapi_json,
         dashboard::page,
     ),
@@ -53,7 +66,8 @@ use super::{
         (name = "models", description = "Models and their predictions"),
         (name = "environments", description = "The simulator, with Gymnasium's reset and step"),
         (name = "sessions", description = "Streams of frames that are remembered"),
-        (name = "jobs", description = "Collection and training in the background"),
+        (name = "jobs", description = "Collection, training and evaluation in the background"),
+        (name = "datasets", description = "What was collected"),
         (name = "health", description = "Whether the server lives and is ready"),
         (name = "about", description = "This contract and a page for people"),
     )

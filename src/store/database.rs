@@ -113,8 +113,12 @@ impl Database {
     async fn open_sqlite(options: SqliteConnectOptions) -> Result<Self, StoreError> {
         // SQLite's migrations lock nothing, and two processes may start at once.
         let lock_path = options.get_filename().with_extension("lock");
-        let lock = std::fs::File::create(&lock_path).map_err(StoreError::io("make", &lock_path))?;
-        lock.lock().map_err(StoreError::io("lock", &lock_path))?;
+        let failed = StoreError::io("lock", &lock_path);
+        let locked = tokio::task::spawn_blocking(move || {
+            let lock = std::fs::File::create(&lock_path)?;
+            lock.lock().map(|()| lock)
+        });
+        let _lock = locked.await.unwrap_or_else(|error| Err(error.into())).map_err(failed)?;
         let options = options
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
@@ -203,10 +207,11 @@ impl Tx {
     }
 
     pub(super) async fn commit(self) -> Result<(), StoreError> {
-        Ok(match self {
-            Self::Sqlite(tx) => tx.commit().await?,
-            Self::Postgres(tx) => tx.commit().await?,
-        })
+        let committed = match self {
+            Self::Sqlite(tx) => tx.commit().await,
+            Self::Postgres(tx) => tx.commit().await,
+        };
+        committed.map_err(StoreError::Query)
     }
 }
 

@@ -134,7 +134,7 @@ fn directory(dir: &Path) -> Result<Arc<dyn ObjectStore>, StoreError> {
         key: dir.display().to_string(),
         source,
     })?;
-    Ok(Arc::new(store.with_fsync(true)))
+    Ok(Arc::new(store.with_fsync(true).with_automatic_cleanup(true)))
 }
 
 /// Credentials, region and endpoint come from the environment, as for every S3 client.

@@ -33,6 +33,17 @@ pub enum Event {
         /// Training windows there are.
         windows: usize,
     },
+    /// A validation of an earlier call, as the checkpoint recalls it; told before `Started` where a run goes on.
+    Recalled {
+        /// In this stage.
+        stage: Stage,
+        /// After so many updates.
+        step: usize,
+        /// The loss of that update's batch.
+        train_loss: f64,
+        /// The mean squared error on the validation windows.
+        validation_loss: f64,
+    },
     /// An update was made.
     Step {
         /// In this stage.

@@ -21,6 +21,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
+    ("versions", &["types", "files", "registry", "serving", "store"]),
     (
         "jobs",
         &[
@@ -34,7 +35,10 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "dataset",
             "registry",
             "training",
+            "evaluation",
             "serving",
+            "store",
+            "versions",
         ],
     ),
     (
@@ -51,6 +55,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "evaluation",
             "serving",
             "store",
+            "versions",
             "jobs",
         ],
     ),
@@ -65,7 +70,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("figment", &["config"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
     ("image::", &["frame"]),
-    ("tokio", &["server", "jobs", "store", "serving", "cli"]),
+    ("tokio", &["server", "jobs", "versions", "store", "serving", "cli"]),
     ("sqlx", &["store"]),
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),

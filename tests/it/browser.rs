@@ -8,14 +8,13 @@ use std::time::Instant;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::server::{App, ServerConfig};
-use foreframe::serving;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
-use crate::service::{PATIENCE, post, run, with_data};
+use crate::service::{PATIENCE, post, run};
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -139,8 +138,10 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
         return;
     };
     let dir = tempfile::tempdir().unwrap();
-    let models = serving::load_models(&[Path::new("models")]).unwrap();
-    let app = App::start(with_data(dir.path(), ServerConfig::default()), models).unwrap();
+    let app = App::open(ServerConfig {
+        data_dir: dir.path().to_owned(),
+        ..ServerConfig::default()
+    }).await.unwrap();
     let server = run(app.clone()).await;
     let job = json!({"kind": "collect", "name": "seen", "scenario": "crowded", "trials": 3, "seed": 1});
     post(&app, "/v1/jobs", &job).await;

@@ -81,11 +81,11 @@ async fn the_server_is_ready_once_its_models_are_warm() {
     assert_eq!(moving["spec"]["conditioning"], "state-action");
     assert_eq!(moving["spec"]["actions"][1]["unit"], "rad/s");
     let page = get(&app, "/").await;
-    assert!(
-        String::from_utf8(page.body)
-            .unwrap()
-            .contains("/v1/models/{model}/predict")
-    );
+    let page = String::from_utf8(page.body).unwrap();
+    for file in ["/dashboard.js", "/dashboard.css"] {
+        assert!(page.contains(file));
+        assert_eq!(get(&app, file).await.status, 200);
+    }
 }
 
 #[test]

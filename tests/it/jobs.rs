@@ -1,17 +1,19 @@
 //! Jobs over HTTP: with work that the test holds in its hand, and with the real collection and training.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use foreframe::jobs::{Execute, Failure, JobError, JobSpec, Jobs, Report, TableLimits};
+use axum::body::Body;
+use axum::http::Request;
+use foreframe::jobs::{Execute, Failure, JobError, JobLimits, JobSpec, Jobs, Outcome, Report};
 use foreframe::nn::Conditioning;
 use foreframe::server::{App, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
 use serde_json::{Value, json};
 
-use crate::service::{app, context, get, model, post, run, spec, until, with_data};
+use crate::service::{app, get, model, post, run, send, spec, store, until, with_data};
 
 const JOBS: &str = "/v1/jobs";
 
@@ -26,12 +28,13 @@ impl Execute for Puppet {
         Ok(())
     }
 
-    fn execute(&self, _: &JobSpec, report: &Report<'_>, cancelled: &AtomicBool) -> Result<(), Failure> {
+    fn execute(&self, _: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
         report.progress(3, 10, "pretending");
+        report.line(format!("attempt {}", report.lease().token));
         let orders = self.orders.lock().unwrap();
         loop {
             if let Ok(order) = orders.recv_timeout(Duration::from_millis(1)) {
-                return order;
+                return order.map(|()| Outcome::default());
             }
             if self.heeds_cancel && cancelled.load(Ordering::Acquire) {
                 return Err(Failure::Cancelled);
@@ -46,7 +49,13 @@ fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<
         orders: Mutex::new(orders),
         heeds_cancel,
     };
-    let jobs = Jobs::start(TableLimits { queued: 2, ended: 10 }, Box::new(puppet)).unwrap();
+    let limits = JobLimits {
+        queued: 2,
+        ended: 10,
+        ..ServerConfig::default().jobs()
+    };
+    let store = store(dir);
+    let jobs = Jobs::start(store.clone(), limits, Arc::new(puppet), true).unwrap();
     let predictor = Predictor::start(
         vec![model(dir, "plain", spec(Conditioning::None))],
         PredictorConfig::default(),
@@ -55,7 +64,7 @@ fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<
         shutdown_deadline_ms: 300,
         ..with_data(dir, ServerConfig::default())
     };
-    (App::with_parts(config, predictor.unwrap(), jobs), order)
+    (App::with_parts(config, predictor.unwrap(), jobs, store), order)
 }
 
 fn collect(name: &str) -> Value {
@@ -139,7 +148,7 @@ async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
 }
 
 #[tokio::test]
-async fn stopping_cancels_jobs_and_does_not_wait_for_one_that_will_not_end() {
+async fn stopping_leaves_jobs_for_the_next_start_and_does_not_wait_for_one_that_will_not_end() {
     for heeds_cancel in [true, false] {
         let dir = tempfile::tempdir().unwrap();
         let (app, order) = puppet_app(dir.path(), heeds_cancel);
@@ -150,12 +159,150 @@ async fn stopping_cancels_jobs_and_does_not_wait_for_one_that_will_not_end() {
         let started = Instant::now();
         server.stop().await;
         assert!(started.elapsed() < Duration::from_secs(10));
-        let expected = if heeds_cancel { "cancelled" } else { "running" };
+        let expected = if heeds_cancel { "queued" } else { "running" };
         assert_eq!(get(&app, "/v1/jobs/job-1").await.json()["state"], expected);
-        assert_eq!(get(&app, "/v1/jobs/job-2").await.json()["state"], "cancelled");
+        assert_eq!(get(&app, "/v1/jobs/job-2").await.json()["state"], "queued");
         assert!(post(&app, JOBS, &collect("c")).await.detail(503).contains("stopping"));
         order.send(Ok(())).ok();
+        if heeds_cancel {
+            let (next, order) = puppet_app(dir.path(), true);
+            order.send(Ok(())).unwrap();
+            order.send(Ok(())).unwrap();
+            assert_eq!(state_becomes(&next, "job-1", "succeeded").await["attempts"], 2);
+            state_becomes(&next, "job-2", "succeeded").await;
+        }
     }
+}
+
+#[tokio::test]
+async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, order) = puppet_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
+    state_becomes(&app, "job-1", "running").await;
+    let early = post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.detail(409);
+    assert_eq!(early, "job job-1 has started; it cannot be resumed any more");
+    post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
+    state_becomes(&app, "job-1", "cancelled").await;
+    assert_eq!(
+        post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"],
+        "queued"
+    );
+    order.send(Err(Failure::Failed("no luck".to_owned()))).unwrap();
+    let path = "/v1/jobs/job-1";
+    let failed = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
+    assert_eq!((&failed["error"], &failed["attempts"]), (&json!("no luck"), &json!(2)));
+    post(&app, "/v1/jobs/job-1/resume", &Value::Null).await;
+    order.send(Ok(())).unwrap();
+    let done = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "succeeded")).await;
+    assert_eq!((&done["error"], &done["attempts"]), (&Value::Null, &json!(3)));
+    assert_eq!(post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.status, 409);
+    let lines = get(&app, "/v1/jobs/job-1/logs?after=1&limit=1").await.json();
+    assert_eq!(
+        (&lines["lines"][0]["seq"], &lines["lines"][0]["line"]),
+        (&json!(2), &json!("attempt 1"))
+    );
+    assert_eq!(lines["lines"].as_array().unwrap().len(), 1);
+}
+
+#[tokio::test]
+async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, order) = puppet_app(dir.path(), true);
+    let ask = async |body: Value, key: &str| {
+        let request = Request::post(JOBS)
+            .header("content-type", "application/json")
+            .header("idempotency-key", key)
+            .body(Body::from(body.to_string()))
+            .unwrap();
+        send(&app, request).await
+    };
+    assert_eq!(ask(collect("a"), "k-1").await.json()["id"], "job-1");
+    order.send(Ok(())).unwrap();
+    state_becomes(&app, "job-1", "succeeded").await;
+    assert_eq!(ask(collect("a"), "k-1").await.json()["state"], "succeeded");
+    let other = ask(collect("b"), "k-1").await.detail(422);
+    assert!(
+        other.starts_with("Idempotency-Key: it was used for another job, job-1"),
+        "{other}"
+    );
+    let long = ask(collect("b"), &"k".repeat(129)).await.detail(422);
+    assert_eq!(long, "Idempotency-Key: a key is 1 to 128 visible ASCII characters");
+    assert_eq!(ask(collect("b"), "k-2").await.json()["id"], "job-2");
+}
+
+#[tokio::test]
+async fn jobs_are_listed_by_kind_and_state_page_by_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, _order) = puppet_app(dir.path(), true);
+    for name in ["a", "b", "c"] {
+        post(&app, JOBS, &collect(name)).await;
+        if name == "a" {
+            state_becomes(&app, "job-1", "running").await;
+        }
+    }
+    let ids = async |query: &str| {
+        let answer = get(&app, &format!("{JOBS}?{query}")).await.json();
+        let ids = answer["jobs"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|job| job["id"].as_str().unwrap().to_owned());
+        (ids.collect::<Vec<_>>(), answer["next"].clone())
+    };
+    assert_eq!(
+        ids("limit=2").await,
+        (vec!["job-3".to_owned(), "job-2".to_owned()], json!("job-2"))
+    );
+    assert_eq!(
+        ids("limit=2&before=job-2").await,
+        (vec!["job-1".to_owned()], Value::Null)
+    );
+    assert_eq!(ids("state=running").await.0, ["job-1"]);
+    assert_eq!(ids("kind=train").await.0, [""; 0]);
+    for (query, part) in [
+        (
+            "kind=dream",
+            "\"dream\" is no kind; there are: collect, train, evaluate",
+        ),
+        ("state=asleep", "unknown variant `asleep`"),
+        ("before=7", "\"7\" is no job's id"),
+        ("limit=0", "limit: 0 is out of range; it must be 1 to 1000"),
+        ("colour=red", "unknown field `colour`"),
+    ] {
+        let detail = get(&app, &format!("{JOBS}?{query}")).await.detail(422);
+        assert!(detail.contains(part), "{detail}");
+    }
+}
+
+#[tokio::test]
+async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, order) = puppet_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
+    order.send(Ok(())).unwrap();
+    let seen = get(&app, "/v1/jobs/job-1/events").await;
+    assert_eq!(seen.headers["content-type"], "text/event-stream");
+    let text = String::from_utf8(seen.body).unwrap();
+    assert!(text.contains("event: log\ndata: {\"seq\":1,"), "{text}");
+    assert!(text.contains("\"line\":\"attempt 1\""), "{text}");
+    assert!(
+        text.trim_end()
+            .rsplit("event: ")
+            .next()
+            .unwrap()
+            .contains("\"state\":\"succeeded\""),
+        "{text}"
+    );
+    assert_eq!(get(&app, "/v1/jobs/job-9/events").await.status, 404);
+
+    post(&app, JOBS, &collect("b")).await;
+    let watched = app.clone();
+    let watcher = tokio::spawn(async move { get(&watched, "/v1/jobs/job-2/events").await });
+    state_becomes(&app, "job-2", "running").await;
+    run(app.clone()).await.stop().await;
+    let text = String::from_utf8(watcher.await.unwrap().body).unwrap();
+    assert!(!text.contains("succeeded"), "{text}");
 }
 
 #[tokio::test]
@@ -198,58 +345,11 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
         (
             json!({"kind": "dream"}),
             422,
-            "unknown variant `dream`, expected `collect` or `train`",
+            "unknown variant `dream`, expected one of `collect`, `train`, `evaluate`",
         ),
     ] {
         let answer = post(&app, JOBS, &body).await.detail(status);
         assert!(answer.contains(detail), "{answer}");
     }
     assert_eq!(get(&app, JOBS).await.json()["jobs"], json!([]));
-}
-
-#[tokio::test]
-async fn a_collected_data_set_trains_a_model_that_serves_at_once() {
-    let dir = tempfile::tempdir().unwrap();
-    let app = app(dir.path(), ServerConfig::default());
-    let mut seen = collect("seen");
-    seen["trials"] = json!(40);
-    let id = post(&app, JOBS, &seen).await.json()["id"].as_str().unwrap().to_owned();
-    let done = state_becomes(&app, &id, "succeeded").await;
-    assert_eq!(
-        (&done["progress"]["done"], &done["progress"]["total"]),
-        (&json!(40), &json!(40))
-    );
-    let exists = post(&app, JOBS, &seen).await.detail(409);
-    assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
-
-    let settings = json!({
-        "model": {"features": 8, "hidden": 8},
-        "data": {"windows": 8, "validation_windows": 4},
-        "pretrain": {"steps": 3, "batch_size": 4},
-        "fit": {"steps": 3, "batch_size": 4},
-        "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
-    });
-    let train = json!({"kind": "train", "name": "fresh", "preset": "paper", "dataset": "seen", "settings": settings});
-    let taken = post(&app, JOBS, &train).await;
-    assert_eq!(taken.status, 202, "{}", taken.json());
-    let done = state_becomes(&app, taken.json()["id"].as_str().unwrap(), "succeeded").await;
-    assert!(
-        done["losses"]["train"].is_number() && done["losses"]["validation"].is_number(),
-        "{done}"
-    );
-
-    let description = get(&app, "/v1/models/fresh").await.json();
-    assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-0");
-    let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
-        .await
-        .detail(422);
-    assert!(
-        misfit.contains("frames[0] is 16×12 px; model \"fresh\" takes 64×64"),
-        "{misfit}"
-    );
-    let preview = get(&app, "/v1/models/fresh/preview.png").await;
-    assert_eq!(preview.status, 200);
-    let again = post(&app, JOBS, &train).await.detail(409);
-    assert_eq!(again, "name: model \"fresh\" exists; choose another name");
-    assert!(dir.path().join("models/fresh/manifest.json").is_file());
 }

@@ -5,7 +5,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::{Frame, codec};
 use foreframe::nn::Conditioning;
-use foreframe::server::{App, ServerConfig};
+use foreframe::server::ServerConfig;
 use foreframe::serving::{self, PredictionInput};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -13,7 +13,7 @@ use tokio::net::TcpStream;
 
 use crate::service::{
     CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, slow_spec, spec,
-    with_data,
+    start, with_data,
 };
 
 const PLAIN: &str = "/v1/models/plain/predict";
@@ -204,7 +204,7 @@ async fn a_full_queue_is_answered_with_when_to_try_again() {
         max_batch: 1,
         ..with_data(dir.path(), ServerConfig::default())
     };
-    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let app = start(config, vec![model(dir.path(), "slow", slow_spec())]);
     let body = json!({"frames": context()});
     let asked = (0..40).map(|_| post(&app, "/v1/models/slow/predict", &body));
     let answers = futures_util::future::join_all(asked).await;
@@ -223,7 +223,7 @@ async fn a_prediction_past_its_deadline_is_refused() {
         prediction_deadline_ms: 1,
         ..with_data(dir.path(), ServerConfig::default())
     };
-    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let app = start(config, vec![model(dir.path(), "slow", slow_spec())]);
     let body = json!({"frames": context()});
     let asked = (0..20).map(|_| post(&app, "/v1/models/slow/predict", &body));
     let answers = futures_util::future::join_all(asked).await;
@@ -283,7 +283,7 @@ async fn half_a_body_is_not_waited_for_for_ever() {
 async fn an_accepted_request_is_answered_while_the_server_stops() {
     let dir = tempfile::tempdir().unwrap();
     let config = with_data(dir.path(), ServerConfig::default());
-    let app = App::start(config, vec![model(dir.path(), "slow", slow_spec())]).unwrap();
+    let app = start(config, vec![model(dir.path(), "slow", slow_spec())]);
     let server = run(app).await;
     let body = json!({"frames": context()}).to_string();
     let length = body.len();

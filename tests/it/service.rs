@@ -1,6 +1,7 @@
 //! What the tests of the service share: small models with random weights, requests, and a running server.
 
 use std::path::Path;
+use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -11,8 +12,10 @@ use foreframe::frame::{Frame, codec};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe::registry::{DatasetStamp, LoadedModel};
 use foreframe::server::{self, App, ServerConfig};
+use foreframe::store::{Store, StoreConfig};
 use foreframe::types::Seed;
 use serde_json::Value;
+use tokio::runtime::Runtime;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tower::ServiceExt as _;
@@ -74,12 +77,30 @@ pub(crate) fn app(dir: &Path, config: ServerConfig) -> App {
         model(&dir.join("models"), "plain", spec(Conditioning::None)),
         model(&dir.join("models"), "moving", spec(Conditioning::StateAction)),
     ];
-    App::start(with_data(dir, config), models).unwrap()
+    start(with_data(dir, config), models)
+}
+
+/// With a store in the data directory.
+pub(crate) fn start(config: ServerConfig, models: Vec<LoadedModel>) -> App {
+    let store = store(&config.data_dir);
+    App::start(config, models, store).unwrap()
+}
+
+/// The store of a data directory, opened on a runtime of its own, since this is no async function.
+pub(crate) fn store(dir: &Path) -> Store {
+    static RUNTIME: LazyLock<Runtime> = LazyLock::new(|| Runtime::new().unwrap());
+    let config = StoreConfig {
+        data_dir: dir.to_owned(),
+        ..StoreConfig::default()
+    };
+    let open = || RUNTIME.block_on(Store::open(&config));
+    std::thread::scope(|scope| scope.spawn(open).join()).unwrap().unwrap()
 }
 
 pub(crate) fn with_data(dir: &Path, config: ServerConfig) -> ServerConfig {
     ServerConfig {
         data_dir: dir.to_owned(),
+        models_dir: dir.join("models"),
         ..config
     }
 }

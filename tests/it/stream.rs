@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use foreframe::nn::Conditioning;
-use foreframe::server::{App, ServerConfig};
+use foreframe::server::ServerConfig;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
@@ -14,7 +14,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::service::{
-    CONTEXT, PATIENCE, Running, app, context, frame, get, model, png, post, run, spec, until, with_data,
+    CONTEXT, PATIENCE, Running, app, context, frame, get, model, png, post, run, spec, start, until, with_data,
 };
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
@@ -293,7 +293,7 @@ async fn a_client_that_never_reads_loses_its_stream() {
         horizon: 8,
         ..spec(Conditioning::None)
     };
-    let server = run(App::start(config, vec![model(dir.path(), "large", large)]).unwrap()).await;
+    let server = run(start(config, vec![model(dir.path(), "large", large)])).await;
     let mut socket = open(&server, "large").await;
     let image = base64::Engine::encode(&base64::engine::general_purpose::STANDARD, vec![0; 128 * 128]);
     let message = json!({"type": "frame", "seq": 0, "timestamp_us": 0, "image": image, "format": "raw"}).to_string();

@@ -13,7 +13,7 @@ use rand::Rng as _;
 use serde_json::{Value, json};
 
 use crate::client::{Client, Opened};
-use crate::service::{Running, get, run, with_data};
+use crate::service::{self, Running, get, run, with_data};
 
 fn shipped(name: &str) -> LoadedModel {
     registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
@@ -113,7 +113,7 @@ impl Trip {
 }
 
 async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
-    let app = App::start(with_data(dir, ServerConfig::default()), models.to_vec()).unwrap();
+    let app = service::start(with_data(dir, ServerConfig::default()), models.to_vec());
     let server = run(app.clone()).await;
     (app, server)
 }

@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMessage, ServerMessage, WarningCode};
-use foreframe::server::{App, ImageBytes, ImageFormat, ServerConfig};
+use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 
 use crate::client::Client;
-use crate::service::{PATIENCE, Running, model, run, spec, until, with_data};
+use crate::service::{self, PATIENCE, Running, model, run, spec, until, with_data};
 
 const SIDE: u32 = 256;
 const SEND: Duration = Duration::from_millis(500);
@@ -26,7 +26,7 @@ async fn start(dir: &std::path::Path) -> Running {
         horizon: 8,
         ..spec(Conditioning::None)
     };
-    run(App::start(config, vec![model(dir, "large", large)]).unwrap()).await
+    run(service::start(config, vec![model(dir, "large", large)])).await
 }
 
 async fn connect(server: &Running) -> Client {

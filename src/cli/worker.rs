@@ -1,0 +1,53 @@
+//! `foreframe worker`
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tracing::info;
+
+use super::settings::StoreSettings;
+use super::{CliError, say};
+use crate::jobs::Jobs;
+use crate::jobs::pipeline::Pipeline;
+use crate::server::{self, ServerConfig};
+use crate::store::Store;
+use crate::telemetry;
+use crate::versions::Versions;
+
+/// Work on jobs without serving.
+///
+/// Takes up the jobs that servers of the same store took: same --data-dir, or same --database-url and --objects-url. On Ctrl-C or
+/// SIGTERM the running job writes its checkpoint and goes back among those that wait.
+#[derive(clap::Args)]
+#[command(after_help = "Example, beside `foreframe serve --no-jobs` in the same directory:
+  foreframe worker")]
+pub(super) struct Args {
+    #[command(flatten)]
+    store: StoreSettings,
+}
+
+pub(super) fn run(args: &Args) -> Result<(), CliError> {
+    let config = args.store.load()?.config;
+    let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(CliError::failed)?;
+    runtime.block_on(work(&config.server))
+}
+
+async fn work(config: &ServerConfig) -> Result<(), CliError> {
+    let store = Store::open(&config.store()).await?;
+    let versions = Versions::new(store.clone(), &config.models_dir);
+    let pipeline = Pipeline::new(store.clone(), versions, config.job_threads);
+    let jobs = Jobs::start(store, config.jobs(), Arc::new(pipeline), true).map_err(CliError::failed)?;
+    say("Foreframe works on jobs — Ctrl-C stops it")?;
+    server::shutdown::requested().await;
+    info!("stopping");
+    jobs.begin_stop();
+    let deadline = Instant::now() + Duration::from_millis(config.shutdown_deadline_ms);
+    if jobs.finish_stop(deadline).await {
+        info!("stopped");
+    }
+    Ok(())
+}

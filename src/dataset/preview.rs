@@ -1,0 +1,64 @@
+//! One episode of a data set on disk, without reading the others: only the file that holds it is read and verified.
+
+use std::path::Path;
+
+use super::files::verify;
+use super::layout::{EPISODES, Stamp};
+use super::shard_reader::{ShardSlot, read};
+use super::store::read_episodes;
+use super::{Dataset, DatasetError, DatasetInfo};
+use crate::frame::Frame;
+
+/// What the finished data set in a directory is, from its description alone.
+/// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
+pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
+    Ok(Stamp::read(directory)?.info())
+}
+
+impl Dataset {
+    /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
+    pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {
+        let stamp = Stamp::read(directory)?;
+        let info = stamp.info();
+        let missing = || DatasetError::NoEpisode {
+            name: info.name.clone(),
+            episode,
+            count: info.episode_count,
+        };
+        let (mut first_episode, mut first_frame) = (0, 0);
+        let shard = stamp.shards.iter().find(|shard| {
+            let holds_it = episode < first_episode + shard.episodes;
+            if !holds_it {
+                first_episode += shard.episodes;
+                first_frame += shard.frames;
+            }
+            holds_it
+        });
+        let shard = shard.ok_or_else(missing)?;
+        let table = directory.join(EPISODES);
+        verify(&table, &stamp.episodes_sha256)?;
+        let wanted = read_episodes(&table, &info)?
+            .into_iter()
+            .nth(episode)
+            .ok_or_else(missing)?;
+        let path = directory.join(&shard.path);
+        verify(&path, &shard.sha256)?;
+        let size = info.frame_pixels();
+        let mut pixels = vec![0; shard.frames * size];
+        let mut masks = info.has_masks.then(|| vec![0; shard.frames * size]);
+        let mut slot = ShardSlot {
+            path,
+            frames: shard.frames,
+            first_frame,
+            pixels: &mut pixels,
+            masks: masks.as_deref_mut(),
+        };
+        read(&info, &mut slot)?;
+        let start = wanted.first_frame.saturating_sub(first_frame);
+        let frames = pixels.chunks(size).skip(start).take(wanted.frame_count);
+        frames
+            .map(|pixels| Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec()))
+            .collect::<Result<_, _>>()
+            .map_err(|error| DatasetError::Description(error.to_string()))
+    }
+}

@@ -1,0 +1,71 @@
+//! The data sets that jobs make and use: directories below `datasets`, here and where objects are kept.
+
+use std::path::PathBuf;
+
+use super::JobError;
+use crate::registry::is_valid_name;
+use crate::store::Objects;
+
+/// The file that says that a data set is whole.
+pub(super) const LAST_FILE: &str = "info.json";
+
+/// A data set's directory among the objects.
+#[must_use]
+pub(super) fn key(name: &str) -> String {
+    format!("datasets/{name}")
+}
+
+/// The finished data sets, by name. Errors: `Store`.
+pub async fn names(objects: &Objects) -> Result<Vec<String>, JobError> {
+    let mut names = objects.directories("datasets").await?;
+    let dir = objects.data_dir().join("datasets");
+    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
+    let local = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    names.extend(local.filter(|name| is_here(objects, name)));
+    names.retain(|name| is_valid_name(name));
+    names.sort();
+    names.dedup();
+    Ok(names)
+}
+
+/// The directory of a data set in the data directory, fetched there if need be.
+/// Errors: `NotFound` with the names there are, `Store`.
+pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
+    if is_valid_name(name) {
+        if !is_here(objects, name) {
+            objects.pull(&key(name), LAST_FILE).await?;
+        }
+        if is_here(objects, name) {
+            return Ok(objects.data_dir().join(key(name)));
+        }
+    }
+    Err(JobError::NotFound {
+        field: "dataset",
+        kind: "data set",
+        name: name.to_owned(),
+        known: names(objects).await?,
+    })
+}
+
+/// Deletes a data set. Errors: `NotFound`, `Store`.
+pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
+    let known = names(objects).await?;
+    if known.iter().any(|known| known == name) {
+        return Ok(objects.delete(&key(name)).await?);
+    }
+    Err(JobError::NotFound {
+        field: "dataset",
+        kind: "data set",
+        name: name.to_owned(),
+        known,
+    })
+}
+
+fn is_here(objects: &Objects, name: &str) -> bool {
+    objects
+        .data_dir()
+        .join(key(name))
+        .join("meta")
+        .join(LAST_FILE)
+        .is_file()
+}

@@ -1,0 +1,122 @@
+//! A job as it is told, from the row that the store keeps.
+
+use serde::Serialize;
+
+use super::notes::Standing;
+use super::{JobError, JobSpec, JobState, Losses, Progress};
+use crate::store::{JobPage, JobRow};
+
+/// One job as it is now.
+#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct Job {
+    /// Its id.
+    pub id: String,
+    /// Where it is on its way.
+    pub state: JobState,
+    /// What was asked for.
+    pub spec: JobSpec,
+    /// How far it is.
+    pub progress: Progress,
+    /// The latest losses, of a training.
+    pub losses: Losses,
+    /// Why it failed.
+    pub error: Option<String>,
+    /// What came of it: a data set's size, a model's version, an evaluation's scores and files.
+    #[schema(value_type = Option<Object>)]
+    pub result: Option<serde_json::Value>,
+    /// Whether it was asked to stop and has not yet.
+    pub cancelling: bool,
+    /// How often it was taken up: more than once after a server ended in its midst, or after it was resumed.
+    pub attempts: i64,
+    /// When it was asked for, in seconds since 1970.
+    pub queued_unix_s: f64,
+    /// When it was taken up first, in seconds since 1970.
+    pub started_unix_s: Option<f64>,
+    /// When it ended, in seconds since 1970.
+    pub ended_unix_s: Option<f64>,
+}
+
+impl Job {
+    /// Errors: `Record` if the row was written by a program that knows other jobs.
+    pub(super) fn of(row: &JobRow) -> Result<Self, JobError> {
+        let record = |reason: String| JobError::Record {
+            id: id_of(row.number),
+            reason,
+        };
+        let state: JobState = row.state.parse().map_err(record)?;
+        let standing: Standing = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
+        let mut progress = standing.progress;
+        if state != JobState::Running {
+            progress.remaining_s = None;
+        }
+        let outcome = row.outcome.as_deref().map(serde_json::from_str).transpose();
+        Ok(Self {
+            id: id_of(row.number),
+            state,
+            spec: serde_json::from_str(&row.spec).map_err(|error| record(error.to_string()))?,
+            progress,
+            losses: standing.losses,
+            error: row.error.clone(),
+            result: outcome.map_err(|error| record(error.to_string()))?,
+            cancelling: row.cancelling,
+            attempts: row.token,
+            queued_unix_s: row.queued_s,
+            started_unix_s: row.started_s,
+            ended_unix_s: row.ended_s,
+        })
+    }
+}
+
+/// Which jobs to list, the newest first.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct JobFilter {
+    /// Only of that kind.
+    pub kind: Option<String>,
+    /// Only in that state.
+    pub state: Option<JobState>,
+    /// Only those asked for before the job of that id.
+    pub before: Option<String>,
+    /// At most so many.
+    pub limit: usize,
+}
+
+impl JobFilter {
+    /// Errors: `Invalid` if a field names nothing there can be.
+    pub(super) fn page(self) -> Result<JobPage, JobError> {
+        let kinds = JobSpec::KINDS;
+        if let Some(kind) = self.kind.as_deref().filter(|kind| !kinds.contains(kind)) {
+            return Err(JobError::Invalid {
+                field: "kind",
+                reason: format!(
+                    "\"{}\" is no kind; there are: {}",
+                    kind.escape_default(),
+                    kinds.join(", ")
+                ),
+            });
+        }
+        let before = self.before.map(|id| {
+            number_of(&id).ok_or_else(|| JobError::Invalid {
+                field: "before",
+                reason: format!("\"{}\" is no job's id; one is job-12", id.escape_default()),
+            })
+        });
+        Ok(JobPage {
+            kind: self.kind,
+            state: self.state.map(|state| state.name().to_owned()),
+            before: before.transpose()?,
+            limit: self.limit as i64,
+        })
+    }
+}
+
+/// The id of the job of that number.
+pub(super) fn id_of(number: i64) -> String {
+    format!("job-{number}")
+}
+
+/// The number in a job's id.
+pub(super) fn number_of(id: &str) -> Option<i64> {
+    let digits = id.strip_prefix("job-")?;
+    digits.bytes().all(|byte| byte.is_ascii_digit()).then_some(())?;
+    digits.parse().ok()
+}

@@ -1,0 +1,238 @@
+//! Jobs of processes that are killed without warning: the real program, `kill -9`, and the weights in the end.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use foreframe::types::Seed;
+use rand::Rng as _;
+use serde_json::{Value, json};
+
+use crate::service::PATIENCE;
+
+const KILLS: u32 = 10;
+/// The program's default.
+const LEASE: Duration = Duration::from_secs(30);
+
+/// A running program that is killed when it is dropped.
+struct Program(Child);
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // On Unix this is SIGKILL.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Starts the program with a data directory and no shipped models; returns the first line that it writes too.
+fn start(data_dir: &Path, arguments: &[&str]) -> (Program, String) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
+        .args(arguments)
+        .arg("--data-dir")
+        .arg(data_dir)
+        .arg("--set")
+        .arg(format!("models_dir={}", data_dir.join("none-shipped").display()))
+        .env("RUST_LOG", "warn")
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    let stdout = child.stdout.take().unwrap();
+    BufReader::new(stdout).read_line(&mut line).unwrap();
+    (Program(child), line)
+}
+
+fn serve(data_dir: &Path, more: &[&str]) -> (Program, String) {
+    let (program, line) = start(data_dir, &[&["serve", "--bind", "127.0.0.1:0"], more].concat());
+    let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
+    (program, address.to_owned())
+}
+
+/// Asks and gives the JSON of the answer.
+fn ask(address: &str, request: &str, body: &Value) -> Value {
+    let body = if body.is_null() {
+        String::new()
+    } else {
+        body.to_string()
+    };
+    let mut stream = TcpStream::connect(address).unwrap();
+    let head = "Host: x\r\nConnection: close\r\nContent-Type: application/json";
+    write!(
+        stream,
+        "{request} HTTP/1.1\r\n{head}\r\nContent-Length: {}\r\n\r\n{body}",
+        body.len()
+    )
+    .unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap_or_else(|_| panic!("{answer}"))
+}
+
+fn wait_for(address: &str, id: &str, state: &str) -> Value {
+    wait_until(address, id, |job| job["state"] == state)
+}
+
+fn wait_until(address: &str, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let job = ask(address, &format!("GET /v1/jobs/{id}"), &Value::Null);
+        if has_come(&job) {
+            return job;
+        }
+        assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn collect() -> Value {
+    json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40})
+}
+
+fn train() -> Value {
+    let settings = json!({
+        "model": {"features": 16, "hidden": 16},
+        "data": {"windows": 64, "validation_windows": 8},
+        "pretrain": {"steps": 40, "batch_size": 16},
+        "fit": {"steps": 120, "batch_size": 16},
+        "run": {"validate_every_steps": 10, "checkpoint_every_steps": 4},
+    });
+    json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
+}
+
+fn weights(data_dir: &Path) -> Vec<u8> {
+    std::fs::read(data_dir.join("models/m/1/model.safetensors")).unwrap()
+}
+
+/// A data directory in which the collection and the training ran through, and how long the training took.
+fn unbroken() -> (tempfile::TempDir, Duration) {
+    let dir = tempfile::tempdir().unwrap();
+    let (_server, address) = serve(dir.path(), &[]);
+    ask(&address, "POST /v1/jobs", &collect());
+    wait_for(&address, "job-1", "succeeded");
+    ask(&address, "POST /v1/jobs", &train());
+    let job = wait_for(&address, "job-2", "succeeded");
+    let took_s = job["ended_unix_s"].as_f64().unwrap() - job["started_unix_s"].as_f64().unwrap();
+    (dir, Duration::from_secs_f64(took_s))
+}
+
+fn copy_dataset(from: &Path, to: &Path) {
+    let mut dirs = vec![PathBuf::from("datasets/seen")];
+    while let Some(dir) = dirs.pop() {
+        std::fs::create_dir_all(to.join(&dir)).unwrap();
+        for entry in std::fs::read_dir(from.join(&dir)).unwrap() {
+            let relative = dir.join(entry.unwrap().file_name());
+            if from.join(&relative).is_dir() {
+                dirs.push(relative);
+            } else {
+                std::fs::copy(from.join(&relative), to.join(&relative)).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
+fn a_training_whose_process_is_killed_ends_in_the_weights_of_an_unbroken_one() {
+    let (whole, took) = unbroken();
+    killed_at_random_points(whole.path(), took);
+    taken_over_by_another_machine(whole.path(), took);
+}
+
+fn killed_at_random_points(whole: &Path, took: Duration) {
+    let dir = tempfile::tempdir().unwrap();
+    copy_dataset(whole, dir.path());
+    let mut rng = Seed(3).rng();
+    for kill in 0..KILLS {
+        let (server, address) = serve(dir.path(), &[]);
+        if kill == 0 {
+            ask(&address, "POST /v1/jobs", &train());
+        }
+        let started = Instant::now();
+        wait_until(&address, "job-1", |job| {
+            job["state"] == "running" && job["attempts"] == kill + 1
+        });
+        assert!(
+            started.elapsed() < LEASE,
+            "it was taken up only when the lease had run out"
+        );
+        std::thread::sleep(took.mul_f64(rng.random_range(0.01..0.06)));
+        let job = ask(&address, "GET /v1/jobs/job-1", &Value::Null);
+        assert_eq!(job["state"], "running", "{job}");
+        drop(server);
+    }
+    let (_server, address) = serve(dir.path(), &[]);
+    let job = wait_for(&address, "job-1", "succeeded");
+    assert_eq!(job["attempts"], KILLS + 1);
+    assert!(weights(dir.path()) == weights(whole), "the weights differ");
+    let killed = validations(&address, "job-1");
+    let (_server, address) = serve(whole, &[]);
+    assert_eq!(killed, validations(&address, "job-2"));
+    assert_eq!(killed.len(), 4 + 12);
+}
+
+/// The points of the loss curves at which the validation windows were predicted.
+fn validations(address: &str, id: &str) -> Vec<Value> {
+    let curves = ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
+    let points = curves["points"].as_array().unwrap().iter();
+    points
+        .filter(|point| point["validation"].is_number())
+        .cloned()
+        .collect()
+}
+
+/// Data directories of their own, one database, one place for objects.
+fn taken_over_by_another_machine(whole: &Path, took: Duration) {
+    let (of_server, first, second) = (
+        tempfile::tempdir().unwrap(),
+        tempfile::tempdir().unwrap(),
+        tempfile::tempdir().unwrap(),
+    );
+    let shared = tempfile::tempdir().unwrap();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let database = match runtime.block_on(crate::store::postgres("killed")) {
+        Some(url) => url,
+        None => format!("sqlite:{}", shared.path().join("jobs.db").display()),
+    };
+    let objects = shared.path().join("objects").display().to_string();
+    let place = [
+        "--database-url",
+        &database,
+        "--objects-url",
+        &objects,
+        "--set",
+        "job_lease_ms=1000",
+    ];
+    copy_dataset(whole, &shared.path().join("objects"));
+    let (_server, address) = serve(of_server.path(), &[&place[..], &["--no-jobs"]].concat());
+    let work = |dir: &Path| start(dir, &[&["worker"], &place[..]].concat()).0;
+    ask(&address, "POST /v1/jobs", &train());
+    assert_eq!(ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"], "queued");
+    let worker = work(first.path());
+    wait_for(&address, "job-1", "running");
+    std::thread::sleep(took / 2);
+    drop(worker);
+    let _worker = work(second.path());
+    let job = wait_for(&address, "job-1", "succeeded");
+    assert_eq!(job["attempts"], 2);
+    assert!(weights(second.path()) == weights(whole), "the weights differ");
+    // The server, which never saw the files, loads the new model by itself.
+    let deadline = Instant::now() + PATIENCE;
+    while ask(&address, "GET /v1/models", &Value::Null)["models"][0]["name"] != "m" {
+        assert!(Instant::now() < deadline);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let log = ask(&address, "GET /v1/jobs/job-1/logs", &Value::Null);
+    let lines: Vec<&str> = log["lines"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|line| line["line"].as_str().unwrap())
+        .collect();
+    let begun: Vec<&str> = lines.into_iter().filter(|line| line.contains(" from step ")).collect();
+    assert!(
+        begun.len() == 2 && !begun[1].starts_with("pretrain from step 0,"),
+        "{begun:?}"
+    );
+}

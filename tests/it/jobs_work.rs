@@ -1,0 +1,244 @@
+//! The real work of jobs over HTTP: what is collected trains models, whose versions serve, are measured and deleted.
+
+use std::path::Path;
+
+use axum::body::Body;
+use axum::http::Request;
+use foreframe::server::{App, ServerConfig};
+use serde_json::{Value, json};
+
+use crate::service::{Answer, app, context, get, post, send, store, until, with_data};
+
+const JOBS: &str = "/v1/jobs";
+
+fn train(name: &str, steps: usize) -> Value {
+    let settings = json!({
+        "model": {"features": 8, "hidden": 8},
+        "data": {"windows": 8, "validation_windows": 4},
+        "pretrain": {"steps": 3, "batch_size": 4},
+        "fit": {"steps": steps, "batch_size": 4},
+        "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
+    });
+    json!({"kind": "train", "name": name, "preset": "paper", "dataset": "seen", "settings": settings})
+}
+
+/// Asks for a job and waits until it has succeeded.
+async fn done(app: &App, body: &Value) -> Value {
+    let taken = post(app, JOBS, body).await;
+    assert_eq!(taken.status, 202, "{}", taken.json());
+    let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
+    until(async || {
+        let job = get(app, &path).await.json();
+        assert!(job["state"] != "failed" && job["state"] != "cancelled", "{job}");
+        (job["state"] == "succeeded").then_some(job)
+    })
+    .await
+}
+
+async fn collected(app: &App) -> Value {
+    let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
+    done(app, &seen).await
+}
+
+async fn delete(app: &App, path: &str) -> Answer {
+    send(app, Request::delete(path).body(Body::empty()).unwrap()).await
+}
+
+async fn serves(app: &App, model: &str, version: u32) -> Value {
+    until(async || {
+        let answer = get(app, &format!("/v1/models/{model}")).await;
+        let description = (answer.status == 200).then(|| answer.json())?;
+        (description["active_version"] == version).then_some(description)
+    })
+    .await
+}
+
+#[tokio::test]
+async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measured() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let done_collecting = collected(&app).await;
+    assert_eq!(
+        (
+            &done_collecting["progress"]["done"],
+            &done_collecting["progress"]["total"]
+        ),
+        (&json!(40), &json!(40))
+    );
+    let again = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
+    let exists = post(&app, JOBS, &again).await.detail(409);
+    assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
+
+    let first = done(&app, &train("fresh", 3)).await;
+    assert!(
+        first["losses"]["train"].is_number() && first["losses"]["validation"].is_number(),
+        "{first}"
+    );
+    assert_eq!(
+        (&first["result"]["model"], &first["result"]["version"]),
+        (&json!("fresh"), &json!(1))
+    );
+    let description = serves(&app, "fresh", 1).await;
+    assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-0");
+    let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
+        .await
+        .detail(422);
+    assert!(
+        misfit.contains("frames[0] is 16×12 px; model \"fresh\" takes 64×64"),
+        "{misfit}"
+    );
+    assert_eq!(get(&app, "/v1/models/fresh/preview.png").await.status, 200);
+
+    let curves = get(&app, "/v1/jobs/job-2/metrics").await.json();
+    let points = curves["points"].as_array().unwrap();
+    let stages: Vec<&str> = points.iter().map(|point| point["stage"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["pretrain", "pretrain", "pretrain", "fit", "fit", "fit"]);
+    let has_validation: Vec<bool> = points.iter().map(|point| point["validation"].is_number()).collect();
+    assert_eq!(has_validation, [false, true, true, false, true, true]);
+
+    let body = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 40, "resamples": 100});
+    let measured = done(&app, &body).await;
+    assert!(measured["result"]["scores"]["test"]["skill"].is_number(), "{measured}");
+    let report = get(&app, "/v1/jobs/job-3/files/report.json").await;
+    assert_eq!(report.headers["content-type"], "application/json");
+    assert_eq!(report.json()["stamp"]["model"], "fresh");
+    let files = measured["result"]["files"].as_array().unwrap();
+    let gif = files
+        .iter()
+        .find_map(|file| file.as_str()?.strip_suffix(".gif"))
+        .unwrap();
+    let gif = get(&app, &format!("/v1/jobs/job-3/files/{gif}.gif")).await;
+    assert!(gif.body.starts_with(b"GIF89a"));
+    for path in ["..%2F..%2Fforeframe.db", "nothing.json"] {
+        assert_eq!(get(&app, &format!("/v1/jobs/job-3/files/{path}")).await.status, 404);
+    }
+    let body = json!({"kind": "evaluate", "model": "fresh", "version": 9, "dataset": "seen"});
+    let unknown = post(&app, JOBS, &body).await.detail(422);
+    assert_eq!(unknown, "version: there is no version \"9\"; there are: 1");
+}
+
+#[tokio::test]
+async fn versions_are_swapped_refused_deleted_and_remembered() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    collected(&app).await;
+    // "plain" was shipped as version 1 and goes on serving until told otherwise.
+    for (name, steps, version) in [("plain", 2, 2), ("plain", 4, 3), ("plain", 6, 4)] {
+        assert_eq!(done(&app, &train(name, steps)).await["result"]["version"], version);
+    }
+    let description = get(&app, "/v1/models/plain").await.json();
+    assert_eq!(
+        (&description["versions"], &description["active_version"]),
+        (&json!([1, 2, 3, 4]), &json!(1))
+    );
+
+    let swapped = post(&app, "/v1/models/plain/versions/2/activate", &Value::Null)
+        .await
+        .json();
+    assert_eq!(
+        (&swapped["active_version"], &swapped["spec"]["frame_width_px"]),
+        (&json!(2), &json!(64))
+    );
+    let weights = |version: u32| dir.path().join(format!("models/plain/{version}/model.safetensors"));
+    let mut bytes = std::fs::read(weights(3)).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    std::fs::write(weights(3), bytes).unwrap();
+    let refused = post(&app, "/v1/models/plain/versions/3/activate", &Value::Null)
+        .await
+        .detail(422);
+    assert!(
+        refused.starts_with("version 3 of model \"plain\" is refused:") && refused.contains("SHA-256"),
+        "{refused}"
+    );
+    misshape(&dir.path().join("models/plain/4"));
+    let refused = post(&app, "/v1/models/plain/versions/4/activate", &Value::Null)
+        .await
+        .detail(422);
+    assert!(refused.contains("do not fit their manifest"), "{refused}");
+    assert_eq!(get(&app, "/v1/models/plain").await.json()["active_version"], 2);
+
+    let unknown = post(&app, "/v1/models/plain/versions/7/activate", &Value::Null)
+        .await
+        .detail(404);
+    assert_eq!(
+        unknown,
+        "there is no version 7 of model \"plain\"; there are: 1, 2, 3, 4"
+    );
+    let active = delete(&app, "/v1/models/plain/versions/2").await.detail(409);
+    assert!(
+        active.contains("is active; activate another before deleting it"),
+        "{active}"
+    );
+    assert!(
+        delete(&app, "/v1/models/plain/versions/1")
+            .await
+            .detail(409)
+            .contains("was shipped")
+    );
+    assert_eq!(delete(&app, "/v1/models/plain/versions/4").await.status, 204);
+    assert!(!weights(4).exists());
+    assert_eq!(delete(&app, "/v1/models/plain/versions/4").await.status, 404);
+
+    let config = with_data(dir.path(), ServerConfig::default());
+    let next = App::open(config.clone()).await.unwrap();
+    let description = get(&next, "/v1/models/plain").await.json();
+    assert_eq!(
+        (&description["versions"], &description["active_version"]),
+        (&json!([1, 2, 3]), &json!(2))
+    );
+    // What another server activates is followed, and what it activated in vain is not served after a restart either.
+    store(dir.path()).set_active("plain", 1, 0.0).await.unwrap();
+    serves(&next, "plain", 1).await;
+    store(dir.path()).set_active("plain", 3, 0.0).await.unwrap();
+    let third = App::open(config).await.unwrap();
+    assert_eq!(get(&third, "/v1/models/plain").await.json()["active_version"], 1);
+    assert_eq!(done(&third, &train("plain", 2)).await["result"]["version"], 5);
+}
+
+/// Has a manifest promise other shapes than the weights have.
+fn misshape(model_dir: &Path) {
+    let path = model_dir.join("manifest.json");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let mut manifest: Value = serde_json::from_str(&text).unwrap();
+    manifest["spec"]["hidden"] = json!(9);
+    std::fs::write(path, manifest.to_string()).unwrap();
+}
+
+#[tokio::test]
+async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    assert_eq!(get(&app, "/v1/datasets").await.json(), json!({"datasets": []}));
+    collected(&app).await;
+    let list = get(&app, "/v1/datasets").await.json();
+    let described = get(&app, "/v1/datasets/seen").await.json();
+    assert_eq!(list, json!({"datasets": [described]}));
+    assert_eq!((&described["episodes"], &described["seed"]), (&json!(40), &json!(0)));
+    assert_eq!(described["content_hash"].as_str().unwrap().len(), 64);
+
+    let picture = async |path: &str| get(&app, &format!("/v1/datasets/seen/episodes/{path}")).await;
+    assert!(picture("39/preview.png").await.body.starts_with(b"\x89PNG"));
+    let first = picture("0/preview.gif").await;
+    assert!(first.body.starts_with(b"GIF89a") && first.headers["content-type"] == "image/gif");
+    assert_ne!(picture("1/preview.gif").await.body, first.body);
+    let absent = picture("40/preview.png").await.detail(404);
+    assert!(absent.starts_with("there is no episode 40 in"), "{absent}");
+    assert_eq!(picture("x/preview.png").await.status, 400);
+    let unknown = get(&app, "/v1/datasets/..%2Fseen").await.detail(404);
+    assert!(unknown.ends_with("there are: seen"), "{unknown}");
+
+    let mut long = train("slow", 100_000);
+    long["settings"]["run"] = json!({});
+    post(&app, JOBS, &long).await;
+    let needed = delete(&app, "/v1/datasets/seen").await.detail(409);
+    assert_eq!(
+        needed,
+        "data set \"seen\" is in use by job-2; wait for its end or cancel it"
+    );
+    post(&app, "/v1/jobs/job-2/cancel", &Value::Null).await;
+    until(async || (get(&app, "/v1/jobs/job-2").await.json()["state"] == "cancelled").then_some(())).await;
+    assert_eq!(delete(&app, "/v1/datasets/seen").await.status, 204);
+    assert!(!dir.path().join("datasets/seen").exists());
+    assert_eq!(delete(&app, "/v1/datasets/seen").await.status, 404);
+}

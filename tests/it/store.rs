@@ -1,0 +1,407 @@
+//! The store, on SQLite always and on PostgreSQL where `FOREFRAME_TEST_POSTGRES` holds the URL of one to make databases in.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use foreframe::store::{Account, Ending, Enqueued, JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
+use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
+use tempfile::TempDir;
+
+/// Where to open a store of each kind, empty. `name` is the test's.
+async fn places(name: &str) -> Vec<(TempDir, StoreConfig)> {
+    let mut places = vec![place(None)];
+    places.extend(postgres(name).await.map(|url| place(Some(url))));
+    places
+}
+
+fn place(database: Option<String>) -> (TempDir, StoreConfig) {
+    let dir = tempfile::tempdir().unwrap();
+    let config = StoreConfig {
+        data_dir: dir.path().to_owned(),
+        database,
+        objects: None,
+    };
+    (dir, config)
+}
+
+/// The URL of a new database beside the one that `FOREFRAME_TEST_POSTGRES` names.
+pub(crate) async fn postgres(name: &str) -> Option<String> {
+    let Ok(url) = std::env::var("FOREFRAME_TEST_POSTGRES") else {
+        println!("skipped on PostgreSQL: FOREFRAME_TEST_POSTGRES holds no URL");
+        return None;
+    };
+    let mut connection = PgConnection::connect(&url).await.unwrap();
+    let database = format!("foreframe_{name}");
+    for statement in [
+        format!("DROP DATABASE IF EXISTS {database} WITH (FORCE)"),
+        format!("CREATE DATABASE {database}"),
+    ] {
+        connection.execute(AssertSqlSafe(statement)).await.unwrap();
+    }
+    let (server, _) = url.rsplit_once('/').unwrap();
+    Some(format!("{server}/{database}"))
+}
+
+async fn stores(name: &str) -> Vec<(TempDir, Store)> {
+    let mut stores = Vec::new();
+    for (dir, config) in places(name).await {
+        stores.push((dir, Store::open(&config).await.unwrap()));
+    }
+    stores
+}
+
+fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
+    NewJob {
+        kind: "collect".to_owned(),
+        makes: makes.map(str::to_owned),
+        spec: "{}".to_owned(),
+        progress: "{}".to_owned(),
+        idempotency_key: key.map(str::to_owned),
+    }
+}
+
+async fn enqueued(store: &Store) -> JobRow {
+    match store.enqueue(job(None, None), 100, 1.0).await.unwrap() {
+        Enqueued::New(row) => row,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn ending(state: &'static str) -> Ending {
+    Ending {
+        state,
+        error: None,
+        outcome: Some("{}".to_owned()),
+        ended_s: Some(9.0),
+        published: None,
+    }
+}
+
+fn account(line: &str) -> Account {
+    Account {
+        progress: "{\"done\":1}".to_owned(),
+        lines: vec![(2.0, line.to_owned())],
+        losses: vec![LossRow {
+            stage: "fit".to_owned(),
+            step: 4,
+            train: Some(0.5),
+            validation: None,
+        }],
+        max_lines: 3,
+    }
+}
+
+#[tokio::test]
+async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
+    for (_dir, store) in stores("way").await {
+        let row = enqueued(&store).await;
+        assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
+        let (row, lease) = store.take_up("me", 2.0, 10.0).await.unwrap().unwrap();
+        assert_eq!(
+            (row.state.as_str(), row.started_s, row.token),
+            ("running", Some(2.0), 1)
+        );
+        assert_eq!(store.take_up("me", 3.0, 10.0).await.unwrap(), None);
+        for line in ["one", "two", "three", "four"] {
+            assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
+        }
+        assert!(store.ask_to_cancel(1).await.unwrap());
+        assert_eq!(store.renew(lease, 20.0, Account::default()).await.unwrap(), Some(true));
+        assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
+        let row = store.job(1).await.unwrap().unwrap();
+        assert_eq!(
+            (row.state.as_str(), row.cancelling, row.ended_s),
+            ("cancelled", false, Some(9.0))
+        );
+        assert_eq!(
+            (row.progress.as_str(), row.outcome.as_deref()),
+            ("{\"done\":1}", Some("{}"))
+        );
+        let lines = store.job_log(1, 3, 10).await.unwrap();
+        let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
+        assert_eq!(lines, [(4, "four"), (5, "five")]);
+        assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
+        assert_eq!(store.job_losses(1).await.unwrap(), account("").losses);
+        assert!(!store.end(lease, ending("succeeded"), Account::default()).await.unwrap());
+    }
+}
+
+#[tokio::test]
+async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
+    for (_dir, store) in stores("fence").await {
+        enqueued(&store).await;
+        let (_, stale) = store.take_up("slow", 0.0, 10.0).await.unwrap().unwrap();
+        assert_eq!(store.take_up("quick", 9.9, 30.0).await.unwrap(), None);
+        let (row, fresh) = store.take_up("quick", 10.1, 30.0).await.unwrap().unwrap();
+        assert_eq!((row.token, row.started_s), (2, Some(0.0)));
+        assert_eq!(store.renew(stale, 99.0, account("from the dead")).await.unwrap(), None);
+        assert!(
+            !store
+                .end(stale, ending("failed"), account("from the dead"))
+                .await
+                .unwrap()
+        );
+        assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
+        assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
+        assert_eq!(store.renew(fresh, 40.0, Account::default()).await.unwrap(), Some(false));
+        assert_eq!(store.release_leases("slow").await.unwrap(), 0);
+        assert_eq!(store.release_leases("quick").await.unwrap(), 1);
+        assert_eq!(store.take_up("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
+    }
+}
+
+#[tokio::test]
+async fn places_keys_and_names_are_given_once() {
+    for (_dir, store) in stores("once").await {
+        let enqueue = async |new: NewJob| store.enqueue(new, 2, 0.0).await.unwrap();
+        assert!(matches!(
+            enqueue(job(Some("data set a"), Some("k"))).await,
+            Enqueued::New(_)
+        ));
+        assert!(matches!(enqueue(job(Some("data set b"), Some("k"))).await, Enqueued::Same(row) if row.number == 1));
+        assert_eq!(enqueue(job(Some("data set a"), None)).await, Enqueued::Taken);
+        assert!(matches!(enqueue(job(None, None)).await, Enqueued::New(_)));
+        assert_eq!(enqueue(job(None, None)).await, Enqueued::Full);
+        assert!(store.cancel_queued(1, 1.0).await.unwrap() && !store.cancel_queued(1, 1.0).await.unwrap());
+        assert!(matches!(enqueue(job(Some("data set a"), None)).await, Enqueued::New(row) if row.number == 3));
+        assert_eq!(store.requeue(1, 2).await.unwrap(), Some(Enqueued::Taken));
+        assert_eq!(store.requeue(2, 2).await.unwrap(), None);
+        assert_eq!(store.job_of_key("k").await.unwrap().unwrap().number, 1);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
+    for (_dir, store) in stores("many").await {
+        let enqueueing = (0..30).map(|_| {
+            let store = store.clone();
+            tokio::spawn(async move { store.enqueue(job(None, None), 20, 0.0).await.unwrap() })
+        });
+        let mut taken = 0;
+        for task in enqueueing.collect::<Vec<_>>() {
+            taken += usize::from(matches!(task.await.unwrap(), Enqueued::New(_)));
+        }
+        assert_eq!(taken, 20);
+        let runners = (0..6).map(|runner| {
+            let store = store.clone();
+            tokio::spawn(async move {
+                let mut numbers = Vec::new();
+                while numbers.len() < 20 {
+                    match store.take_up(&runner.to_string(), 0.0, 10.0).await.unwrap() {
+                        Some((row, _)) => numbers.push(row.number),
+                        // Those that others are about to take are passed over.
+                        None if store.jobs(queued()).await.unwrap().is_empty() => break,
+                        None => tokio::task::yield_now().await,
+                    }
+                }
+                numbers
+            })
+        });
+        let mut numbers = Vec::new();
+        for runner in runners.collect::<Vec<_>>() {
+            numbers.extend(runner.await.unwrap());
+        }
+        numbers.sort_unstable();
+        assert_eq!(numbers, (1..=20).collect::<Vec<i64>>());
+    }
+}
+
+fn queued() -> JobPage {
+    JobPage {
+        state: Some("queued".to_owned()),
+        limit: 100,
+        ..JobPage::default()
+    }
+}
+
+#[tokio::test]
+async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
+    for (_dir, store) in stores("list").await {
+        for _ in 0..5 {
+            enqueued(&store).await;
+        }
+        for number in 1..=3 {
+            store.cancel_queued(number, number as f64).await.unwrap();
+        }
+        let numbers = async |page: JobPage| -> Vec<i64> {
+            store.jobs(page).await.unwrap().iter().map(|row| row.number).collect()
+        };
+        assert_eq!(numbers(queued()).await, [5, 4]);
+        let page = JobPage {
+            kind: Some("collect".to_owned()),
+            before: Some(4),
+            limit: 2,
+            state: None,
+        };
+        assert_eq!(numbers(page).await, [3, 2]);
+        assert_eq!(
+            store
+                .forget_ended(1)
+                .await
+                .unwrap()
+                .into_iter()
+                .collect::<BTreeSet<_>>(),
+            [1, 2].into()
+        );
+        assert_eq!(
+            numbers(JobPage {
+                limit: 9,
+                ..JobPage::default()
+            })
+            .await,
+            [5, 4, 3]
+        );
+        enqueued(&store).await;
+        assert_eq!(store.job(6).await.unwrap().unwrap().number, 6);
+    }
+}
+
+/// A job of that model, taken up, with its version reserved.
+async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
+    enqueued(store).await;
+    let (_, lease) = store.take_up("me", 0.0, 10.0).await.unwrap().unwrap();
+    (lease, store.reserve_version(lease, model, 4).await.unwrap().unwrap())
+}
+
+#[tokio::test]
+async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_ended() {
+    for (_dir, store) in stores("versions").await {
+        let (lease, version) = reserve(&store, "m").await;
+        assert_eq!(
+            (version, store.reserve_version(lease, "m", 4).await.unwrap()),
+            (5, Some(5))
+        );
+        assert_eq!(store.published_versions().await.unwrap(), []);
+        let published = |version, activates| Ending {
+            published: Some(("m".to_owned(), version, activates)),
+            ..ending("succeeded")
+        };
+        assert!(store.end(lease, published(5, true), Account::default()).await.unwrap());
+        let (lease, version) = reserve(&store, "m").await;
+        assert_eq!(version, 6);
+        assert!(store.end(lease, published(6, true), Account::default()).await.unwrap());
+        let listed = store.published_versions().await.unwrap();
+        assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
+        // The first stays chosen until another is.
+        assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
+        assert!(!store.delete_version("m", 5, 1.0).await.unwrap());
+        store.set_active("m", 4, 1.0).await.unwrap();
+        assert!(store.delete_version("m", 6, 1.0).await.unwrap() && !store.delete_version("m", 6, 1.0).await.unwrap());
+        assert_eq!(reserve(&store, "m").await.1, 7);
+    }
+}
+
+#[tokio::test]
+async fn keys_are_found_by_id_and_revoked_once() {
+    for (_dir, store) in stores("keys").await {
+        store.create_key("b", "robot", "hash-b", 2.0).await.unwrap();
+        store.create_key("a", "room", "hash-a", 1.0).await.unwrap();
+        assert!(store.create_key("a", "other", "hash", 3.0).await.is_err());
+        let names: Vec<_> = store
+            .list_keys()
+            .await
+            .unwrap()
+            .into_iter()
+            .map(|key| key.name)
+            .collect();
+        assert_eq!(names, ["room", "robot"]);
+        assert!(store.revoke_key("b", 5.0).await.unwrap() && !store.revoke_key("b", 6.0).await.unwrap());
+        assert_eq!(store.find_key("b").await.unwrap().unwrap().revoked_s, Some(5.0));
+        assert_eq!(store.find_key("c").await.unwrap(), None);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn several_may_open_a_new_store_at_once_and_all_see_the_same() {
+    for (_dir, config) in places("open").await {
+        let opening = (0..6).map(|_| {
+            let config = config.clone();
+            tokio::spawn(async move { Store::open(&config).await.unwrap() })
+        });
+        let mut stores = Vec::new();
+        for task in opening.collect::<Vec<_>>() {
+            stores.push(task.await.unwrap());
+        }
+        enqueued(&stores[0]).await;
+        assert!(stores[5].job(1).await.unwrap().is_some());
+        stores[3].ping().await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
+    let dir = tempfile::tempdir().unwrap();
+    let refused = async |database: Option<&str>, objects: Option<&str>| {
+        let config = StoreConfig {
+            data_dir: dir.path().to_owned(),
+            database: database.map(str::to_owned),
+            objects: objects.map(str::to_owned),
+        };
+        Store::open(&config).await.err().unwrap().to_string()
+    };
+    assert_eq!(
+        refused(Some("mysql://me:secret@host/db"), None).await,
+        "database starts with \"mysql\"; use sqlite:FILE or postgres://USER@HOST/NAME"
+    );
+    assert_eq!(
+        refused(None, Some("gs://bucket")).await,
+        "objects starts with \"gs\"; use a directory or s3://BUCKET/PREFIX"
+    );
+}
+
+/// Two data directories with one place for objects, a directory or, where `FOREFRAME_TEST_S3` holds a URL, a bucket.
+#[tokio::test]
+async fn what_one_machine_pushes_another_pulls_lists_and_deletes() {
+    let shared = tempfile::tempdir().unwrap();
+    let url = if cfg!(feature = "cloud") {
+        std::env::var("FOREFRAME_TEST_S3").ok()
+    } else {
+        None
+    };
+    if url.is_none() {
+        println!("skipped on S3: built without the feature cloud, or FOREFRAME_TEST_S3 holds no URL");
+    }
+    for url in std::iter::once(shared.path().display().to_string()).chain(url) {
+        let (here, there) = (open_sharing(&url).await, open_sharing(&url).await);
+        let write = |path: &str, text: &str| {
+            let path = here.0.path().join(path);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        };
+        write("models/m/1/manifest.json", "last");
+        write("models/m/1/deep/weights", "first");
+        write("models/m/1/half.partial", "never");
+        let (ours, theirs) = (here.1.objects(), there.1.objects());
+        assert!(!theirs.pull("models/m/1", "manifest.json").await.unwrap());
+        ours.push("models/m/1", "manifest.json").await.unwrap();
+        assert_eq!(theirs.directories("models/m").await.unwrap(), ["1"]);
+        assert!(theirs.pull("models/m/1", "manifest.json").await.unwrap());
+        let read = |path: &str| std::fs::read_to_string(there.0.path().join(path)).ok();
+        assert_eq!(read("models/m/1/deep/weights").as_deref(), Some("first"));
+        assert_eq!(
+            (
+                read("models/m/1/manifest.json").as_deref(),
+                read("models/m/1/half.partial")
+            ),
+            (Some("last"), None)
+        );
+        write("models/m/1/manifest.json", "newer");
+        ours.push("models/m/1", "manifest.json").await.unwrap();
+        theirs.pull("models/m/1", "manifest.json").await.unwrap();
+        assert_eq!(read("models/m/1/manifest.json").as_deref(), Some("newer"));
+        theirs.delete("models/m/1").await.unwrap();
+        assert!(!there.0.path().join("models/m/1").exists());
+        assert_eq!(ours.directories("models/m").await.unwrap(), [""; 0]);
+    }
+}
+
+async fn open_sharing(objects: &str) -> (TempDir, Store) {
+    let dir = tempfile::tempdir().unwrap();
+    let config = StoreConfig {
+        data_dir: Path::new(dir.path()).to_owned(),
+        database: None,
+        objects: Some(objects.to_owned()),
+    };
+    let store = Store::open(&config).await.unwrap();
+    (dir, store)
+}
