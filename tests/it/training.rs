@@ -142,6 +142,7 @@ fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "fit.learning_rate=1",
+        "fit.codec=fine-tuned",
         "run.clip_norm=1e6",
         "run.warmup_steps=0",
         "fit.steps=500",
