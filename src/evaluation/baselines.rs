@@ -20,7 +20,8 @@ pub enum Method {
     LinearExtrapolation,
     /// The last frame moved on by the shift between the last two inputs (phase correlation).
     ConstantShift,
-    /// The true future frame through the model's own dense layers: the ceiling of what it can draw.
+    /// The true future frame through the model's own dense layers: about the best it can draw. It reads them
+    /// smoothed; a prediction that learnt to sharpen can come out better.
     CodecOnly,
 }
 
@@ -55,7 +56,7 @@ impl Method {
             Self::MeanTrainingFrame => "mean training frame",
             Self::LinearExtrapolation => "linear extrapolation",
             Self::ConstantShift => "constant global shift",
-            Self::CodecOnly => "codec only (ceiling)",
+            Self::CodecOnly => "codec on the true frame",
         }
     }
 }

@@ -113,7 +113,7 @@ fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
     Ok(())
 }
 
-/// No prediction goes below what the codec alone loses.
+/// The codec is shown the true frame: no prediction.
 fn is_dashed(method: Method) -> bool {
     method == Method::CodecOnly
 }
