@@ -105,6 +105,9 @@ pub enum EvaluationError {
         /// First frame of the window.
         frame: usize,
     },
+    /// It was asked to stop.
+    #[error("the evaluation was cancelled")]
+    Cancelled,
     /// The output directory holds something.
     #[error("{} exists and is not empty; name a new directory", .0.display())]
     OutputExists(PathBuf),
