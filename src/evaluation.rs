@@ -19,6 +19,7 @@ mod samples;
 pub mod score;
 pub mod skill;
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 pub use self::error::EvaluationError;
@@ -52,6 +53,8 @@ pub struct EvaluateConfig<'a> {
     pub twin: Option<&'a LoadedModel>,
     /// The command line, for the stamp.
     pub command: String,
+    /// Where it is looked whether to stop.
+    pub cancelled: Option<&'a AtomicBool>,
 }
 
 impl Default for EvaluateConfig<'_> {
@@ -65,6 +68,7 @@ impl Default for EvaluateConfig<'_> {
             batch: 64,
             twin: None,
             command: String::new(),
+            cancelled: None,
         }
     }
 }
@@ -114,21 +118,28 @@ pub struct Watched<'a> {
     batch: usize,
     bootstrap: Bootstrap,
     on_progress: &'a (dyn Fn(Progress) + Sync),
+    cancelled: Option<&'a AtomicBool>,
 }
 
 impl Watched<'_> {
-    fn tell(&self, stage: Stage, done: usize, total: usize) {
+    /// Errors: `Cancelled` if it is to stop.
+    fn tell(&self, stage: Stage, done: usize, total: usize) -> Result<(), EvaluationError> {
         (self.on_progress)(Progress {
             split: self.split,
             stage,
             done,
             total,
         });
+        match self.cancelled {
+            Some(cancelled) if cancelled.load(Ordering::Acquire) => Err(EvaluationError::Cancelled),
+            _ => Ok(()),
+        }
     }
 }
 
 /// Scores the model on both held-out parts of the data set: trials never seen, and start/goal pairs and gains never seen.
-/// Errors: model and data set that don't fit together, settings out of range, nothing held out, those of the network.
+/// Errors: model and data set that don't fit together, settings out of range, nothing held out, `Cancelled`, those of the
+/// network.
 pub fn run(
     loaded: &LoadedModel,
     dataset: &Dataset,
@@ -163,6 +174,7 @@ pub fn run(
                 seed: config.seed,
             },
             on_progress,
+            cancelled: config.cancelled,
         };
         let outcome = score_split(loaded, (dataset, &splits), config, &training_mean, &watched)?;
         sets.push(SetReport {

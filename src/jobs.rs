@@ -13,7 +13,7 @@ mod runner;
 pub mod spec;
 pub mod state;
 
-use crate::store::StoreError;
+use crate::store::{StoreError, unix_s};
 
 pub use job::{Job, JobFilter};
 pub use notes::{Losses, Progress};
@@ -121,10 +121,4 @@ fn list(names: &[String]) -> String {
     } else {
         names.join(", ")
     }
-}
-
-/// The time, in seconds since 1970.
-fn unix_s() -> f64 {
-    let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);
-    since_1970.unwrap_or_default().as_secs_f64()
 }

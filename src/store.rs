@@ -121,3 +121,10 @@ impl Store {
         self.database.fetch("SELECT 1", vec![]).await.map(drop)
     }
 }
+
+/// The time as the store keeps it: seconds since 1970.
+#[must_use]
+pub fn unix_s() -> f64 {
+    let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);
+    since_1970.unwrap_or_default().as_secs_f64()
+}

@@ -11,7 +11,7 @@ use tracing::{info, warn};
 use crate::files::write_atomically;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
-use crate::store::{Lease, Store, StoreError};
+use crate::store::{Lease, Store, StoreError, unix_s};
 
 /// Why a version could not be loaded, published, chosen or deleted.
 #[derive(Debug, thiserror::Error)]
@@ -334,9 +334,4 @@ async fn take_in(predictor: &Predictor, loaded: LoadedModel) -> Result<(), Versi
             reason: error.to_string(),
         }),
     }
-}
-
-fn unix_s() -> f64 {
-    let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);
-    since_1970.unwrap_or_default().as_secs_f64()
 }

@@ -111,7 +111,7 @@ pub fn compare(
                 Variant::True | Variant::UnconditionedTwin => Told::Truth,
             };
             errors.extend(errors_of(model, dataset, batch, told)?);
-            watched.tell(Stage::Actions, all.len() * windows.len() + errors.len(), total);
+            watched.tell(Stage::Actions, all.len() * windows.len() + errors.len(), total)?;
         }
         all.push((variant, errors));
     }

@@ -105,6 +105,9 @@ pub enum EvaluationError {
         /// First frame of the window.
         frame: usize,
     },
+    /// It was asked to stop.
+    #[error("the evaluation was cancelled")]
+    Cancelled,
     /// The output directory holds something, or is a file.
     #[error("{} exists and is not an empty directory; name a new one", .0.display())]
     OutputExists(PathBuf),

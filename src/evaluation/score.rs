@@ -54,7 +54,7 @@ pub fn score(
             .enumerate()
             .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, training_mean));
         scores.par_extend(scored);
-        watched.tell(Stage::Scores, scores.len(), windows.len());
+        watched.tell(Stage::Scores, scores.len(), windows.len())?;
     }
     Ok(scores)
 }

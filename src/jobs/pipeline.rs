@@ -70,7 +70,7 @@ impl Execute for Pipeline {
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
-            JobSpec::Evaluate(spec) => self.evaluate(spec, report),
+            JobSpec::Evaluate(spec) => self.evaluate(spec, report, cancelled),
         };
         match result {
             Err(Failure::Failed(_)) if cancelled.load(Ordering::Acquire) => Err(Failure::Cancelled),
@@ -160,7 +160,7 @@ impl Pipeline {
         prepared.map_err(|error: StoreError| failed(&error))
     }
 
-    fn evaluate(&self, spec: &EvaluateSpec, report: &Report) -> Result<Outcome, Failure> {
+    fn evaluate(&self, spec: &EvaluateSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
         let loaded = self.model(&spec.model, spec.version)?;
         let twin = spec.twin.as_deref().map(|twin| self.model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
@@ -171,6 +171,7 @@ impl Pipeline {
             seed: Seed(spec.seed),
             twin: twin.as_ref(),
             command: posted(&JobSpec::Evaluate(spec.clone())),
+            cancelled: Some(cancelled),
             ..EvaluateConfig::default()
         };
         let found = evaluation::run(&loaded, &dataset, &config, &|now| {

@@ -289,7 +289,8 @@ impl Store {
     /// Ends a job's work; says whether the lease still held, and writes nothing if not. Errors: `Query`.
     pub async fn end(&self, lease: Lease, ending: Ending, account: Account) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
-        let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, cancelling = 0, \
+        let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
+             cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
         let values = vec![
             lease.number.into(),

@@ -1,4 +1,4 @@
-//! The page at `/` in a real Chromium, over its DevTools protocol. Skips with a message where there is none.
+//! The page at `/` in a real Chromium, over its `DevTools` protocol. Skips with a message where there is none.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -141,7 +141,9 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
     let app = App::open(ServerConfig {
         data_dir: dir.path().to_owned(),
         ..ServerConfig::default()
-    }).await.unwrap();
+    })
+    .await
+    .unwrap();
     let server = run(app.clone()).await;
     let job = json!({"kind": "collect", "name": "seen", "scenario": "crowded", "trials": 3, "seed": 1});
     post(&app, "/v1/jobs", &job).await;

@@ -206,6 +206,24 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
 }
 
 #[tokio::test]
+async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, _order) = puppet_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
+    let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
+    until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
+    // To another process whose clock says that the lease has long run out.
+    let (row, thief) = app.store().take_up("another", 1e12, 2e12).await.unwrap().unwrap();
+    assert_eq!((row.number, thief.token), (1, 2));
+    post(&app, JOBS, &collect("b")).await;
+    // The runner is free for the next job once it has seen that it lost this one.
+    state_becomes(&app, "job-2", "running").await;
+    let job = get(&app, "/v1/jobs/job-1").await.json();
+    assert_eq!((&job["state"], &job["attempts"]), (&json!("running"), &json!(2)));
+    assert_eq!(log().await.as_array().unwrap().len(), 2);
+}
+
+#[tokio::test]
 async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
     let dir = tempfile::tempdir().unwrap();
     let (app, order) = puppet_app(dir.path(), true);

@@ -192,7 +192,7 @@ async fn sessions_are_listed_page_by_page() {
         get(&app, "/v1/sessions?limit=0").await.detail(422),
         "limit is 0; it must be 1 to 1000"
     );
-    get(&app, "/v1/sessions?colour=red").await.detail(400);
+    get(&app, "/v1/sessions?colour=red").await.detail(422);
 }
 
 #[tokio::test]
