@@ -45,7 +45,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    let app = App::open(config.server)
+    let app = Box::pin(App::open(config.server))
         .await
         .map_err(CliError::failed)?
         .with_keys(keys);
