@@ -259,16 +259,20 @@ pub(super) async fn file(
     if !files.is_some_and(|files| files.iter().any(|known| *known == file)) {
         return Err(ApiError::NotFound(format!("job {id} left no file of that name")));
     }
+    let bytes = report_file(&app, &id, &file).await?;
+    Ok(([(header::CONTENT_TYPE, media_type(&file))], bytes))
+}
+
+/// The bytes of a file of a report, fetched into the data directory if need be.
+async fn report_file(app: &App, id: &str, file: &str) -> Result<Vec<u8>, ApiError> {
     let objects = app.store().objects();
-    let path = objects.data_dir().join(report_key(&id)).join(&file);
+    let path = objects.data_dir().join(report_key(id)).join(file);
     if !path.is_file() {
-        let pulled = objects.pull(&report_key(&id), &file).await;
+        let pulled = objects.pull(&report_key(id), file).await;
         pulled.map_err(|error| ApiError::Internal(error.to_string()))?;
     }
-    let kind = media_type(&file);
     let bytes = blocking(move || std::fs::read(path)).await?;
-    let bytes = bytes.map_err(|_| ApiError::NotFound(format!("the file of job {id} is gone")))?;
-    Ok(([(header::CONTENT_TYPE, kind)], bytes))
+    bytes.map_err(|_| ApiError::NotFound(format!("the file of job {id} is gone")))
 }
 
 fn media_type(file: &str) -> &'static str {
