@@ -24,6 +24,8 @@ mod nn_common;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
+#[cfg(feature = "otlp")]
+mod otlp;
 mod program;
 mod rollouts;
 mod server;
