@@ -33,12 +33,6 @@ pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
     reader(bytes, limits)?.into_dimensions().map_err(FrameError::Decode)
 }
 
-/// Bytes of the longest sound image of that size, encoded.
-#[must_use]
-pub fn max_encoded_bytes(width: u32, height: u32) -> usize {
-    (u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES + MAX_METADATA_BYTES) as usize
-}
-
 fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {
     let mut reader = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()

@@ -98,14 +98,6 @@ pub(super) enum ImageError {
         width: u32,
         height: u32,
     },
-    #[error("{field} holds {found} bytes; an image of {width}×{height} px takes at most {most}")]
-    Length {
-        field: String,
-        found: usize,
-        most: usize,
-        width: u32,
-        height: u32,
-    },
     #[error(transparent)]
     Size(#[from] InputError),
     #[error("an image of the answer could not be encoded")]
@@ -129,17 +121,6 @@ pub(super) fn decode(
     }
     let size = codec::dimensions(&bytes).map_err(decode_error)?;
     check_size(field, model, spec, size)?;
-    let (found, most) = (bytes.len(), codec::max_encoded_bytes(size.0, size.1));
-    // What unpacks to more than its pixels would keep the decoder busy for nothing.
-    if found > most {
-        return Err(ImageError::Length {
-            field: field.to_owned(),
-            found,
-            most,
-            width: size.0,
-            height: size.1,
-        });
-    }
     codec::decode(&bytes).map_err(decode_error)
 }
 

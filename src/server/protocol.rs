@@ -152,7 +152,7 @@ pub enum ServerMessage {
         /// What it is, and what would help.
         detail: String,
     },
-    /// Something was refused; the stream goes on.
+    /// Something was refused; unless `closing` follows, the stream goes on.
     Error {
         /// What kind, for programs.
         code: ErrorCode,

@@ -70,7 +70,7 @@ def images():
         "refused-says-65535.jpeg": huge,
         "refused-says-2-gigapixels-a-side.png": png(header(0x7FFFFFFF, 0x7FFFFFFF), rows(*SIZE)),
         "refused-no-width.png": png(header(0, 12), rows(*SIZE)),
-        "refused-profile-bomb.png": png(header(*SIZE), chunk(b"iCCP", b"a\0\0" + bomb(64 << 20)), rows(*SIZE)),
+        "ok-profile-bomb.png": png(header(*SIZE), chunk(b"iCCP", b"a\0\0" + bomb(64 << 20)), rows(*SIZE)),
         "refused-chunk-of-4-gigabytes.png": png(header(*SIZE), chunk(b"eXIf", b"II", length=0x7FFFFFFF), rows(*SIZE)),
         "refused-wrong-checksum.png": png(header(*SIZE), chunk(b"PLTE", b"abc", crc=1), rows(*SIZE)),
         "refused-half.png": sound[: len(sound) // 2],
@@ -113,6 +113,7 @@ def messages():
         "ok-type-last.json": json.dumps({key: frame[key] for key in reversed(frame)}),
         "ok-not-a-number.msgpack": pack(binary | {"action": [float("nan"), float("inf")]}),
         "refused-unknown-field.json": json.dumps(frame | {"colour": 1}),
+        "refused-long-key.json": json.dumps(frame | {"colour" * 10000: 1}),
         "refused-field-of-another.json": '{"type":"close","seq":1}',
         "refused-unknown-type.json": '{"type":"dance"}',
         "refused-no-type.json": '{"seq":1}',
@@ -188,9 +189,10 @@ def bodies():
     for name, content in {
         "400-predict-half.json": text[:400],
         "400-predict-nothing.json": "",
-        "400-predict-deep.json": '{"actions":' + "[" * 5000,
+        "422-predict-deep.json": '{"actions":' + "[" * 5000,
         "400-predict-not-a-number.json": '{"frames":[],"state":[NaN]}',
         "400-predict-not-utf8.json": b'{"format":"\xff\xfe"}',
+        "422-predict-long-key.json": json.dumps({"colour" * 10000: 1}),
         "422-predict-key-twice.json": '{"format":"raw","format":"png"}',
         "400-jobs-deep.json": '{"kind":"train","settings":' + '{"a":' * 5000,
         "200-predict-sound.form": form(*[("frames", PIXELS)] * 3, ("request", json.dumps(predict | {"frames": []}).encode())),
@@ -227,7 +229,7 @@ def states():
         write("states", f"{name}.json", json.dumps(content))
     text = json.dumps(state)
     write("states", "400-half.json", text[: len(text) // 2])
-    write("states", "400-deep.json", text[:-2] + ',"x":' + "[" * 5000)
+    write("states", "422-deep.json", text.replace("[[", "[" * 5000, 1))
     write("states", "422-key-twice.json", text[:-1] + ',"version":1}')
 
 

@@ -13,6 +13,7 @@ use tracing::{debug, info, trace};
 use tungstenite::error::ProtocolError;
 
 use super::outbox::{Next, Outbox};
+use crate::server::error::bounded;
 use crate::server::images;
 use crate::server::protocol::{
     ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, WarningCode,
@@ -231,7 +232,7 @@ impl Connection {
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
-        let next_seq = self.hold.session().next_seq();
+        let (detail, next_seq) = (bounded(detail), self.hold.session().next_seq());
         ServerMessage::Error { code, detail, next_seq }
     }
 
