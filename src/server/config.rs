@@ -282,7 +282,13 @@ mod tests {
     }
 
     #[test]
-    fn jobs_without_threads_or_with_a_lease_that_runs_out_at_once_are_refused() {
+    fn jobs_without_threads_or_room_or_with_a_lease_that_runs_out_at_once_are_refused() {
+        let roomless = ServerConfig {
+            max_job_bytes: 0,
+            ..ServerConfig::default()
+        };
+        let error = roomless.validate().unwrap_err().to_string();
+        assert_eq!(error, "max_job_bytes is 0; it must be 1024 to 16777216");
         let threadless = ServerConfig {
             job_threads: 0,
             ..ServerConfig::default()
