@@ -21,6 +21,8 @@ use crate::versions::VersionError;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
+/// Bytes of a detail at most: it quotes what a client sent, however long that is.
+const MAX_DETAIL_BYTES: usize = 1000;
 
 /// An error as a client sees it: problem details, RFC 9457.
 #[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
@@ -133,7 +135,7 @@ impl IntoResponse for ApiError {
             kind: format!("urn:foreframe:problem:{slug}"),
             title: status.canonical_reason().unwrap_or(slug),
             status: status.as_u16(),
-            detail: self.detail(),
+            detail: bounded(self.detail()),
             instance: String::new(),
         });
         response
@@ -312,6 +314,16 @@ impl From<PathRejection> for ApiError {
     }
 }
 
+/// The detail, without its middle where it is too long.
+pub(super) fn bounded(detail: String) -> String {
+    if detail.len() <= MAX_DETAIL_BYTES {
+        return detail;
+    }
+    let head = detail.floor_char_boundary(MAX_DETAIL_BYTES / 2);
+    let tail = detail.ceil_char_boundary(detail.len() - MAX_DETAIL_BYTES / 2);
+    format!("{} … {}", &detail[..head], &detail[tail..])
+}
+
 fn with_cause(error: &dyn std::error::Error) -> String {
     match error.source() {
         Some(source) => format!("{error}: {}", with_cause(source)),
@@ -333,3 +345,20 @@ pub(super) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavail
     Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\r\n\
     {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
     \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_detail_keeps_its_beginning_and_its_end() {
+        let long = format!("unknown field `{}` at line 1", "ä".repeat(1000));
+        let bounded = bounded(long.clone());
+        assert!(
+            bounded.len() < MAX_DETAIL_BYTES + 10 && bounded.starts_with("unknown field `ä"),
+            "{bounded}"
+        );
+        assert!(bounded.ends_with("ä` at line 1"), "{bounded}");
+        assert_eq!(super::bounded("short".to_owned()), "short");
+    }
+}

@@ -8,7 +8,7 @@ use tokio::sync::Notify;
 
 use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
 
-/// What a message weighs besides its images, in bytes: more than any but `ready` takes.
+/// What a message weighs besides its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
 
 /// What the writer does next.
@@ -140,6 +140,7 @@ fn bytes(message: &ServerMessage) -> usize {
     MESSAGE_BYTES
         + match message {
             ServerMessage::Prediction { frames, .. } => frames.iter().map(|frame| frame.0.len()).sum(),
+            ServerMessage::Error { detail, .. } | ServerMessage::Warning { detail, .. } => detail.len(),
             _ => 0,
         }
 }
