@@ -8,6 +8,7 @@ mod instance;
 pub mod job;
 mod notes;
 pub mod pipeline;
+mod priority;
 pub mod queue;
 mod runner;
 pub mod spec;

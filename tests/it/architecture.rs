@@ -21,7 +21,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
-    ("versions", &["types", "files", "registry", "serving", "store"]),
+    ("versions", &["types", "files", "telemetry", "registry", "serving", "store"]),
     (
         "jobs",
         &[
@@ -75,6 +75,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),
+    ("rustix", &["jobs"]),
 ];
 
 fn sources() -> Vec<(String, String)> {

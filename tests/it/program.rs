@@ -1,109 +1,15 @@
 //! The real program: what it says on the command line, and how it ends.
 
-use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
+use crate::process::{Served, foreframe, output, text};
 use crate::service::{PATIENCE, context, model, slow_spec, spec};
-
-fn foreframe(dir: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
-    command.current_dir(dir);
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("FOREFRAME_")) {
-        command.env_remove(name);
-    }
-    command
-}
-
-fn output(dir: &Path, arguments: &[&str]) -> Output {
-    foreframe(dir).args(arguments).output().unwrap()
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8(bytes.to_vec()).unwrap()
-}
-
-/// A running server; killed when a test ends before it.
-struct Served {
-    child: Child,
-    address: SocketAddr,
-    log: PathBuf,
-}
-
-impl Served {
-    fn start(dir: &Path, arguments: &[&str]) -> Self {
-        let log = dir.join("log");
-        let mut child = foreframe(dir)
-            .args(["serve", "--bind", "127.0.0.1:0"])
-            .args(arguments)
-            .env("RUST_LOG", "foreframe=debug")
-            .stdout(Stdio::piped())
-            .stderr(File::create(&log).unwrap())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.as_mut().unwrap())
-            .read_line(&mut line)
-            .unwrap();
-        let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
-        let served = Self {
-            address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
-            child,
-            log,
-        };
-        let deadline = Instant::now() + PATIENCE;
-        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
-            assert!(Instant::now() < deadline, "the server did not get ready");
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        served
-    }
-
-    fn get(&self, path: &str) -> String {
-        let mut stream = TcpStream::connect(self.address).unwrap();
-        write!(stream, "GET {path} HTTP/1.1\r\nhost: a\r\nconnection: close\r\n\r\n").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        answer
-    }
-
-    fn terminate(&self) {
-        let kill = Command::new("kill")
-            .args(["-TERM", &self.child.id().to_string()])
-            .status();
-        assert!(kill.unwrap().success());
-    }
-
-    /// Waits for the end; gives its log.
-    fn ended(mut self) -> String {
-        let deadline = Instant::now() + PATIENCE;
-        let status = loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                break status;
-            }
-            assert!(Instant::now() < deadline, "the server did not end");
-            std::thread::sleep(Duration::from_millis(5));
-        };
-        let log = std::fs::read_to_string(&self.log).unwrap();
-        assert!(status.success(), "{status}: {log}");
-        log
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        // It has ended already in a test that passes.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 /// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
 fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
