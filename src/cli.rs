@@ -1,5 +1,6 @@
 //! The command line: one file a subcommand. Exit code 2 for what was asked wrongly, 1 for what went wrong.
 
+mod alone;
 mod collect;
 mod config;
 mod error;
@@ -70,6 +71,7 @@ enum Command {
 /// Runs the program with the process's arguments and says how it ended.
 #[must_use]
 pub fn main() -> ExitCode {
+    alone::compute_alone();
     let Err(error) = run(Cli::parse().command) else {
         return ExitCode::SUCCESS;
     };

@@ -11,10 +11,10 @@ use serde_json::Value;
 
 use crate::service::PATIENCE;
 
-/// The program in a directory, with no setting from the environment.
+/// The program in a directory, with no setting from the environment, as users start it.
 pub(crate) fn foreframe(dir: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
-    command.current_dir(dir);
+    command.current_dir(dir).env_remove("CANDLE_NUM_THREADS");
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("FOREFRAME_")) {
         command.env_remove(name);
     }
