@@ -38,7 +38,9 @@ pub(super) async fn metrics(State(app): State<App>) -> impl IntoResponse {
 fn measure_jobs(counts: &[(String, String, i64)]) {
     for kind in JobSpec::KINDS {
         for state in JobState::ALL.map(JobState::name) {
-            let found = counts.iter().find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
+            let found = counts
+                .iter()
+                .find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
             gauge!(names::JOBS, "kind" => kind, "state" => state).set(found.map_or(0, |(.., count)| *count) as f64);
         }
     }

@@ -21,7 +21,10 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
-    ("versions", &["types", "files", "telemetry", "registry", "serving", "store"]),
+    (
+        "versions",
+        &["types", "files", "telemetry", "registry", "serving", "store"],
+    ),
     (
         "jobs",
         &[

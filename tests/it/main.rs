@@ -20,6 +20,7 @@ mod jobs_killed;
 mod jobs_priority;
 mod jobs_work;
 mod keys;
+mod metrics;
 mod nn_cell;
 mod nn_common;
 mod nn_model;

@@ -111,7 +111,7 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
         "foreframe_prediction_batch_size_sum{model=\"plain\"} 1",
         "foreframe_prediction_queue_wait_seconds_count{model=\"plain\"} 1",
         "foreframe_prediction_compute_seconds_count{model=\"plain\"} 1",
-        "foreframe_jobs{state=\"running\"} 0",
+        "foreframe_jobs{kind=\"train\",state=\"running\"} 0",
         "foreframe_streams_active 0",
         "foreframe_models_loaded 1",
         "# TYPE process_resident_memory_bytes gauge",
@@ -183,6 +183,7 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
     );
     let served = Served::start(dir.path(), &["--set", "key_refresh_ms=100"]);
     assert!(served.get("/v1/models").starts_with("HTTP/1.1 401"));
+    assert!(served.get("/metrics").contains("\nforeframe_auth_refused_total 1\n"));
     let ask = |key: &str| {
         served.get(&format!(
             "/v1/models HTTP/1.1\r\nauthorization: Bearer {}\r\nx:",
