@@ -48,6 +48,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         "server",
         &[
             "types",
+            "wording",
             "telemetry",
             "frame",
             "nn",
