@@ -107,7 +107,7 @@ impl From<ConfigError> for CliError {
 impl From<StoreError> for CliError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::Url { .. } => Self::Usage(error.to_string()),
+            StoreError::Url { .. } | StoreError::NoTls => Self::Usage(error.to_string()),
             other => Self::failed(other),
         }
     }
