@@ -18,6 +18,7 @@ use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
 use crate::versions::VersionError;
+use crate::wording::sentence;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -174,7 +175,7 @@ impl From<ServingError> for ApiError {
             ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(with_cause(&error)),
+            | ServingError::Thread(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -194,7 +195,7 @@ impl From<PredictError> for ApiError {
             PredictError::Picture(FrameError::Size { .. }) => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
-            PredictError::Picture(_) => Self::Internal(with_cause(&error)),
+            PredictError::Picture(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -202,7 +203,7 @@ impl From<PredictError> for ApiError {
 impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
-            ImageError::Encode(_) => Self::Internal(with_cause(&error)),
+            ImageError::Encode(_) => Self::Internal(sentence(&error)),
             _ => Self::Unprocessable(error.to_string()),
         }
     }
@@ -236,12 +237,15 @@ impl From<JobError> for ApiError {
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
             JobError::IllegalTransition { .. }
             | JobError::Taken { .. }
-            | JobError::Occupied { .. }
+            | JobError::Occupied(_)
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            JobError::Record { .. } | JobError::Instance(_) | JobError::Threads(_) | JobError::Store(_) => {
-                Self::Internal(with_cause(&error))
-            }
+            JobError::Record { .. }
+            | JobError::Instance(_)
+            | JobError::Threads(_)
+            | JobError::Dataset(_)
+            | JobError::Versions(_)
+            | JobError::Store(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -254,7 +258,7 @@ impl From<VersionError> for ApiError {
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(with_cause(&error))
+                Self::Internal(sentence(&error))
             }
         }
     }
@@ -264,7 +268,7 @@ impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
             DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(with_cause(&error)),
+            _ => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -322,13 +326,6 @@ pub(super) fn bounded(detail: String) -> String {
     let head = detail.floor_char_boundary(MAX_DETAIL_BYTES / 2);
     let tail = detail.ceil_char_boundary(detail.len() - MAX_DETAIL_BYTES / 2);
     format!("{} … {}", &detail[..head], &detail[tail..])
-}
-
-fn with_cause(error: &dyn std::error::Error) -> String {
-    match error.source() {
-        Some(source) => format!("{error}: {}", with_cause(source)),
-        None => error.to_string(),
-    }
 }
 
 /// The answer that a job was taken: accepted, where it can be watched, and what it is.

@@ -20,8 +20,10 @@ mod hostile_requests;
 mod hostile_streams;
 mod jobs;
 mod jobs_killed;
+mod jobs_priority;
 mod jobs_work;
 mod keys;
+mod metrics;
 mod neighbour;
 mod nn_cell;
 mod nn_common;
@@ -30,6 +32,7 @@ mod nn_optimizer;
 mod nn_spec;
 #[cfg(feature = "otlp")]
 mod otlp;
+mod process;
 mod program;
 mod rollouts;
 mod server;

@@ -1,8 +1,9 @@
 //! Traces of the real program at a collector.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::{TcpListener, TcpStream};
-use std::process::{Command, Stdio};
+use std::net::TcpListener;
+
+use crate::process::Served;
 
 /// Takes requests until one brings a trace, and gives its path and body.
 fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
@@ -32,27 +33,11 @@ fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
 fn requests_are_traced_to_a_collector() {
     let (dir, collector) = (tempfile::tempdir().unwrap(), TcpListener::bind("127.0.0.1:0").unwrap());
     let endpoint = format!("otlp_endpoint=http://{}", collector.local_addr().unwrap());
-    let mut server = Command::new(env!("CARGO_BIN_EXE_foreframe"))
-        .args(["serve", "--bind", "127.0.0.1:0", "--set", &endpoint])
-        .current_dir(dir.path())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(server.stdout.take().unwrap())
-        .read_line(&mut line)
-        .unwrap();
-    let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
-    let mut client = TcpStream::connect(address).unwrap();
-    client
-        .write_all(b"GET /v1/models HTTP/1.1\r\nhost: a\r\nconnection: close\r\n\r\n")
-        .unwrap();
-    client.read_to_string(&mut String::new()).unwrap();
-    let stopped = Command::new("kill").args(["-TERM", &server.id().to_string()]).status();
-    assert!(stopped.unwrap().success());
+    let server = Served::start(dir.path(), &["--set", &endpoint]);
+    server.get("/v1/models");
+    server.program.terminate();
     let (path, body) = first_trace(&collector);
-    assert!(server.wait().unwrap().success());
+    server.program.ended();
     assert_eq!(path, "POST /v1/traces HTTP/1.1");
     let holds = |text: &str| body.windows(text.len()).any(|part| part == text.as_bytes());
     // The service's name, and the request with its path.

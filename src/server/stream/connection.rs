@@ -7,6 +7,7 @@ use std::time::Duration;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
+use metrics::counter;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tracing::{debug, info, trace};
@@ -23,6 +24,7 @@ use crate::server::sessions::limits;
 use crate::server::sessions::session::{Hold, Holder, Session};
 use crate::server::{App, streams};
 use crate::serving::{Premise, STEP, Told};
+use crate::telemetry::names;
 use crate::types::{Action, RobotState};
 
 /// How long a client may take to hang up after the end was said, so that it has read it.
@@ -146,6 +148,8 @@ impl Connection {
             let item = match self.codec.decode::<ClientMessage>(&message) {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
+                    let model = &self.hold.session().model().manifest.name;
+                    counter!(names::STREAM_FRAMES, "model" => model.clone()).increment(1);
                     self.checked(frame)
                         .map_or_else(|error| Item::Refused(error.code(), error.to_string()), Item::Frame)
                 }

@@ -4,9 +4,11 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use metrics::counter;
 use tokio::sync::Notify;
 
 use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
+use crate::telemetry::names;
 
 /// What a message weighs besides its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
@@ -121,6 +123,7 @@ impl State {
         };
         self.bytes -= bytes(&message);
         self.dropped += 1;
+        counter!(names::STREAM_DROPPED).increment(1);
         true
     }
 
