@@ -1,6 +1,7 @@
 //! Foreframe sees a few moments ahead for robots: from camera frames, actions and state it predicts the frames to come.
 //!
 //! The modules in reading order; each uses only those above it:
+#![forbid(unsafe_code)]
 
 pub mod types;
 

@@ -32,6 +32,9 @@ pub use session::{SessionMemory, SessionState};
 pub use task::{Premise, Task};
 pub(crate) use task::{STEP, Told};
 
+/// A task of many futures takes that share of a batch, so that those who come meanwhile wait for less than a whole one.
+const PARTS_IN_A_BATCH: usize = 4;
+
 /// Why no prediction came.
 #[derive(Debug, thiserror::Error)]
 pub enum ServingError {
@@ -94,7 +97,7 @@ pub enum ServingError {
 pub struct PredictorConfig {
     /// Requests that may wait, at least 1.
     pub queue_capacity: usize,
-    /// Futures predicted together at most, at least 1, except that one task is never split.
+    /// Futures predicted together at most, at least 1.
     pub batch_limit: usize,
     /// How long a request may take from its arrival to its answer.
     pub deadline: Duration,
@@ -134,8 +137,18 @@ pub struct Computed {
     pub futures: Vec<Vec<Frame>>,
     /// Microseconds in the queue.
     pub queue_us: u64,
-    /// Microseconds of computation, of the whole batch.
+    /// Microseconds of computation, of whole batches.
     pub compute_us: u64,
+}
+
+impl Computed {
+    /// Adds what came of the next part.
+    fn append(&mut self, mut part: Self) {
+        self.features.append(&mut part.features);
+        self.futures.append(&mut part.futures);
+        self.queue_us += part.queue_us;
+        self.compute_us += part.compute_us;
+    }
 }
 
 /// The handle to the thread that owns the models; clones share it. The thread ends with the last of them.
@@ -148,6 +161,7 @@ struct Shared {
     queue: Arc<Queue>,
     catalog: Arc<Catalog>,
     deadline: Duration,
+    part_limit: usize,
     worker: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -169,6 +183,7 @@ impl Predictor {
                 queue,
                 catalog,
                 deadline: config.deadline,
+                part_limit: (config.batch_limit / PARTS_IN_A_BATCH).max(1),
                 worker: Mutex::new(Some(worker)),
             }),
         })
@@ -222,25 +237,45 @@ impl Predictor {
         })
     }
 
-    /// Computes a task, which is a step of that session if there is one: of a session, one step is in a batch. Dropping
-    /// the future withdraws it. Errors: `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
+    /// Computes a task, which is a step of that session if there is one: of a session, one step is in a batch. Many futures
+    /// are computed in parts, between which others have their turn. Dropping the future withdraws it.
+    /// Errors: `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
     pub async fn compute(
+        &self,
+        model: &Arc<LoadedModel>,
+        mut task: Task,
+        session: Option<u64>,
+    ) -> Result<Computed, ServingError> {
+        let deadline = Instant::now() + self.shared.deadline;
+        let mut whole = Computed::default();
+        loop {
+            let part = task.next_part(self.shared.part_limit);
+            let computed = self.compute_part(model, part, session, deadline).await?;
+            task.known.extend(computed.features.iter().cloned());
+            whole.append(computed);
+            if task.premises.is_empty() {
+                return Ok(whole);
+            }
+        }
+    }
+
+    async fn compute_part(
         &self,
         model: &Arc<LoadedModel>,
         task: Task,
         session: Option<u64>,
+        deadline: Instant,
     ) -> Result<Computed, ServingError> {
-        let accepted = Instant::now();
         let (reply, answer) = oneshot::channel();
         self.shared.queue.push(Waiting {
             model: Arc::clone(model),
             task,
             session,
-            accepted,
-            deadline: accepted + self.shared.deadline,
+            accepted: Instant::now(),
+            deadline,
             reply,
         })?;
-        match tokio::time::timeout(self.shared.deadline, answer).await {
+        match tokio::time::timeout_at(deadline.into(), answer).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(ServingError::Stopped),
             Err(_) => Err(ServingError::Deadline {

@@ -109,7 +109,9 @@ pub enum DatasetError {
         longest: usize,
     },
     /// Fewer windows than asked for.
-    #[error("{asked} windows asked of the {split} split, which has {available}; ask for fewer or collect more")]
+    #[error(
+        "data.windows is {asked}, but the {split} split has only {available}; ask for fewer (data.windows=all takes what there is) or collect more"
+    )]
     TooFewWindows {
         /// Windows asked for.
         asked: usize,

@@ -32,7 +32,7 @@ pub struct ServerConfig {
     pub max_frames: usize,
     /// Predictions that may wait; more are answered 503.
     pub max_queued_predictions: usize,
-    /// Futures predicted together at most; those of one request are never split.
+    /// Futures predicted together at most; of one request a quarter of that.
     pub max_batch: usize,
     /// Connections at a time; more are answered 503 and closed.
     pub max_connections: usize,

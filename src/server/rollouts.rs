@@ -74,7 +74,7 @@ impl WithFrames for RolloutRequest {
     }
 }
 
-/// Predicts what would come of each of many sequences of actions, in one batch. `Accept: image/png` gives a contact sheet
+/// Predicts what would come of each of many sequences of actions. `Accept: image/png` gives a contact sheet
 /// with a row for each, `image/gif` an animation with all of them side by side.
 #[utoipa::path(
     post, path = "/v1/models/{model}/rollouts", tag = "models", request_body = RolloutRequest,

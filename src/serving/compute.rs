@@ -64,11 +64,12 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Computati
     if premises.is_empty() {
         return Ok(computations);
     }
-    let values: Vec<f32> = windows
+    let values = windows
         .into_iter()
         .flatten()
-        .flat_map(|features| features.iter().copied())
-        .collect();
+        .map(AsRef::as_ref)
+        .collect::<Vec<&[f32]>>()
+        .concat();
     let mut futures = predict_windows(loaded, values, &window_of, &premises)?.into_iter();
     for (task, computation) in tasks.iter().zip(&mut computations) {
         computation.futures.extend(futures.by_ref().take(task.premises.len()));
@@ -83,8 +84,8 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
     if frames.is_empty() {
         return Ok(Vec::new());
     }
-    let values: Vec<f32> = frames.iter().flat_map(|frame| spec.preprocess.forward(frame)).collect();
-    let features = Tensor::from_vec(values, (frames.len(), spec.pixels()), &Device::Cpu)
+    let values: Vec<Vec<f32>> = frames.iter().map(|frame| spec.preprocess.forward(frame)).collect();
+    let features = Tensor::from_vec(values.concat(), (frames.len(), spec.pixels()), &Device::Cpu)
         .map_err(tensor_error)
         .and_then(|frames| {
             loaded

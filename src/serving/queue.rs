@@ -79,8 +79,11 @@ impl Queue {
             });
         }
         state.waiting.push_back(request);
-        meter::waiting(state.waiting.len());
+        let count = state.waiting.len();
+        // Whoever is woken takes the lock.
+        drop(state);
         self.arrived.notify_one();
+        meter::waiting(count);
         Ok(())
     }
 

@@ -127,6 +127,16 @@ impl Task {
             ..Self::default()
         })
     }
+
+    /// Takes out what is computed next: the frames, and the first futures up to a limit.
+    pub(super) fn next_part(&mut self, limit: usize) -> Self {
+        let later = self.premises.split_off(limit.min(self.premises.len()));
+        Self {
+            known: self.known.clone(),
+            frames: std::mem::take(&mut self.frames),
+            premises: std::mem::replace(&mut self.premises, later),
+        }
+    }
 }
 
 /// Whether there is an action for each predicted frame, and of each action every number.

@@ -91,7 +91,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
             "there is no data set \"moving\" in data/datasets; there are: static-observer",
         ),
         ("train --preset moving", "no data set \"moving-observer\""),
-        ("train", "windows asked of the train split, which has"),
+        ("train", "but the train split has only"),
         (
             "train --set model.context=90",
             "a window of 95 frames (90 seen, 5 to come) is longer than every episode",

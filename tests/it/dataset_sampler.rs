@@ -178,7 +178,7 @@ fn a_draw_of_more_windows_than_there_are_says_how_many_there_are() {
     let error = splits.sample(&dataset, Split::Train, shape, 1000, Seed(0)).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "1000 windows asked of the train split, which has 71; ask for fewer or collect more"
+        "data.windows is 1000, but the train split has only 71; ask for fewer (data.windows=all takes what there is) or collect more"
     );
 }
 

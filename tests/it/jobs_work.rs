@@ -118,6 +118,24 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
 }
 
 #[tokio::test]
+async fn the_jobs_in_the_readme_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let readme = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md")).unwrap();
+    let bodies = readme
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("-d '")?.strip_suffix('\''));
+    let jobs: Vec<Value> = bodies
+        .map(|body| serde_json::from_str(body).unwrap())
+        .filter(|body: &Value| body["kind"].is_string())
+        .collect();
+    assert!(jobs.len() >= 2, "{jobs:?}");
+    for job in jobs {
+        done(&app, &job).await;
+    }
+}
+
+#[tokio::test]
 async fn versions_are_swapped_refused_deleted_and_remembered() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

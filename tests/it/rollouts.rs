@@ -1,16 +1,21 @@
 //! Many futures of one context, and images as files.
 
+use std::pin::pin;
+
 use axum::body::Body;
 use axum::http::{Request, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::codec;
+use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::Codec;
 use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 
 use crate::client::{Client, Opened, send_frame, step};
-use crate::service::{Answer, CONTEXT, HEIGHT, WIDTH, app, context, frame, post, post_text, run, send};
+use crate::service::{
+    Answer, CONTEXT, HEIGHT, WIDTH, app, context, frame, model, post, post_text, run, send, slow_spec, start, with_data,
+};
 
 const ROLLOUTS: &str = "/v1/models/moving/rollouts";
 
@@ -53,6 +58,29 @@ async fn hundreds_of_candidates_come_to_what_each_would_alone() {
         assert!(difference(&futures[index], &alone["frames"]) <= 1);
     }
     assert!(difference(&futures[0], &futures[299]) > 0);
+}
+
+#[tokio::test]
+async fn others_are_answered_while_hundreds_of_candidates_are_computed() {
+    let dir = tempfile::tempdir().unwrap();
+    let spec = ModelSpec {
+        conditioning: Conditioning::StateAction,
+        ..slow_spec()
+    };
+    let config = with_data(dir.path(), ServerConfig::default());
+    let app = start(config, vec![model(dir.path(), "slow", spec)]);
+    let rollouts = json!({"frames": context(), "state": [0.5], "candidates": candidates(300)});
+    let mut rollouts = pin!(post(&app, "/v1/models/slow/rollouts", &rollouts));
+    let single = json!({"frames": context(), "state": [0.5], "actions": [[0.0, 0.0]]});
+    let mut answered = 0;
+    loop {
+        tokio::select! {
+            answer = &mut rollouts => break assert_eq!(answer.status, 200),
+            answer = post(&app, "/v1/models/slow/predict", &single) => answered += usize::from(answer.status == 200),
+        }
+    }
+    // Were they computed in one go, one prediction would fit before and one would wait for the end.
+    assert!(answered > 4, "{answered} answered");
 }
 
 #[tokio::test]
