@@ -160,6 +160,11 @@ impl Flown {
         self.latencies(|answer| answer.came - answer.scheduled)
     }
 
+    /// The server's processor time for each of the predictions that came in the time that counts, in microseconds.
+    pub(crate) fn each_us(&self) -> f64 {
+        1e4 * self.server_cpu / self.goodput_hz()
+    }
+
     /// Predictions a second that came in the time that counts.
     pub(crate) fn goodput_hz(&self) -> f64 {
         let came = |answer: &&Answer| (self.from..self.to).contains(&answer.came);

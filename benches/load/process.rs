@@ -73,7 +73,15 @@ impl CpuShare {
 
     /// In percent since it began.
     pub(crate) fn percent(&self) -> f64 {
-        let used = self.process.cpu().saturating_sub(self.before);
-        100.0 * used.as_secs_f64() / self.since.elapsed().as_secs_f64()
+        100.0 * self.used().as_secs_f64() / self.since.elapsed().as_secs_f64()
+    }
+
+    /// Processor time since it began for each of so many, in microseconds.
+    pub(crate) fn each_us(&self, count: usize) -> f64 {
+        1e6 * self.used().as_secs_f64() / count as f64
+    }
+
+    fn used(&self) -> Duration {
+        self.process.cpu().saturating_sub(self.before)
     }
 }

@@ -36,6 +36,9 @@ pub(crate) struct Args {
     /// Bound: memory of the last fifth of the time over that of the first
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
+    /// Predictions that may wait in the server
+    #[arg(long, default_value_t = 256)]
+    queue: usize,
     /// Connections that the requests share
     #[arg(long, default_value_t = 384)]
     connections: usize,

@@ -13,6 +13,7 @@ use crate::figures::{Bounds, Latencies};
 use crate::http::{Http, Request};
 use crate::material::Material;
 use crate::pace::Pace;
+use crate::process::CpuShare;
 use crate::server::Server;
 
 /// Connections that ask again and again, in search of the peak.
@@ -30,23 +31,28 @@ struct Tally {
 }
 
 pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
-    let mut server = Server::start(&args.target, &[]).await;
+    let mut server = Server::start(&args.target, &[("max_queued_predictions", args.queue)]).await;
     let request = Material::of(&args.target.model).predict_json();
     let mut peak_hz: f64 = 0.0;
     for level in LEVELS {
-        let tally = closed(level, &server, &request, args.peak_time()).await;
-        let goodput_hz = tally.answered.len() as f64 / args.peak_s;
-        println!("requests: {goodput_hz:.0} predictions/s of {level} connections that ask again and again");
+        let cpu = CpuShare::begin(server.process.clone());
+        let answered = closed(level, &server, &request, args.peak_time()).await.answered.len();
+        let (goodput_hz, each_us) = (answered as f64 / args.peak_s, cpu.each_us(answered));
+        println!(
+            "requests: {goodput_hz:.0} predictions/s of {level} connections that ask again and again, for {each_us:.0} µs \
+             of the server's processor time each"
+        );
         peak_hz = peak_hz.max(goodput_hz);
     }
     let (offered_hz, process) = (args.times * peak_hz, server.process.clone());
     let memory = tokio::spawn(watch_memory(process, args.time()));
+    let cpu = CpuShare::begin(server.process.clone());
     let (tally, held_back) = open(args, offered_hz, &server, &request).await;
     let latencies = Latencies::of(tally.answered);
-    let goodput_hz = latencies.len() as f64 / args.seconds;
+    let (goodput_hz, each_us) = (latencies.len() as f64 / args.seconds, cpu.each_us(latencies.len()));
     println!(
-        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s, {} of {} refused with Retry-After, \
-         {held_back} not sent for want of a connection; predictions {latencies}",
+        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s for {each_us:.0} µs each, {} of {} \
+         refused with Retry-After, {held_back} not sent for want of a connection; predictions {latencies}",
         args.seconds, tally.refused, tally.sent
     );
     args.hold_goodput(goodput_hz, peak_hz, bounds);

@@ -19,11 +19,7 @@ const AHEAD: usize = 2;
 const KNOCK_EVERY: Duration = Duration::from_millis(100);
 
 pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
-    // A queue shorter than there are streams, so that it is full at times.
-    let settings = [
-        ("max_streams", args.sessions),
-        ("max_queued_predictions", args.sessions / 4),
-    ];
+    let settings = [("max_streams", args.sessions), ("max_queued_predictions", args.queue)];
     let mut server = Server::start(&args.target, &settings).await;
     let material = Arc::new(Material::of(&args.target.model));
     let mut peak_hz: f64 = 0.0;
@@ -34,8 +30,13 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
             warm_up: WARM_UP,
             measured: args.peak_time(),
         };
-        let goodput_hz = flight.run(&server, &material).await.goodput_hz();
-        println!("streams: {goodput_hz:.0} predictions/s of {sessions} sessions that keep {AHEAD} frames ahead");
+        let flown = flight.run(&server, &material).await;
+        let goodput_hz = flown.goodput_hz();
+        println!(
+            "streams: {goodput_hz:.0} predictions/s of {sessions} sessions that keep {AHEAD} frames ahead, for {:.0} µs of \
+             the server's processor time each",
+            flown.each_us()
+        );
         peak_hz = peak_hz.max(goodput_hz);
     }
     let offered_hz = args.times * peak_hz;
@@ -49,9 +50,10 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
     let (flown, (knocks, untold)) = tokio::join!(flight.run(&server, &material), knock(args, &server));
     let (goodput_hz, tally) = (flown.goodput_hz(), &flown.tally);
     println!(
-        "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s; of {} frames {} refused, {} \
-         dropped, {} not sent for want of room in the socket; {knocks} streams over the limit refused; predictions {}",
+        "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s for {:.0} µs each; of {} frames {} \
+         refused, {} dropped, {} not sent for want of room in the socket; {knocks} streams over the limit refused; predictions {}",
         args.seconds,
+        flown.each_us(),
         tally.sent + flown.held_back,
         tally.overloaded,
         tally.dropped,
