@@ -1,6 +1,7 @@
 //! The service over HTTP and WebSocket: [`serve`] answers until told to stop, then ends what it began. [`App`] is what
 //! the handlers share, [`protocol`] the stream's messages, [`openapi`] the contract.
 
+mod admission;
 mod config;
 mod connections;
 mod dashboard;
@@ -38,11 +39,13 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
+use axum::middleware::from_fn_with_state;
 use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
 use tokio::time::{timeout, timeout_at};
 use tracing::{info, warn};
 
+use admission::Admission;
 pub use config::ServerConfig;
 use connections::Connections;
 use environments::Environments;
@@ -116,6 +119,7 @@ struct Shared {
     store: Store,
     versions: Versions,
     streams: Streams,
+    admission: Admission,
     environments: Environments,
     draining: AtomicBool,
     sessions: Table,
@@ -150,6 +154,7 @@ impl App {
     #[must_use]
     pub fn with_parts(config: ServerConfig, predictor: Predictor, jobs: Jobs, store: Store) -> Self {
         let streams = Streams::new(config.max_streams);
+        let admission = Admission::new(&config);
         let idle = Duration::from_millis(config.environment_idle_ms);
         let environments = Environments::new(config.max_environments, idle);
         let sessions = Table::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
@@ -162,6 +167,7 @@ impl App {
                 store,
                 versions,
                 streams,
+                admission,
                 environments,
                 draining: AtomicBool::new(false),
                 sessions,
@@ -216,6 +222,10 @@ impl App {
         &self.shared.streams
     }
 
+    fn admission(&self) -> &Admission {
+        &self.shared.admission
+    }
+
     fn environments(&self) -> &Environments {
         &self.shared.environments
     }
@@ -257,8 +267,8 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
-        .layer(axum::middleware::from_fn_with_state(app.clone(), origin::check))
-        .layer(axum::middleware::from_fn_with_state(app.clone(), middleware::trace))
+        .layer(from_fn_with_state(app.clone(), origin::check))
+        .layer(from_fn_with_state(app.clone(), middleware::trace))
         .with_state(app)
 }
 
@@ -271,7 +281,10 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/models/{model}", get(models::get))
         .route("/v1/models/{model}/versions/{version}", delete(models::delete))
         .route("/v1/models/{model}/versions/{version}/activate", post(models::activate))
-        .route("/v1/models/{model}/predict", post(predict::predict))
+        .route(
+            "/v1/models/{model}/predict",
+            post(predict::predict).layer(from_fn_with_state(app.clone(), admission::check)),
+        )
         .route("/v1/models/{model}/preview.png", get(preview::preview))
         .route("/v1/models/{model}/rollouts", post(rollouts::of_model))
         .route("/v1/models/{model}/stream", get(stream::of_model))
@@ -302,7 +315,7 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/environments/{id}", delete(environments::delete))
         .route("/v1/environments/{id}/reset", post(environments::reset))
         .route("/v1/environments/{id}/step", post(environments::step))
-        .route_layer(axum::middleware::from_fn_with_state(app.clone(), keys::check))
+        .route_layer(from_fn_with_state(app.clone(), keys::check))
 }
 
 /// Answers on the listener until `shutdown` completes. Then it is not ready but goes on for `drain_ms`; takes no more

@@ -28,6 +28,8 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     telemetry::record();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
+        // Each such thread keeps memory, and many that decode would leave the one that predicts few turns.
+        .max_blocking_threads(config.server.request_threads)
         .build()
         .map_err(CliError::failed)?;
     let result = runtime.block_on(listen(config));

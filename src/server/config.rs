@@ -60,6 +60,8 @@ pub struct ServerConfig {
     pub max_job_log_lines: usize,
     /// Threads that the work of jobs may use.
     pub job_threads: usize,
+    /// Threads that decode and encode images, simulate and read files for requests; more such work waits.
+    pub request_threads: usize,
     /// How long a process that works on a job may be silent before others take it, in milliseconds.
     pub job_lease_ms: u64,
     /// How long a prediction may take, queue and all, in milliseconds.
@@ -119,6 +121,7 @@ impl Default for ServerConfig {
             max_ended_jobs: 100,
             max_job_log_lines: 1000,
             job_threads: spare_cores(),
+            request_threads: 4,
             job_lease_ms: 30_000,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
@@ -196,6 +199,7 @@ impl ServerConfig {
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
             ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
             ("job_threads", self.job_threads as u64, 1..=1024),
+            ("request_threads", self.request_threads as u64, 1..=1024),
             ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
@@ -282,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn jobs_without_threads_or_room_or_with_a_lease_that_runs_out_at_once_are_refused() {
+    fn requests_or_jobs_without_threads_or_room_or_with_a_lease_that_runs_out_at_once_are_refused() {
         let roomless = ServerConfig {
             max_job_bytes: 0,
             ..ServerConfig::default()
@@ -295,6 +299,12 @@ mod tests {
         };
         let error = threadless.validate().unwrap_err().to_string();
         assert_eq!(error, "job_threads is 0; it must be 1 to 1024");
+        let handless = ServerConfig {
+            request_threads: 0,
+            ..ServerConfig::default()
+        };
+        let error = handless.validate().unwrap_err().to_string();
+        assert_eq!(error, "request_threads is 0; it must be 1 to 1024");
         let hasty = ServerConfig {
             job_lease_ms: 10,
             ..ServerConfig::default()

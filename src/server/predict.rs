@@ -132,6 +132,7 @@ pub(super) async fn predict(
     Upload(request): Upload<PredictRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
+    let _place = app.admission().enter()?;
     let (manifest, format) = (Arc::clone(&model.manifest), request.format);
     let max_frames = app.config().max_frames;
     let input = blocking(move || request.into_input(&manifest, max_frames)).await??;

@@ -1,0 +1,212 @@
+//! Sessions and requests that come and go.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use foreframe::server::protocol::{ClientMessage, CloseMessage, ServerMessage};
+use futures_util::SinkExt as _;
+use tokio::task::JoinSet;
+
+use crate::figures::Bounds;
+use crate::http::{Http, Request};
+use crate::material::{self, Material};
+use crate::process::Taken;
+use crate::server::{Server, Target};
+use crate::session::{self, Session};
+
+/// Parts of the load, after each of which memory is told.
+const PARTS: u64 = 5;
+/// What comes before it counts is a tenth, at most so many sessions; of requests ten times that.
+const MOST_WARM_UP: u64 = 1000;
+/// How long the server may take to notice that connections ended, and to let idle threads go.
+const SETTLE_LIMIT: Duration = Duration::from_secs(20);
+/// How long memory is left alone before it is looked at.
+const REST: Duration = Duration::from_secs(1);
+
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    target: Target,
+    /// Sessions to open, to stream on, to close and to delete
+    #[arg(long, default_value_t = 500)]
+    sessions: u64,
+    /// Requests of many kinds after that, a fifth of them predictions
+    #[arg(long, default_value_t = 5000)]
+    requests: u64,
+    /// Frames of each session
+    #[arg(long, default_value_t = 6)]
+    frames: u64,
+    /// How many do so at a time, each on a kept connection
+    #[arg(long, default_value_t = 8)]
+    workers: usize,
+    /// Bound: growth of the server's memory after the first tenth
+    #[arg(long, default_value_t = 10.0)]
+    growth_mb: f64,
+}
+
+/// What is done again and again.
+#[derive(Clone)]
+enum Deed {
+    /// A session from its opening to its deletion, with so many frames.
+    Session(u64),
+    /// Requests by turns, each with the status that it shall have.
+    Requests(Arc<[(Request, u16)]>),
+}
+
+type Faults = BTreeMap<String, u64>;
+
+pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+    let mut server = Server::start(&args.target, &[]).await;
+    let material = Arc::new(Material::of(&args.target.model));
+    let deeds = [
+        (Deed::Session(args.frames), args.sessions, MOST_WARM_UP, "sessions"),
+        (
+            Deed::Requests(kinds(&material)),
+            args.requests,
+            10 * MOST_WARM_UP,
+            "requests",
+        ),
+    ];
+    let mut faults = Faults::new();
+    let mut doing = async |deed: &Deed, count| {
+        for fault in many(args.workers, server.address, (deed, count), &material).await {
+            *faults.entry(fault).or_default() += 1;
+        }
+    };
+    for (deed, count, most, _) in &deeds {
+        doing(deed, (count / 10).min(*most)).await;
+    }
+    tokio::time::sleep(REST).await;
+    let before = server.process.taken();
+    println!("after the warm-up: {}", list(&before));
+    for (deed, count, _, name) in &deeds {
+        let (since, part) = (Instant::now(), count / PARTS);
+        for done in 1..=PARTS {
+            doing(deed, part).await;
+            println!("after {} {name}: {}", done * part, list(&server.process.taken()));
+        }
+        println!("{:.0} {name}/s", (PARTS * part) as f64 / since.elapsed().as_secs_f64());
+    }
+    bounds.hold(
+        faults.is_empty(),
+        format!("every request and every frame was answered as it should {faults:?}"),
+    );
+    let after = settled(&server, &before).await;
+    println!("at the end: {}", list(&after));
+    let growth_mb = after.rss_mb - before.rss_mb;
+    let what = format!("memory grew by {growth_mb:.1} MB, at most {} MB", args.growth_mb);
+    bounds.hold(growth_mb <= args.growth_mb, what);
+    bounds.hold(after.descriptors <= before.descriptors, "no descriptor was lost");
+    bounds.hold(after.threads <= before.threads, "no thread was lost");
+    server.check(bounds);
+}
+
+fn list(taken: &Taken) -> String {
+    format!(
+        "{:.1} MB, {} descriptors, {} threads",
+        taken.rss_mb, taken.descriptors, taken.threads
+    )
+}
+
+/// What the server takes when it rests: no more than before, or what it is after a while.
+async fn settled(server: &Server, before: &Taken) -> Taken {
+    let since = Instant::now();
+    loop {
+        tokio::time::sleep(REST).await;
+        let taken = server.process.taken();
+        let is_settled = taken.descriptors <= before.descriptors && taken.threads <= before.threads;
+        if is_settled || since.elapsed() > SETTLE_LIMIT {
+            return taken;
+        }
+    }
+}
+
+/// Cheap ones and middling ones, predictions and refusals among them.
+fn kinds(material: &Material) -> Arc<[(Request, u16)]> {
+    let get = |path: &str, status| (Request::get(path), status);
+    Arc::new([
+        (material.predict_json(), 200),
+        get("/livez", 200),
+        get(&format!("/v1/models/{}", material.model()), 200),
+        get("/v1/sessions", 200),
+        get("/v1/sessions/none", 404),
+        (material.predict_form(), 200),
+        get("/readyz", 200),
+        get("/v1/models", 200),
+        get("/v1/jobs", 200),
+        get("/metrics", 200),
+    ])
+}
+
+/// Does so many deeds, several at a time; what went wrong.
+async fn many(
+    workers: usize,
+    address: SocketAddr,
+    (deed, count): (&Deed, u64),
+    material: &Arc<Material>,
+) -> Vec<String> {
+    let next = Arc::new(AtomicU64::new(0));
+    let mut working = JoinSet::new();
+    for _ in 0..workers {
+        let (next, deed, material) = (Arc::clone(&next), deed.clone(), Arc::clone(material));
+        let mut http = Http::new(address);
+        working.spawn(async move {
+            let mut faults = Vec::new();
+            loop {
+                let index = next.fetch_add(1, Ordering::Relaxed);
+                if index >= count {
+                    return faults;
+                }
+                let done = match &deed {
+                    Deed::Session(frames) => session(&mut http, address, &material, *frames).await,
+                    Deed::Requests(kinds) => {
+                        let (request, status) = &kinds[index as usize % kinds.len()];
+                        ask(&mut http, request, *status).await.map(drop)
+                    }
+                };
+                faults.extend(done.err());
+            }
+        });
+    }
+    working.join_all().await.concat()
+}
+
+async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::http::Answer, String> {
+    let answer = http.ask(request).await.map_err(|error| format!("no answer: {error}"))?;
+    if answer.status == status {
+        Ok(answer)
+    } else {
+        Err(format!("{} for {status}: {}", answer.status, answer.text()))
+    }
+}
+
+/// Opens a session and its stream, has a prediction of each frame that fills the context, closes and deletes.
+async fn session(http: &mut Http, address: SocketAddr, material: &Material, frames: u64) -> Result<(), String> {
+    let session = Session::of(&ask(http, &Session::request(material.model()), 201).await?);
+    let socket = session::connect(address, &session.stream_path()).await;
+    let mut socket = socket.map_err(|error| format!("no stream: {error}"))?;
+    for seq in 0..frames {
+        socket
+            .send(material.frame(seq))
+            .await
+            .map_err(|error| error.to_string())?;
+        let is_full = seq + 1 >= material.context();
+        match session::receive(&mut socket).await {
+            Some(ServerMessage::Prediction { seq: of, .. }) if is_full && of == seq => {}
+            Some(ServerMessage::Warming { seq: of, .. }) if !is_full && of == seq => {}
+            other => return Err(format!("frame {seq} was answered with {other:?}")),
+        }
+    }
+    let close = material::message(&ClientMessage::Close(CloseMessage {}));
+    socket.send(close).await.map_err(|error| error.to_string())?;
+    match session::receive(&mut socket).await {
+        Some(ServerMessage::Closing { .. }) => {}
+        other => return Err(format!("the close was answered with {other:?}")),
+    }
+    // The rest of the closing, so that no socket is cut off.
+    while session::receive(&mut socket).await.is_some() {}
+    ask(http, &session.deletion(), 204).await.map(drop)
+}

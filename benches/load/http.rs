@@ -1,0 +1,147 @@
+//! A client of HTTP/1.1 that takes little of the machine: one connection, kept, and bodies of a stated length.
+
+use std::io::{self, ErrorKind};
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use serde_json::Value;
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+/// Whoever has no answer by then gets none: longer than any deadline of the server.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
+
+/// A request as it goes over the wire.
+#[derive(Clone)]
+pub(crate) struct Request(Vec<u8>);
+
+impl Request {
+    fn new(line: &str, headers: &str, body: &[u8]) -> Self {
+        let head = format!(
+            "{line} HTTP/1.1\r\nhost: a\r\n{headers}content-length: {}\r\n\r\n",
+            body.len()
+        );
+        Self([head.as_bytes(), body].concat())
+    }
+
+    pub(crate) fn get(path: &str) -> Self {
+        Self::new(&format!("GET {path}"), "", &[])
+    }
+
+    pub(crate) fn delete(path: &str) -> Self {
+        Self::new(&format!("DELETE {path}"), "", &[])
+    }
+
+    pub(crate) fn post(path: &str, content_type: &str, body: &[u8]) -> Self {
+        Self::new(
+            &format!("POST {path}"),
+            &format!("content-type: {content_type}\r\n"),
+            body,
+        )
+    }
+
+    pub(crate) fn json(path: &str, body: &Value) -> Self {
+        Self::post(path, "application/json", body.to_string().as_bytes())
+    }
+}
+
+/// What came back.
+#[derive(Default)]
+pub(crate) struct Answer {
+    pub(crate) status: u16,
+    /// Whether it says when to try again.
+    pub(crate) retry_after: bool,
+    pub(crate) body: Vec<u8>,
+}
+
+impl Answer {
+    pub(crate) fn text(&self) -> String {
+        String::from_utf8_lossy(&self.body).into_owned()
+    }
+
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.text()))
+    }
+
+    /// Whether it is a refusal that its sender can do something with.
+    pub(crate) fn is_refusal(&self) -> bool {
+        matches!(self.status, 429 | 503) && self.retry_after
+    }
+}
+
+/// One connection, opened when it is needed.
+pub(crate) struct Http {
+    address: SocketAddr,
+    stream: Option<BufReader<TcpStream>>,
+}
+
+impl Http {
+    pub(crate) fn new(address: SocketAddr) -> Self {
+        Self { address, stream: None }
+    }
+
+    /// The answer. Errors: the connection ended before it, or it did not come.
+    pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Answer> {
+        timeout(PATIENCE, self.exchange(request))
+            .await
+            .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
+    }
+
+    /// The answer, which has to have that status.
+    pub(crate) async fn expect(&mut self, status: u16, request: &Request) -> Answer {
+        let answer = self.ask(request).await.expect("the server answers");
+        assert_eq!(answer.status, status, "{}", answer.text());
+        answer
+    }
+
+    async fn exchange(&mut self, request: &Request) -> io::Result<Answer> {
+        let mut stream = match self.stream.take() {
+            Some(stream) => stream,
+            None => connect(self.address).await?,
+        };
+        stream.get_mut().write_all(&request.0).await?;
+        let (answer, is_last) = read(&mut stream).await?;
+        self.stream = (!is_last).then_some(stream);
+        Ok(answer)
+    }
+}
+
+async fn connect(address: SocketAddr) -> io::Result<BufReader<TcpStream>> {
+    let stream = TcpStream::connect(address).await?;
+    stream.set_nodelay(true)?;
+    Ok(BufReader::new(stream))
+}
+
+/// The answer, and whether the connection ends with it.
+async fn read(stream: &mut BufReader<TcpStream>) -> io::Result<(Answer, bool)> {
+    let (mut answer, mut length, mut is_last) = (Answer::default(), None, false);
+    let mut line = String::new();
+    stream.read_line(&mut line).await?;
+    let status = line.split(' ').nth(1).and_then(|status| status.parse().ok());
+    answer.status = status.ok_or(ErrorKind::UnexpectedEof)?;
+    loop {
+        line.clear();
+        if stream.read_line(&mut line).await? == 0 {
+            return Err(ErrorKind::UnexpectedEof.into());
+        }
+        let Some((name, value)) = line.trim_end().split_once(": ") else {
+            break;
+        };
+        match name.to_ascii_lowercase().as_str() {
+            "content-length" => length = value.parse().ok(),
+            "retry-after" => answer.retry_after = value.parse::<u64>().is_ok(),
+            "connection" => is_last = value == "close",
+            _ => {}
+        }
+    }
+    match length {
+        Some(length) => {
+            answer.body.resize(length, 0);
+            stream.read_exact(&mut answer.body).await?;
+        }
+        None if is_last => drop(stream.read_to_end(&mut answer.body).await?),
+        None => {}
+    }
+    Ok((answer, is_last))
+}

@@ -1,0 +1,122 @@
+//! A robot: sends frames when it is told to, and notes what comes back.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use foreframe::server::protocol::{ClientMessage, CloseMessage, ErrorCode, ServerMessage};
+use futures_util::{SinkExt as _, StreamExt as _};
+use tokio::sync::mpsc;
+
+use crate::material::{self, Material};
+use crate::session::{self, Socket};
+
+/// What came of a robot's frames, or of many robots'.
+#[derive(Default)]
+pub(crate) struct Tally {
+    pub(crate) sent: u64,
+    /// Frames that only filled the context.
+    pub(crate) warming: u64,
+    /// Refused because the server is too busy.
+    pub(crate) overloaded: u64,
+    /// Refused for other reasons, and why the first was.
+    pub(crate) refused: u64,
+    pub(crate) first_refusal: Option<String>,
+    /// Left out because they were read too slowly.
+    pub(crate) dropped: u64,
+    pub(crate) answers: Vec<Answer>,
+}
+
+/// A prediction.
+#[derive(Clone, Copy)]
+pub(crate) struct Answer {
+    /// When its frame was to be sent.
+    pub(crate) scheduled: Instant,
+    /// When its frame was in fact sent.
+    pub(crate) sent: Instant,
+    /// When it came.
+    pub(crate) came: Instant,
+    /// Of that the model's computation.
+    pub(crate) compute: Duration,
+}
+
+impl Tally {
+    /// Frames of which nothing was heard again.
+    pub(crate) fn unanswered(&self) -> u64 {
+        let heard = self.answers.len() as u64 + self.warming + self.overloaded + self.refused + self.dropped;
+        self.sent.saturating_sub(heard)
+    }
+
+    pub(crate) fn add(&mut self, other: Self) {
+        self.sent += other.sent;
+        self.warming += other.warming;
+        self.overloaded += other.overloaded;
+        self.refused += other.refused;
+        self.dropped += other.dropped;
+        self.answers.extend(other.answers);
+        self.first_refusal = self.first_refusal.take().or(other.first_refusal);
+    }
+}
+
+/// Sends a frame at each cue, which is the time that it was scheduled for, and closes after the last. Calls `answered`
+/// after each answer.
+pub(crate) async fn fly(
+    socket: Socket,
+    material: Arc<Material>,
+    mut cues: mpsc::Receiver<Instant>,
+    mut answered: impl FnMut(),
+) -> Tally {
+    let (mut sender, mut receiver) = socket.split();
+    // Of every frame when it was to be sent, and when it was.
+    let log = Mutex::new(Vec::<(Instant, Instant)>::new());
+    let sending = async {
+        while let Some(scheduled) = cues.recv().await {
+            let seq = {
+                let mut log = log.lock().unwrap();
+                log.push((scheduled, Instant::now()));
+                log.len() as u64 - 1
+            };
+            if sender.send(material.frame(seq)).await.is_err() {
+                return;
+            }
+        }
+        let close = material::message(&ClientMessage::Close(CloseMessage {}));
+        // If it is gone, the receiver knows as well.
+        let _ = sender.send(close).await;
+    };
+    let receiving = async {
+        let mut tally = Tally::default();
+        while let Some(message) = session::receive(&mut receiver).await {
+            let came = Instant::now();
+            match message {
+                ServerMessage::Prediction {
+                    seq, timing, dropped, ..
+                } => {
+                    let (scheduled, sent) = log.lock().unwrap()[seq as usize];
+                    let compute = Duration::from_micros(timing.compute_us);
+                    tally.answers.push(Answer {
+                        scheduled,
+                        sent,
+                        came,
+                        compute,
+                    });
+                    tally.dropped += dropped;
+                }
+                ServerMessage::Warming { .. } => tally.warming += 1,
+                ServerMessage::Error {
+                    code: ErrorCode::Overloaded,
+                    ..
+                } => tally.overloaded += 1,
+                ServerMessage::Error { code, detail, .. } => {
+                    tally.refused += 1;
+                    tally.first_refusal.get_or_insert(format!("{code:?}: {detail}"));
+                }
+                _ => continue,
+            }
+            answered();
+        }
+        tally
+    };
+    let ((), mut tally) = tokio::join!(sending, receiving);
+    tally.sent = log.lock().unwrap().len() as u64;
+    tally
+}

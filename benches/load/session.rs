@@ -1,0 +1,84 @@
+//! Sessions and their sockets.
+
+use std::io;
+use std::net::SocketAddr;
+
+use axum::http::HeaderValue;
+use foreframe::server::protocol::{Codec, ServerMessage};
+use futures_util::StreamExt as _;
+use serde_json::json;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::tungstenite::{Error, Message};
+
+use crate::http::{Answer, Http, PATIENCE, Request};
+
+pub(crate) type Socket = WebSocketStream<TcpStream>;
+
+/// A session as it was opened.
+pub(crate) struct Session {
+    id: String,
+    token: String,
+}
+
+impl Session {
+    /// The request for one, that goes on with what comes when frames are missing: robots want the present.
+    pub(crate) fn request(model: &str) -> Request {
+        Request::json("/v1/sessions", &json!({"model": model, "on_gap": "skip"}))
+    }
+
+    pub(crate) fn of(answer: &Answer) -> Self {
+        let answer = answer.json();
+        let text = |field: &str| answer[field].as_str().expect("a session").to_owned();
+        Self {
+            id: text("id"),
+            token: text("token"),
+        }
+    }
+
+    pub(crate) async fn open(http: &mut Http, model: &str) -> Self {
+        Self::of(&http.expect(201, &Self::request(model)).await)
+    }
+
+    pub(crate) fn stream_path(&self) -> String {
+        format!("/v1/sessions/{}/stream?token={}", self.id, self.token)
+    }
+
+    pub(crate) fn deletion(&self) -> Request {
+        Request::delete(&format!("/v1/sessions/{}?token={}", self.id, self.token))
+    }
+}
+
+/// A stream whose `ready` has been read.
+pub(crate) async fn connect(address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
+    let stream = TcpStream::connect(address).await.map_err(Error::Io)?;
+    stream.set_nodelay(true).map_err(Error::Io)?;
+    over(stream, address, path).await
+}
+
+/// The same over a socket of one's own.
+pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
+    let mut request = format!("ws://{address}{path}").into_client_request()?;
+    let protocol = HeaderValue::from_static(Codec::Msgpack.name());
+    request.headers_mut().insert("sec-websocket-protocol", protocol);
+    let (mut socket, _) = tokio_tungstenite::client_async(request, stream).await?;
+    match receive(&mut socket).await {
+        Some(ServerMessage::Ready { .. }) => Ok(socket),
+        _ => Err(Box::new(Error::Io(io::ErrorKind::InvalidData.into()))),
+    }
+}
+
+/// The next message of the server; none at the end, or where none comes.
+pub(crate) async fn receive(
+    socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
+) -> Option<ServerMessage> {
+    loop {
+        match timeout(PATIENCE, socket.next()).await {
+            Ok(Some(Ok(Message::Binary(bytes)))) => return Some(rmp_serde::from_slice(&bytes).unwrap()),
+            Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => {}
+            _ => return None,
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! A socket that sends and never reads, beside robots that do.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::SinkExt as _;
+use tokio::net::TcpSocket;
+
+use crate::figures::{Bounds, median};
+use crate::flight::{Drive, Flight};
+use crate::material::Material;
+use crate::process::Process;
+use crate::server::{Server, Target};
+use crate::session;
+
+/// Small, so that what is not read waits in the server and not in this process.
+const RECEIVE_BUFFER_BYTES: u32 = 4096;
+
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    target: Target,
+    /// Sessions that read
+    #[arg(long, default_value_t = 20)]
+    sessions: usize,
+    /// Frames a second of each session
+    #[arg(long, default_value_t = 30.0)]
+    rate_hz: f64,
+    /// Frames a second of the socket that never reads; 0 for as many as it takes
+    #[arg(long, default_value_t = 30.0)]
+    slow_rate_hz: f64,
+    /// How often to measure without and with that socket, by turns
+    #[arg(long, default_value_t = 3)]
+    rounds: usize,
+    /// How long to measure each time
+    #[arg(long, default_value_t = 5.0)]
+    seconds: f64,
+    /// How long to send before that; frames of that time are not counted
+    #[arg(long, default_value_t = 1.0)]
+    warm_up_s: f64,
+    /// Bound: how much longer the 99th percentile is beside that socket, as a share
+    #[arg(long, default_value_t = 0.1)]
+    p99_share: f64,
+    /// What it may be longer besides: as much as two measurements of the same differ
+    #[arg(long, default_value_t = 0.3)]
+    noise_ms: f64,
+    /// Bound: how much more memory the server takes beside that socket
+    #[arg(long, default_value_t = 10.0)]
+    growth_mb: f64,
+}
+
+/// What was measured one time.
+struct Round {
+    p99_ms: f64,
+    rss_mb: f64,
+    unanswered: u64,
+}
+
+pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+    let mut server = Server::start(&args.target, &[]).await;
+    let material = Arc::new(Material::of(&args.target.model));
+    let (mut alone, mut beside) = (Vec::new(), Vec::new());
+    for _ in 0..args.rounds {
+        alone.push(round(args, &server, &material).await);
+        let stuck = tokio::spawn(never_read(server.address, Arc::clone(&material), args.slow_rate_hz));
+        beside.push(round(args, &server, &material).await);
+        stuck.abort();
+    }
+    let list = |rounds: &[Round]| {
+        let each: Vec<String> = rounds.iter().map(|round| format!("{:.2}", round.p99_ms)).collect();
+        each.join(", ")
+    };
+    println!(
+        "p99 from schedule of {} sessions alone: {} ms",
+        args.sessions,
+        list(&alone)
+    );
+    println!("beside a socket that never reads: {} ms", list(&beside));
+    let p99_ms = |rounds: &[Round]| median(rounds.iter().map(|round| round.p99_ms).collect());
+    let (before_ms, after_ms) = (p99_ms(&alone), p99_ms(&beside));
+    let limit_ms = before_ms * (1.0 + args.p99_share) + args.noise_ms;
+    let what = format!("the p99 in the middle, {before_ms:.2} ms alone, is {after_ms:.2} ms, at most {limit_ms:.2}");
+    bounds.hold(after_ms <= limit_ms, what);
+    let lost: u64 = alone.iter().chain(&beside).map(|round| round.unanswered).sum();
+    bounds.hold(lost == 0, "every frame of those that read was predicted");
+    let rss_mb = |rounds: &[Round]| rounds.iter().map(|round| round.rss_mb).fold(0.0, f64::max);
+    let growth_mb = rss_mb(&beside) - alone.first().map_or(0.0, |round| round.rss_mb);
+    let what = format!(
+        "the server takes {growth_mb:.1} MB more memory, at most {} MB",
+        args.growth_mb
+    );
+    bounds.hold(growth_mb <= args.growth_mb, what);
+    server.check(bounds);
+}
+
+async fn round(args: &Args, server: &Server, material: &Arc<Material>) -> Round {
+    let flight = Flight {
+        sessions: args.sessions,
+        drive: Drive::Paced(args.rate_hz),
+        warm_up: Duration::from_secs_f64(args.warm_up_s),
+        measured: Duration::from_secs_f64(args.seconds),
+    };
+    let flown = flight.run(server, material).await;
+    Round {
+        p99_ms: flown.since_schedule().at_ms(0.99),
+        rss_mb: Process::taken(&server.process).rss_mb,
+        unanswered: flown.tally.sent - flown.tally.warming - flown.tally.answers.len() as u64,
+    }
+}
+
+/// Sends and never reads; begins anew when the server has enough of it.
+async fn never_read(address: SocketAddr, material: Arc<Material>, rate_hz: f64) {
+    let path = format!("/v1/models/{}/stream", material.model());
+    loop {
+        let socket = TcpSocket::new_v4().unwrap();
+        socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES).unwrap();
+        let stream = socket.connect(address).await.unwrap();
+        let mut socket = session::over(stream, address, &path).await.expect("a stream");
+        let mut seq = 0;
+        while socket.send(material.frame(seq)).await.is_ok() {
+            seq += 1;
+            if rate_hz > 0.0 {
+                tokio::time::sleep(Duration::from_secs_f64(1.0 / rate_hz)).await;
+            }
+        }
+    }
+}
