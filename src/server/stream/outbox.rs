@@ -106,10 +106,7 @@ impl State {
         let was_dropping = self.dropped > 0;
         while self.bytes + bytes(&message) > limit_bytes && self.drop_oldest() {}
         if self.dropped > 0 && !was_dropping {
-            self.push(ServerMessage::Warning {
-                code: WarningCode::Slow,
-                detail: "answers are read too slowly: the oldest predictions are dropped and counted".to_owned(),
-            });
+            self.push(slow());
         }
         self.push(message);
     }
@@ -136,6 +133,13 @@ impl State {
             *dropped = std::mem::take(&mut self.dropped);
         }
         Some(Next::Message(message))
+    }
+}
+
+fn slow() -> ServerMessage {
+    ServerMessage::Warning {
+        code: WarningCode::Slow,
+        detail: "answers are read too slowly: the oldest predictions are dropped and counted".to_owned(),
     }
 }
 
@@ -234,7 +238,7 @@ mod tests {
                     pushed += 1;
                 }
                 // One prediction and the warning are there even where they are over it.
-                prop_assert!(state.bytes <= limit + MESSAGE_BYTES, "{}", state.bytes);
+                prop_assert!(state.bytes <= limit + bytes(&slow()), "{}", state.bytes);
             }
             while count(&mut state) {}
             prop_assert_eq!(pushed, accounted);
