@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
 use crate::telemetry::names;
 
-/// What a message weighs besides its images and its detail, in bytes: more than any but `ready` takes.
+/// What a message weighs besides its images and what it quotes, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
 
 /// What the writer does next.
@@ -147,7 +147,7 @@ fn bytes(message: &ServerMessage) -> usize {
     MESSAGE_BYTES
         + match message {
             ServerMessage::Prediction { frames, .. } => frames.iter().map(|frame| frame.0.len()).sum(),
-            ServerMessage::Error { detail, .. } | ServerMessage::Warning { detail, .. } => detail.len(),
+            ServerMessage::Error { detail, .. } => detail.len(),
             _ => 0,
         }
 }
