@@ -14,6 +14,7 @@ use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
 use crate::store::{Lease, Store, StoreError, unix_s};
 use crate::telemetry::names;
+use crate::wording;
 
 /// Why a version could not be loaded, published, chosen or deleted.
 #[derive(Debug, thiserror::Error)]
@@ -181,7 +182,7 @@ impl Versions {
         let loaded = tokio::task::spawn_blocking(move || registry::load(&dir)).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
-            .map_err(|error| refused(error.to_string()))?;
+            .map_err(|error| refused(wording::sentence(&error)))?;
         let Manifest {
             name, version: found, ..
         } = &*loaded.manifest;
@@ -324,7 +325,7 @@ impl Versions {
             Err(error) => Err(VersionError::Refused {
                 model: model.to_owned(),
                 version,
-                reason: error.to_string(),
+                reason: wording::sentence(&error),
             }),
         }
     }

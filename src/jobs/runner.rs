@@ -45,7 +45,8 @@ pub struct Outcome {
 
 /// What does the work of a job.
 pub trait Execute: Send + Sync + 'static {
-    /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`.
+    /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and what keeps it
+    /// from looking.
     fn check(&self, spec: &JobSpec) -> Result<(), JobError>;
 
     /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.

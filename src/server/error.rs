@@ -18,6 +18,7 @@ use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
 use crate::versions::VersionError;
+use crate::wording::sentence;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -172,7 +173,7 @@ impl From<ServingError> for ApiError {
             ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(with_cause(&error)),
+            | ServingError::Thread(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -192,7 +193,7 @@ impl From<PredictError> for ApiError {
             PredictError::Picture(FrameError::Size { .. }) => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
-            PredictError::Picture(_) => Self::Internal(with_cause(&error)),
+            PredictError::Picture(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -200,7 +201,7 @@ impl From<PredictError> for ApiError {
 impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
-            ImageError::Encode(_) => Self::Internal(with_cause(&error)),
+            ImageError::Encode(_) => Self::Internal(sentence(&error)),
             _ => Self::Unprocessable(error.to_string()),
         }
     }
@@ -234,12 +235,15 @@ impl From<JobError> for ApiError {
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
             JobError::IllegalTransition { .. }
             | JobError::Taken { .. }
-            | JobError::Occupied { .. }
+            | JobError::Occupied(_)
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            JobError::Record { .. } | JobError::Instance(_) | JobError::Threads(_) | JobError::Store(_) => {
-                Self::Internal(with_cause(&error))
-            }
+            JobError::Record { .. }
+            | JobError::Instance(_)
+            | JobError::Threads(_)
+            | JobError::Dataset(_)
+            | JobError::Versions(_)
+            | JobError::Store(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -252,7 +256,7 @@ impl From<VersionError> for ApiError {
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(with_cause(&error))
+                Self::Internal(sentence(&error))
             }
         }
     }
@@ -262,7 +266,7 @@ impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
             DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(with_cause(&error)),
+            _ => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -309,13 +313,6 @@ impl From<MultipartError> for ApiError {
 impl From<PathRejection> for ApiError {
     fn from(rejection: PathRejection) -> Self {
         Self::Malformed(rejection.body_text())
-    }
-}
-
-fn with_cause(error: &dyn std::error::Error) -> String {
-    match error.source() {
-        Some(source) => format!("{error}: {}", with_cause(source)),
-        None => error.to_string(),
     }
 }
 

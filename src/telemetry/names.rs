@@ -49,7 +49,7 @@ names! {
     describe_gauge STREAMS = "foreframe_streams_active" in Count: "Open WebSocket streams.";
     describe_gauge SESSIONS = "foreframe_sessions_active" in Count: "Sessions that hold state.";
     describe_counter SESSIONS_EVICTED = "foreframe_sessions_evicted_total" in Count:
-        "Sessions that nobody used for session_grace_ms, and that were ended.";
+        "Sessions that nobody used for `session_grace_ms`, and that were ended.";
     describe_counter STREAM_FRAMES = "foreframe_stream_frames_total" in Count:
         "Frames that came over streams, those refused or sent again included, by model.";
     describe_counter STREAM_DROPPED = "foreframe_stream_predictions_dropped_total" in Count:

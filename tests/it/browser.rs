@@ -217,10 +217,7 @@ async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addr
     };
     let dir = tempfile::tempdir().unwrap();
     let (app, keys, server) = serve(dir.path()).await;
-    let [key, other] = [
-        new_key(app.store(), &keys).await,
-        new_key(app.store(), &keys).await,
-    ];
+    let [key, other] = [new_key(app.store(), &keys).await, new_key(app.store(), &keys).await];
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
     let says = |text: &str| format!("document.getElementById('refused').textContent.includes('{text}')");

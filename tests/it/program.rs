@@ -204,6 +204,39 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
 }
 
 #[test]
+fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("file"), "").unwrap();
+    let none = "; name a directory that holds models, or none to serve those in ./models";
+    for (arguments, complaint) in [
+        (
+            ["serve", "--models", "modles"],
+            format!("models_dir is \"modles\" (--models), which is not there{none}"),
+        ),
+        (
+            ["worker", "--set", "models_dir=file"],
+            format!("models_dir is \"file\" (--set), which is a file{none}"),
+        ),
+        (
+            ["serve", "--data-dir", "file"],
+            "data_dir is \"file\" (--data-dir), which is a file; name a directory, which is made if it is not there"
+                .to_owned(),
+        ),
+    ] {
+        let refused = output(dir.path(), &arguments);
+        assert_eq!(
+            (refused.status.code(), text(&refused.stderr).trim()),
+            (Some(2), format!("error: {complaint}").as_str())
+        );
+    }
+    // Without any, it says what to do.
+    let served = Served::start(dir.path(), &[]);
+    assert!(served.get("/v1/models").ends_with("{\"models\":[]}"));
+    served.terminate();
+    assert!(served.ended().contains("no models there; train one by"));
+}
+
+#[test]
 fn the_configuration_is_printed_with_where_it_comes_from() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();

@@ -152,7 +152,7 @@ async function drive(model) {
   const scenario = model.lineage.scenario ?? (told ? "moving-observer" : "static-observer");
   const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: scenario === "static-observer" ? 30 : 3600 };
   lay_out(model.spec);
-  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)} s ago`;
+  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)}\u00a0s ago`;
   by_id("keys").hidden = scenario === "static-observer";
   const seed = Math.floor(Math.random() * 2 ** 32);
   const environment = await call("POST", "/v1/environments", { scenario, seed, world });
