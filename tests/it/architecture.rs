@@ -23,7 +23,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("store", &["types", "files"]),
     (
         "versions",
-        &["types", "files", "telemetry", "registry", "serving", "store"],
+        &["types", "files", "wording", "telemetry", "registry", "serving", "store"],
     ),
     (
         "jobs",
