@@ -13,7 +13,7 @@ use super::config::{RunConfig, TrainConfig};
 use super::observer::Stage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{sha256_hex, write_atomically};
+use crate::files::{partial_path, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// The key of the state's numbers in the file's metadata.
@@ -54,8 +54,10 @@ impl RunFiles {
             }
             return Ok(files);
         }
-        let is_occupied = fs::read_dir(run_dir)
-            .is_ok_and(|mut entries| entries.any(|entry| entry.is_ok_and(|entry| entry.file_name() != DATA_FILE)));
+        let left_by_a_killed_start = [files.data(), partial_path(&files.data()), partial_path(&files.config())];
+        let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
+            entries.any(|entry| entry.is_ok_and(|entry| !left_by_a_killed_start.contains(&entry.path())))
+        });
         if is_occupied || run_dir.is_file() {
             return Err(TrainError::NotARun(run_dir.to_owned()));
         }

@@ -199,6 +199,16 @@ fn a_directory_of_something_else_is_left_alone() {
 }
 
 #[test]
+fn a_run_that_was_killed_at_its_start_is_no_obstacle() {
+    let (dataset, config) = (squares(20), small_config(&[]));
+    for left in ["dataset.sha256.partial", "dataset.sha256", "config.toml.partial"] {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join(left), "ha").unwrap();
+        train_until(&config, &dataset, dir.path(), 1).unwrap();
+    }
+}
+
+#[test]
 fn a_damaged_checkpoint_is_refused_with_what_to_do() {
     let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train_until(&config, &dataset, dir.path(), 10).unwrap();
