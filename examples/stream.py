@@ -6,12 +6,15 @@
 
 The actions file is JSON, {"actions": [[linear, angular], ...], "states": [[...], ...]}, one entry a frame; a model that is
 told nothing needs none. After the frame of number N, the prediction of the k-th frame to come is OUT/after-N-k.png.
+A server that asks for a key is shown --key, or better STREAM_KEY, which other users of the machine do not see.
 """
 
 import argparse
 import base64
 import json
+import os
 import pathlib
+import urllib.error
 import urllib.request
 
 from websockets.exceptions import ConnectionClosedError
@@ -23,6 +26,7 @@ parser.add_argument("--model", default="moving", help="a model's name (default: 
 parser.add_argument("--frames", required=True, type=pathlib.Path, help="a directory of PNG or JPEG frames")
 parser.add_argument("--actions", type=pathlib.Path, help="what the robot did and said of itself, as JSON")
 parser.add_argument("--out", required=True, type=pathlib.Path, help="the directory to write into")
+parser.add_argument("--key", default=os.environ.get("STREAM_KEY"), help="an API key (default: $STREAM_KEY)")
 args = parser.parse_args()
 
 trace = json.loads(args.actions.read_text()) if args.actions else {}
@@ -54,17 +58,21 @@ def keep(answer):
         print(f"frame {answer['seq']}: {len(answer['frames'])} predicted in {answer['timing']['compute_us']} us")
 
 
+authorization = {"Authorization": f"Bearer {args.key}"} if args.key else {}
 body = json.dumps({"model": args.model, "format": "png"}).encode()
-request = urllib.request.Request(f"{args.server}/v1/sessions", body, {"Content-Type": "application/json"})
-with urllib.request.urlopen(request) as answer:
-    session = json.load(answer)
+headers = {"Content-Type": "application/json", **authorization}
+try:
+    with urllib.request.urlopen(urllib.request.Request(f"{args.server}/v1/sessions", body, headers)) as answer:
+        session = json.load(answer)
+except urllib.error.HTTPError as refused:
+    raise SystemExit(json.load(refused)["detail"]) from None
 url = f"{args.server.replace('http', 'ws', 1)}{session['stream']}?token={session['token']}"
 
 # A session outlives its socket: where the connection breaks, connect again and go on with the frame that is next.
 seq = 0
 while seq < len(frames):
     try:
-        with connect(url, subprotocols=["foreframe.v1.json"], max_size=None) as socket:
+        with connect(url, subprotocols=["foreframe.v1.json"], additional_headers=authorization, max_size=None) as socket:
             ready = json.loads(socket.recv())
             print(f"model {ready['model']} version {ready['version']}: {ready['spec']['context']} frames, then predictions")
             for seq in range(ready["next_seq"], len(frames)):

@@ -77,6 +77,20 @@ pub enum ConfigError {
         /// The most it may be.
         most: u64,
     },
+    /// The directory is not there, or is none.
+    #[error("{field} is \"{}\" ({origin}), {wrong}; {right}", path.display())]
+    Directory {
+        /// The field.
+        field: &'static str,
+        /// Where it was given.
+        origin: String,
+        /// Its value.
+        path: PathBuf,
+        /// What is wrong with it.
+        wrong: &'static str,
+        /// What would be right.
+        right: &'static str,
+    },
 }
 
 /// All settings, checked.
@@ -169,6 +183,35 @@ impl Loaded {
         }
         config.server = server;
         Ok(Self { config, values })
+    }
+
+    /// Looks at the directories: a data directory is made where it is not there, and so may the default one of models not
+    /// be, but one that was asked for must. Errors: `Directory`.
+    pub fn check_directories(&self) -> Result<(), ConfigError> {
+        let ServerConfig {
+            data_dir, models_dir, ..
+        } = &self.config.server;
+        let is_asked_for = origin(&self.values, "models_dir") != Layer::DEFAULT;
+        let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
+            let right = "name a directory, which is made if it is not there";
+            ("data_dir", data_dir, right)
+        } else if !models_dir.is_dir() && (is_asked_for || models_dir.exists()) {
+            let right = "name a directory that holds models, or none to serve those in ./models";
+            ("models_dir", models_dir, right)
+        } else {
+            return Ok(());
+        };
+        Err(ConfigError::Directory {
+            field,
+            origin: origin(&self.values, field),
+            path: path.clone(),
+            wrong: if path.exists() {
+                "which is a file"
+            } else {
+                "which is not there"
+            },
+            right,
+        })
     }
 
     /// The settings as a TOML text, each with where it came from; passwords in URLs are masked.

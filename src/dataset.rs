@@ -22,7 +22,7 @@ use std::ops::Range;
 
 use sha2::{Digest, Sha256};
 
-pub use catalog::{find, list};
+pub use catalog::{find, is_finished, list};
 use check::{check_description, check_episode};
 pub use collect::{CollectConfig, Progress, collect};
 pub use collection::Standing;

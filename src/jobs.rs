@@ -8,12 +8,15 @@ mod instance;
 pub mod job;
 mod notes;
 pub mod pipeline;
+mod priority;
 pub mod queue;
 mod runner;
 pub mod spec;
 pub mod state;
 
+use crate::dataset::DatasetError;
 use crate::store::{StoreError, unix_s};
+use crate::versions::VersionError;
 
 pub use job::{Job, JobFilter};
 pub use notes::{Losses, Progress};
@@ -78,11 +81,8 @@ pub enum JobError {
         why: &'static str,
     },
     /// The directory holds what an earlier job left, which this one cannot go on with.
-    #[error("name: {reason}")]
-    Occupied {
-        /// What is there.
-        reason: String,
-    },
+    #[error("name: {0}")]
+    Occupied(#[source] Box<DatasetError>),
     /// A job that has not ended needs it.
     #[error("{kind} \"{name}\" is in use by {job}; wait for its end or cancel it")]
     InUse {
@@ -110,9 +110,27 @@ pub enum JobError {
     /// The runner's threads could not be started.
     #[error("could not start the threads for jobs: {0}")]
     Threads(#[source] rayon::ThreadPoolBuildError),
+    /// The data sets could not be looked at.
+    #[error(transparent)]
+    Dataset(Box<DatasetError>),
+    /// The models could not be looked at.
+    #[error(transparent)]
+    Versions(Box<VersionError>),
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
+}
+
+impl From<DatasetError> for JobError {
+    fn from(error: DatasetError) -> Self {
+        Self::Dataset(Box::new(error))
+    }
+}
+
+impl From<VersionError> for JobError {
+    fn from(error: VersionError) -> Self {
+        Self::Versions(Box::new(error))
+    }
 }
 
 fn list(names: &[String]) -> String {

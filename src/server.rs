@@ -273,6 +273,8 @@ pub fn router(app: App) -> Router {
 
 /// The routes that need a key where keys are asked for.
 fn api(app: &App) -> Router<App> {
+    let job_limit = DefaultBodyLimit::max(app.config().max_job_bytes);
+    let jobs_route = post(jobs::create).layer(job_limit).get(jobs::list);
     Router::new()
         .route("/v1/models", get(models::list))
         .route("/v1/models/{model}", get(models::get))
@@ -287,7 +289,7 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/sessions/{id}/state", get(sessions::state))
         .route("/v1/sessions/{id}/rollouts", post(rollouts::of_session))
         .route("/v1/sessions/{id}/stream", get(stream::of_session))
-        .route("/v1/jobs", post(jobs::create).get(jobs::list))
+        .route("/v1/jobs", jobs_route)
         .route("/v1/jobs/{id}", get(jobs::get))
         .route("/v1/jobs/{id}/cancel", post(jobs::cancel))
         .route("/v1/jobs/{id}/resume", post(jobs::resume))

@@ -41,6 +41,11 @@ pub enum StoreError {
         /// Its reason.
         source: sqlx::Error,
     },
+    /// TLS is asked for and cannot be had.
+    #[error(
+        "database_url asks for TLS by its sslmode, which this program was built without; build it with --features cloud"
+    )]
+    NoTls,
     /// The tables could not be brought to this program's form.
     #[error("could not bring the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
@@ -96,7 +101,7 @@ pub struct Store {
 
 impl Store {
     /// Opens it, makes what is not there yet, and brings the tables to this program's form. Must be called, and the store
-    /// used, within a tokio runtime. Errors: `Url`, `Open`, `Migrate`, `Io`, `Object`.
+    /// used, within a tokio runtime. Errors: `Url`, `NoTls`, `Open`, `Migrate`, `Io`, `Object`.
     pub async fn open(config: &StoreConfig) -> Result<Self, StoreError> {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;

@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 /// Why a value of this module was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum ValueError {
-    /// An action or state held NaN or an infinity.
-    #[error("{kind} component {index} is {value}; every component must be a finite number")]
-    NotFinite {
+    /// An action or state held NaN, an infinity, or a number beyond [`MAX_MAGNITUDE`].
+    #[error("{kind} component {index} is {value}; every component must be a number from -1e30 to 1e30")]
+    OutOfRange {
         /// `action` or `state`.
         kind: &'static str,
         /// Position in the vector.
@@ -20,6 +20,10 @@ pub enum ValueError {
         value: f32,
     },
 }
+
+/// The greatest magnitude of a component of an action or a state: scaled to a network's range and weighted, it stays
+/// finite, so that no value brings a prediction to NaN.
+pub const MAX_MAGNITUDE: f32 = 1e30;
 
 /// The origin of all randomness in one run: the same seed gives the same bytes on the same machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -71,8 +75,10 @@ macro_rules! finite_vector {
             type Error = ValueError;
 
             fn try_from(values: Vec<f32>) -> Result<Self, ValueError> {
-                match values.iter().position(|value| !value.is_finite()) {
-                    Some(index) => Err(ValueError::NotFinite { kind: $kind, index, value: values[index] }),
+                // NaN is in no range.
+                let is_sound = |value: &f32| (-MAX_MAGNITUDE..=MAX_MAGNITUDE).contains(value);
+                match values.iter().position(|value| !is_sound(value)) {
+                    Some(index) => Err(ValueError::OutOfRange { kind: $kind, index, value: values[index] }),
                     None => Ok(Self(values)),
                 }
             }
@@ -87,12 +93,12 @@ macro_rules! finite_vector {
 }
 
 finite_vector!(
-    /// What the robot was told to do from one frame to the next: finite numbers, in the order and units of [`Channel`]s.
+    /// What the robot was told to do from one frame to the next: numbers up to [`MAX_MAGNITUDE`], in the order and units of [`Channel`]s.
     Action,
     "action"
 );
 finite_vector!(
-    /// What the robot says of itself when a frame is taken: finite numbers, in the order and units of [`Channel`]s.
+    /// What the robot says of itself when a frame is taken: numbers up to [`MAX_MAGNITUDE`], in the order and units of [`Channel`]s.
     RobotState,
     "state"
 );
@@ -141,5 +147,6 @@ mod tests {
     fn an_action_with_nan_is_refused_with_its_place() {
         let error = Action::try_from(vec![0.0, f32::NAN]).unwrap_err();
         assert!(error.to_string().starts_with("action component 1 is NaN"));
+        assert!(Action::try_from(vec![f32::MAX]).is_err() && Action::try_from(vec![-1e30]).is_ok());
     }
 }

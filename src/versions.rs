@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use metrics::counter;
 use tokio::sync::Mutex;
 use tracing::{info, warn};
 
@@ -12,6 +13,8 @@ use crate::files::write_atomically;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
 use crate::store::{Lease, Store, StoreError, unix_s};
+use crate::telemetry::names;
+use crate::wording;
 
 /// Why a version could not be loaded, published, chosen or deleted.
 #[derive(Debug, thiserror::Error)]
@@ -141,7 +144,7 @@ impl Versions {
             let shipped = self.shipped(&model);
             versions.sort_by_key(|&version| (active.get(&model) != Some(&version), shipped != Some(version)));
             for version in versions {
-                match self.load(&model, version).await {
+                match counted(self.load(&model, version).await) {
                     Ok(loaded) => {
                         serving.push(loaded);
                         break;
@@ -179,7 +182,7 @@ impl Versions {
         let loaded = tokio::task::spawn_blocking(move || registry::load(&dir)).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
-            .map_err(|error| refused(error.to_string()))?;
+            .map_err(|error| refused(wording::sentence(&error)))?;
         let Manifest {
             name, version: found, ..
         } = &*loaded.manifest;
@@ -251,8 +254,7 @@ impl Versions {
     /// theirs. One that is refused changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
     pub async fn activate(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
-        let loaded = self.load(model, version).await?;
-        take_in(predictor, loaded).await?;
+        counted(self.take_in(predictor, model, version).await)?;
         self.store.set_active(model, version, unix_s()).await?;
         info!(model, version, "version activated");
         Ok(())
@@ -301,11 +303,7 @@ impl Versions {
             if serves || refused.contains(&(model.clone(), version)) {
                 continue;
             }
-            let taken = match self.load(&model, version).await {
-                Ok(loaded) => take_in(predictor, loaded).await,
-                Err(error) => Err(error),
-            };
-            match taken {
+            match counted(self.take_in(predictor, &model, version).await) {
                 Ok(()) => info!(model, version, "version loaded"),
                 Err(error) => {
                     warn!(model, version, %error, "a version was not loaded");
@@ -315,23 +313,35 @@ impl Versions {
         }
         Ok(())
     }
+
+    /// Has the predictor answer with a version.
+    async fn take_in(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+        let loaded = self.load(model, version).await?;
+        let predictor = predictor.clone();
+        let taken = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
+        match taken.unwrap_or(Err(ServingError::Stopped)) {
+            Ok(()) => Ok(()),
+            Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
+            Err(error) => Err(VersionError::Refused {
+                model: model.to_owned(),
+                version,
+                reason: wording::sentence(&error),
+            }),
+        }
+    }
 }
 
 fn key(model: &str, version: u32) -> String {
     format!("models/{model}/{version}")
 }
 
-async fn take_in(predictor: &Predictor, loaded: LoadedModel) -> Result<(), VersionError> {
-    let (model, version) = (loaded.manifest.name.clone(), loaded.manifest.version);
-    let predictor = predictor.clone();
-    let taken = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
-    match taken.unwrap_or(Err(ServingError::Stopped)) {
-        Ok(()) => Ok(()),
-        Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
-        Err(error) => Err(VersionError::Refused {
-            model,
-            version,
-            reason: error.to_string(),
-        }),
-    }
+/// Counts a version that was to serve, unless it had nothing to do with the version that it does not.
+fn counted<T>(taken: Result<T, VersionError>) -> Result<T, VersionError> {
+    let outcome = match &taken {
+        Ok(_) => "ok",
+        Err(VersionError::Refused { .. }) => "refused",
+        Err(_) => return taken,
+    };
+    counter!(names::MODEL_LOADS, "outcome" => outcome).increment(1);
+    taken
 }

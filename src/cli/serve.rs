@@ -3,7 +3,7 @@
 use tokio::net::TcpListener;
 use tracing::info;
 
-use super::settings::{Settings, open_store};
+use super::settings::{Settings, checked, open_store};
 use super::{CliError, say};
 use crate::config::Config;
 use crate::server::keys::Keys;
@@ -23,7 +23,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
-    let config = args.settings.load()?.config;
+    let config = checked(args.settings.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     telemetry::record();
     let runtime = tokio::runtime::Builder::new_multi_thread()

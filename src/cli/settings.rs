@@ -87,6 +87,12 @@ fn given<const N: usize>(flags: [(&str, &str, Option<String>); N]) -> Vec<Layer>
     flags.into_iter().filter_map(given).collect()
 }
 
+/// The configuration of a command that is about to begin its work in its directories.
+pub(super) fn checked(loaded: Loaded) -> Result<Config, CliError> {
+    loaded.check_directories()?;
+    Ok(loaded.config)
+}
+
 /// The store that the settings name.
 pub(super) async fn open_store(config: &Config) -> Result<Store, CliError> {
     Ok(Store::open(&config.server.store()).await?)
@@ -101,7 +107,7 @@ impl From<ConfigError> for CliError {
 impl From<StoreError> for CliError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::Url { .. } => Self::Usage(error.to_string()),
+            StoreError::Url { .. } | StoreError::NoTls => Self::Usage(error.to_string()),
             other => Self::failed(other),
         }
     }

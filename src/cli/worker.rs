@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use tracing::info;
 
-use super::settings::StoreSettings;
+use super::settings::{StoreSettings, checked};
 use super::{CliError, say};
 use crate::jobs::Jobs;
 use crate::jobs::pipeline::Pipeline;
@@ -27,7 +27,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), CliError> {
-    let config = args.store.load()?.config;
+    let config = checked(args.store.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -21,6 +21,9 @@ pub struct Layer {
 }
 
 impl Layer {
+    /// Where a value comes from that nobody gave.
+    pub(super) const DEFAULT: &'static str = "default";
+
     /// One value, for example of the flag `--bind`.
     #[must_use]
     pub fn one(origin: impl Into<String>, field: &str, value: impl Into<Value>) -> Self {
@@ -75,7 +78,7 @@ impl Layer {
         let mut values = dict(&Config::default());
         values.extend(dict(&ServerConfig::default()));
         Self {
-            origin: "default".to_owned(),
+            origin: Self::DEFAULT.to_owned(),
             values,
         }
     }

@@ -5,6 +5,12 @@ use std::path::{Path, PathBuf};
 use super::DatasetError;
 use super::layout::INFO;
 
+/// Whether a directory holds a finished data set: what says so is written last.
+#[must_use]
+pub fn is_finished(dir: &Path) -> bool {
+    dir.join(INFO).is_file()
+}
+
 /// Names of the finished data sets in a directory, sorted; an absent one holds none. Errors: `Io`.
 pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
     if !datasets_dir.exists() {
@@ -15,7 +21,7 @@ pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
     let mut names: Vec<String> = entries
         .map_err(unlisted)?
         .into_iter()
-        .filter(|entry| entry.path().join(INFO).is_file())
+        .filter(|entry| is_finished(&entry.path()))
         .filter_map(|entry| entry.file_name().into_string().ok())
         .collect();
     names.sort();

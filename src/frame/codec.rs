@@ -3,32 +3,45 @@
 use std::io::Cursor;
 
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageReader, Limits, RgbaImage};
+use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage};
 
 use super::{Frame, FrameError, MAX_SIDE_PX};
 
 /// Weights of red, green and blue in gray, ITU-R BT.601, in thousandths.
 const GRAY_FROM_RGB: [u32; 3] = [299, 587, 114];
 
+/// Bytes that what an image says beside its pixels may take, unpacked: colour profiles and the like.
+const MAX_METADATA_BYTES: u64 = 1 << 20;
+/// Bytes of a pixel at most: four channels of 16 bits.
+const MAX_PIXEL_BYTES: u64 = 8;
+
 /// Reads a PNG or JPEG image as gray. Errors: `Decode` if the bytes are neither or a side is over [`MAX_SIDE_PX`].
 pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
-    let mut reader = ImageReader::new(Cursor::new(bytes))
-        .with_guessed_format()
-        .map_err(|error| FrameError::Decode(error.into()))?;
+    let (width, height) = dimensions(bytes)?;
+    let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE_PX);
     limits.max_image_height = Some(MAX_SIDE_PX);
-    reader.limits(limits);
-    gray_from_image(&reader.decode().map_err(FrameError::Decode)?)
+    limits.max_alloc = Some(pixel_bytes + MAX_METADATA_BYTES);
+    gray_from_image(&reader(bytes, limits)?.decode().map_err(FrameError::Decode)?)
 }
 
 /// Width and height that a PNG or JPEG image states, without decoding its pixels. Errors: `Decode` if the bytes are neither.
 pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
-    ImageReader::new(Cursor::new(bytes))
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(MAX_METADATA_BYTES);
+    reader(bytes, limits)?.into_dimensions().map_err(FrameError::Decode)
+}
+
+fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {
+    let mut reader = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()
-        .map_err(|error| FrameError::Decode(error.into()))?
-        .into_dimensions()
-        .map_err(FrameError::Decode)
+        .map_err(|error| FrameError::Decode(error.into()))?;
+    if !matches!(reader.format(), Some(ImageFormat::Png | ImageFormat::Jpeg)) {
+        reader.clear_format();
+    }
+    reader.limits(limits);
+    Ok(reader)
 }
 
 fn gray_from_image(image: &DynamicImage) -> Result<Frame, FrameError> {
@@ -123,5 +136,6 @@ mod tests {
         let frame = Frame::new(2, 2, vec![0, 80, 160, 255]).unwrap();
         let bytes = encode_gif(&[frame.clone(), frame], 200).unwrap();
         assert!(bytes.starts_with(b"GIF89a"));
+        assert!(decode(&bytes).is_err(), "only PNG and JPEG are read");
     }
 }

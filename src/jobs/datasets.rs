@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::JobError;
+use crate::dataset;
 use crate::registry::is_valid_name;
 use crate::store::Objects;
 
@@ -15,13 +16,10 @@ pub(super) fn key(name: &str) -> String {
     format!("datasets/{name}")
 }
 
-/// The finished data sets, by name. Errors: `Store`.
+/// The finished data sets, by name. Errors: `Store`, `Dataset`.
 pub async fn names(objects: &Objects) -> Result<Vec<String>, JobError> {
     let mut names = objects.directories("datasets").await?;
-    let dir = objects.data_dir().join("datasets");
-    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
-    let local = entries.filter_map(|entry| entry.file_name().into_string().ok());
-    names.extend(local.filter(|name| is_here(objects, name)));
+    names.extend(dataset::list(&objects.data_dir().join("datasets"))?);
     names.retain(|name| is_valid_name(name));
     names.sort();
     names.dedup();
@@ -29,14 +27,15 @@ pub async fn names(objects: &Objects) -> Result<Vec<String>, JobError> {
 }
 
 /// The directory of a data set in the data directory, fetched there if need be.
-/// Errors: `NotFound` with the names there are, `Store`.
+/// Errors: `NotFound` with the names there are, `Store`, `Dataset`.
 pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
     if is_valid_name(name) {
-        if !is_here(objects, name) {
+        let dir = objects.data_dir().join(key(name));
+        if !dataset::is_finished(&dir) {
             objects.pull(&key(name), LAST_FILE).await?;
         }
-        if is_here(objects, name) {
-            return Ok(objects.data_dir().join(key(name)));
+        if dataset::is_finished(&dir) {
+            return Ok(dir);
         }
     }
     Err(JobError::NotFound {
@@ -47,7 +46,7 @@ pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
     })
 }
 
-/// Deletes a data set. Errors: `NotFound`, `Store`.
+/// Deletes a data set. Errors: `NotFound`, `Store`, `Dataset`.
 pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
     let known = names(objects).await?;
     if known.iter().any(|known| known == name) {
@@ -59,13 +58,4 @@ pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
         name: name.to_owned(),
         known,
     })
-}
-
-fn is_here(objects: &Objects, name: &str) -> bool {
-    objects
-        .data_dir()
-        .join(key(name))
-        .join("meta")
-        .join(LAST_FILE)
-        .is_file()
 }

@@ -54,11 +54,7 @@ impl Execute for Pipeline {
     fn check(&self, spec: &JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
         let datasets = self.runtime.block_on(datasets::names(objects))?;
-        let models = self.runtime.block_on(self.versions.all());
-        let models = models.map_err(|error| JobError::Invalid {
-            field: "model",
-            reason: error.to_string(),
-        })?;
+        let models = self.runtime.block_on(self.versions.all())?;
         spec.check(Ground {
             data_dir: objects.data_dir(),
             datasets: &datasets,

@@ -14,7 +14,7 @@ use super::instance::Instance;
 use super::job::id_of;
 use super::notes::{Notes, Standing};
 use super::queue::Shared;
-use super::{Event, Job, JobError, JobSpec, JobState, Losses, unix_s};
+use super::{Event, Job, JobError, JobSpec, JobState, Losses, priority, unix_s};
 use crate::store::{Account, Ending, JobRow, Lease, LossRow};
 use crate::telemetry::names;
 
@@ -45,7 +45,8 @@ pub struct Outcome {
 
 /// What does the work of a job.
 pub trait Execute: Send + Sync + 'static {
-    /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`.
+    /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and what keeps it
+    /// from looking.
     fn check(&self, spec: &JobSpec) -> Result<(), JobError>;
 
     /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.
@@ -107,11 +108,12 @@ impl Report {
     }
 }
 
-/// The threads that jobs work on, and no others: what predicts has its own. Errors: `Threads`.
+/// The threads that jobs work on, and no others: what predicts has its own, and goes first. Errors: `Threads`.
 pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .thread_name(|index| format!("jobs-{index}"))
+        .start_handler(|_| priority::lower())
         .build()
         .map_err(JobError::Threads)
 }
@@ -202,7 +204,7 @@ impl<'a> Work<'a> {
             warn!(job.id = %id, "the job's lease was lost; another goes on with it");
             return;
         }
-        self.end(result).await;
+        self.end(&row.kind, result).await;
     }
 
     /// Works on threads of its own and writes how far it is, until the work returns.
@@ -216,6 +218,7 @@ impl<'a> Work<'a> {
         let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
         let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
         let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
+            priority::lower();
             let result = pool.install(|| execute.execute(&spec, &report, &cancelled));
             // Nobody waits for it if the runner is gone.
             let _ = sender.send(result);
@@ -271,7 +274,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    async fn end(&self, result: Result<Outcome, Failure>) {
+    async fn end(&self, kind: &str, result: Result<Outcome, Failure>) {
         let id = self.report.id();
         let (event, error, outcome) = match result {
             Ok(outcome) => (Event::Succeed, None, Some(outcome)),
@@ -281,7 +284,8 @@ impl<'a> Work<'a> {
         };
         // A running job can do all of these.
         let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
-        counter!(names::JOBS_ENDED, "outcome" => if state.is_final() { state.name() } else { "left" }).increment(1);
+        let outcome_name = if state.is_final() { state.name() } else { "left" };
+        counter!(names::JOBS_ENDED, "kind" => kind.to_owned(), "outcome" => outcome_name).increment(1);
         match &error {
             None => info!(job.id = %id, job.outcome = ?event, "job ended"),
             Some(reason) => warn!(job.id = %id, reason, "job failed"),

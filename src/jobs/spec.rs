@@ -7,12 +7,13 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
-use crate::dataset::{CollectConfig, Standing};
+use crate::dataset::{CollectConfig, DatasetError, Standing};
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
 use crate::types::Seed;
+use crate::wording;
 
 /// Trials of one collection at most.
 pub const MAX_TRIALS: u64 = 1_000_000;
@@ -149,7 +150,8 @@ impl JobSpec {
         }
     }
 
-    /// Checks all that can be known before the work begins. Errors: `Invalid` and `NotFound`, which name the field; `Taken`.
+    /// Checks all that can be known before the work begins. Errors: `Invalid` and `NotFound`, which name the field; `Taken`,
+    /// `Occupied`, `Dataset`.
     pub fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
         match self {
             Self::Collect(spec) => spec.check(ground.data_dir),
@@ -199,9 +201,10 @@ impl CollectSpec {
                 name: self.name.clone(),
                 why: "exists",
             }),
-            Err(error) => Err(JobError::Occupied {
-                reason: error.to_string(),
-            }),
+            Err(error @ (DatasetError::OutExists { .. } | DatasetError::OtherArguments { .. })) => {
+                Err(JobError::Occupied(Box::new(error)))
+            }
+            Err(error) => Err(error.into()),
         }
     }
 
@@ -246,7 +249,7 @@ impl TrainSpec {
                 field: "preset",
                 reason: error.to_string(),
             },
-            other => settings(other.to_string()),
+            other => settings(wording::sentence(&other)),
         })?;
         Ok(TrainConfig {
             name: self.name.clone(),

@@ -28,6 +28,8 @@ pub struct ServerConfig {
     pub no_jobs: bool,
     /// Bytes of a request's body, and of a message on a socket, at most.
     pub max_body_bytes: usize,
+    /// Bytes of a request for a job at most.
+    pub max_job_bytes: usize,
     /// Images in one request at most.
     pub max_frames: usize,
     /// Predictions that may wait; more are answered 503.
@@ -103,6 +105,7 @@ impl Default for ServerConfig {
             objects_url: None,
             no_jobs: false,
             max_body_bytes: 8 << 20,
+            max_job_bytes: 64 << 10,
             max_frames: 64,
             max_queued_predictions: 256,
             max_batch: 64,
@@ -172,6 +175,7 @@ impl ServerConfig {
         let count = 1..=1_000_000;
         vec![
             ("max_body_bytes", self.max_body_bytes as u64, 1024..=1 << 30),
+            ("max_job_bytes", self.max_job_bytes as u64, 1024..=16 << 20),
             ("max_frames", self.max_frames as u64, 1..=4096),
             (
                 "max_queued_predictions",
@@ -282,7 +286,13 @@ mod tests {
     }
 
     #[test]
-    fn requests_or_jobs_without_threads_or_with_a_lease_that_runs_out_at_once_are_refused() {
+    fn requests_or_jobs_without_threads_or_room_or_with_a_lease_that_runs_out_at_once_are_refused() {
+        let roomless = ServerConfig {
+            max_job_bytes: 0,
+            ..ServerConfig::default()
+        };
+        let error = roomless.validate().unwrap_err().to_string();
+        assert_eq!(error, "max_job_bytes is 0; it must be 1024 to 16777216");
         let threadless = ServerConfig {
             job_threads: 0,
             ..ServerConfig::default()

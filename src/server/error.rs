@@ -18,9 +18,12 @@ use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
 use crate::versions::VersionError;
+use crate::wording::sentence;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
+/// Bytes of a detail at most: it quotes what a client sent, however long that is.
+const MAX_DETAIL_BYTES: usize = 1000;
 
 /// An error as a client sees it: problem details, RFC 9457.
 #[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
@@ -133,7 +136,7 @@ impl IntoResponse for ApiError {
             kind: format!("urn:foreframe:problem:{slug}"),
             title: status.canonical_reason().unwrap_or(slug),
             status: status.as_u16(),
-            detail: self.detail(),
+            detail: bounded(self.detail()),
             instance: String::new(),
         });
         response
@@ -172,7 +175,7 @@ impl From<ServingError> for ApiError {
             ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(with_cause(&error)),
+            | ServingError::Thread(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -192,7 +195,7 @@ impl From<PredictError> for ApiError {
             PredictError::Picture(FrameError::Size { .. }) => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
-            PredictError::Picture(_) => Self::Internal(with_cause(&error)),
+            PredictError::Picture(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -200,7 +203,7 @@ impl From<PredictError> for ApiError {
 impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
-            ImageError::Encode(_) => Self::Internal(with_cause(&error)),
+            ImageError::Encode(_) => Self::Internal(sentence(&error)),
             _ => Self::Unprocessable(error.to_string()),
         }
     }
@@ -234,12 +237,15 @@ impl From<JobError> for ApiError {
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
             JobError::IllegalTransition { .. }
             | JobError::Taken { .. }
-            | JobError::Occupied { .. }
+            | JobError::Occupied(_)
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            JobError::Record { .. } | JobError::Instance(_) | JobError::Threads(_) | JobError::Store(_) => {
-                Self::Internal(with_cause(&error))
-            }
+            JobError::Record { .. }
+            | JobError::Instance(_)
+            | JobError::Threads(_)
+            | JobError::Dataset(_)
+            | JobError::Versions(_)
+            | JobError::Store(_) => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -252,7 +258,7 @@ impl From<VersionError> for ApiError {
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(with_cause(&error))
+                Self::Internal(sentence(&error))
             }
         }
     }
@@ -262,7 +268,7 @@ impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
             DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(with_cause(&error)),
+            _ => Self::Internal(sentence(&error)),
         }
     }
 }
@@ -312,11 +318,14 @@ impl From<PathRejection> for ApiError {
     }
 }
 
-fn with_cause(error: &dyn std::error::Error) -> String {
-    match error.source() {
-        Some(source) => format!("{error}: {}", with_cause(source)),
-        None => error.to_string(),
+/// The detail, without its middle where it is too long.
+pub(super) fn bounded(detail: String) -> String {
+    if detail.len() <= MAX_DETAIL_BYTES {
+        return detail;
     }
+    let head = detail.floor_char_boundary(MAX_DETAIL_BYTES / 2);
+    let tail = detail.ceil_char_boundary(detail.len() - MAX_DETAIL_BYTES / 2);
+    format!("{} … {}", &detail[..head], &detail[tail..])
 }
 
 /// The answer that a job was taken: accepted, where it can be watched, and what it is.
@@ -333,3 +342,20 @@ pub(super) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavail
     Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\r\n\
     {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
     \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_detail_keeps_its_beginning_and_its_end() {
+        let long = format!("unknown field `{}` at line 1", "ä".repeat(1000));
+        let bounded = bounded(long.clone());
+        assert!(
+            bounded.len() < MAX_DETAIL_BYTES + 10 && bounded.starts_with("unknown field `ä"),
+            "{bounded}"
+        );
+        assert!(bounded.ends_with("ä` at line 1"), "{bounded}");
+        assert_eq!(super::bounded("short".to_owned()), "short");
+    }
+}

@@ -1,5 +1,6 @@
 //! A listener that holds a bounded number of connections; those over it are told so and closed.
 
+use std::future::poll_fn;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -9,6 +10,7 @@ use std::time::Duration;
 use metrics::{counter, gauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Sleep;
 use tracing::warn;
@@ -19,8 +21,8 @@ use crate::telemetry::names;
 
 /// Connections that are being refused at a time; more are closed without a word.
 const MAX_REFUSING: usize = 64;
-/// How long a refused client may take to hang up, so that it has read why.
-const REFUSAL_LIMIT: Duration = Duration::from_secs(1);
+/// How long a client may take to hang up after the last that is said to it, so that it has read that.
+const LINGER: Duration = Duration::from_secs(1);
 /// How long to wait when the system has no descriptors left for a connection.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
@@ -68,7 +70,7 @@ impl BoundedListener {
         if let Ok(place) = Arc::clone(&self.refusing).try_acquire_owned() {
             tokio::spawn(async move {
                 // A client that is gone or slow has had its chance.
-                let _ = tokio::time::timeout(REFUSAL_LIMIT, tell_and_drain(stream)).await;
+                let _ = tokio::time::timeout(LINGER, tell_and_hang_up(stream)).await;
                 drop(place);
             });
         }
@@ -86,15 +88,18 @@ async fn pause_after(error: &io::Error) {
     }
 }
 
-async fn tell_and_drain(stream: TcpStream) -> io::Result<()> {
+async fn tell_and_hang_up(stream: TcpStream) -> io::Result<()> {
     stream.writable().await?;
     // Shorter than any socket's send buffer, so it is written at once.
     stream.try_write(CONNECTIONS_FULL_RESPONSE.as_bytes())?;
-    let stream = stream.into_std()?;
-    stream.shutdown(std::net::Shutdown::Write)?;
-    let stream = TcpStream::from_std(stream)?;
-    let mut unread = [0; 1024];
-    // Closing with unread bytes would reset the connection before the client has read why.
+    hang_up(stream).await
+}
+
+/// Says no more, and drops what still comes until the client hangs up too: closing with unread bytes would reset the
+/// connection before the client has read what was said.
+async fn hang_up(mut stream: TcpStream) -> io::Result<()> {
+    poll_fn(|cx| Pin::new(&mut stream).poll_shutdown(cx)).await?;
+    let mut unread = [0; 4096];
     loop {
         stream.readable().await?;
         match stream.try_read(&mut unread) {
@@ -105,23 +110,28 @@ async fn tell_and_drain(stream: TcpStream) -> io::Result<()> {
     }
 }
 
-/// A connection that holds its place until it is dropped, and fails when its client reads nothing for too long.
+/// A connection that holds its place until it has ended, and fails when its client reads nothing for too long. Dropped, it
+/// gives the client time to read the last that was written.
 pub(super) struct Connection {
-    stream: TcpStream,
+    /// None once it is dropped.
+    open: Option<(TcpStream, OwnedSemaphorePermit)>,
     write_stall: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
-    _place: OwnedSemaphorePermit,
 }
 
 impl Connection {
     fn new(stream: TcpStream, place: OwnedSemaphorePermit, write_stall: Duration) -> Self {
         gauge!(names::HTTP_CONNECTIONS).increment(1.0);
         Self {
-            stream,
+            open: Some((stream, place)),
             write_stall,
             stalled: None,
-            _place: place,
         }
+    }
+
+    fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
+        let (stream, _) = self.open.as_mut().ok_or(io::ErrorKind::NotConnected)?;
+        Ok(Pin::new(stream))
     }
 
     /// Passes on how a write went; one that cannot go on has until the stall's limit.
@@ -142,18 +152,25 @@ impl Connection {
 impl Drop for Connection {
     fn drop(&mut self) {
         gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
+        // Without a runtime all ends at once.
+        if let (Some((stream, place)), Ok(runtime)) = (self.open.take(), Handle::try_current()) {
+            runtime.spawn(async move {
+                let _ = tokio::time::timeout(LINGER, hang_up(stream)).await;
+                drop(place);
+            });
+        }
     }
 }
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(cx, buffer)
+        self.stream()?.poll_read(cx, buffer)
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write(cx, bytes);
+        let written = self.stream()?.poll_write(cx, bytes);
         self.watch(cx, written)
     }
 
@@ -162,19 +179,19 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         bytes: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write_vectored(cx, bytes);
+        let written = self.stream()?.poll_write_vectored(cx, bytes);
         self.watch(cx, written)
     }
 
     fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
+        true
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
+        self.stream()?.poll_flush(cx)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+        self.stream()?.poll_shutdown(cx)
     }
 }

@@ -1,7 +1,7 @@
 //! What the service measures, for Prometheus.
 
 use std::convert::Infallible;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::extract::State;
 use axum::http::header;
@@ -10,7 +10,7 @@ use metrics::gauge;
 use tracing::warn;
 
 use super::App;
-use crate::jobs::JobState;
+use crate::jobs::{JobSpec, JobState};
 use crate::telemetry::{self, names};
 
 const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
@@ -24,21 +24,26 @@ const FOLD_INTERVAL: Duration = Duration::from_secs(5);
 )]
 pub(super) async fn metrics(State(app): State<App>) -> impl IntoResponse {
     gauge!(names::STREAMS).set(app.streams().count() as f64);
+    gauge!(names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
     gauge!(names::MODELS_LOADED).set(app.predictor().models().len() as f64);
-    match app.store().jobs_by_state().await {
-        Ok(counts) => {
-            for state in JobState::ALL.map(JobState::name) {
-                let count = counts
-                    .iter()
-                    .find(|(name, _)| name == state)
-                    .map_or(0, |(_, count)| *count);
-                gauge!(names::JOBS, "state" => state).set(count as f64);
-            }
-        }
+    match app.store().count_jobs().await {
+        Ok(counts) => measure_jobs(&counts),
         // The rest is worth reading all the same.
         Err(error) => warn!(%error, "could not count the jobs"),
     }
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], telemetry::render())
+}
+
+/// States without jobs are 0, so that a job that has left one is not counted there for ever.
+fn measure_jobs(counts: &[(String, String, i64)]) {
+    for kind in JobSpec::KINDS {
+        for state in JobState::ALL.map(JobState::name) {
+            let found = counts
+                .iter()
+                .find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
+            gauge!(names::JOBS, "kind" => kind, "state" => state).set(found.map_or(0, |(.., count)| *count) as f64);
+        }
+    }
 }
 
 /// Bounds the memory of histograms that nobody reads.

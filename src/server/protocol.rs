@@ -1,6 +1,7 @@
 //! The messages of a stream, the same in both sub-protocols; [`codec`] takes them from and to the wire. Knows no socket.
 //! `openapi/asyncapi.yaml` is the contract, with an example of each.
 
+mod any;
 pub mod codec;
 
 use serde::{Deserialize, Serialize};
@@ -12,7 +13,7 @@ pub use codec::Codec;
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
+#[serde(tag = "type", rename_all = "snake_case", try_from = "any::AnyMessage")]
 pub enum ClientMessage {
     /// The next frame.
     Frame(FrameMessage),
@@ -151,7 +152,7 @@ pub enum ServerMessage {
         /// What it is, and what would help.
         detail: String,
     },
-    /// Something was refused; the stream goes on.
+    /// Something was refused; unless `closing` follows, the stream goes on.
     Error {
         /// What kind, for programs.
         code: ErrorCode,
@@ -238,6 +239,12 @@ pub enum ClosingReason {
     Deleted,
     /// The client reads too slowly.
     Slow,
+    /// A message was longer than `limits.message_bytes`.
+    TooLong,
+    /// What came is against the WebSocket's own rules.
+    Malformed,
+    /// Text that is not UTF-8.
+    NotUtf8,
     /// The server stops.
     Shutdown,
 }

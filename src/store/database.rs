@@ -5,10 +5,13 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use sqlx::migrate::{Migration, MigrationType, Migrator};
-use sqlx::postgres::{PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow};
-use sqlx::{AssertSqlSafe, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction, Type};
+use sqlx::{
+    AssertSqlSafe, Connection as _, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
+    Type,
+};
 
 use super::StoreError;
 
@@ -140,12 +143,16 @@ impl Database {
         let pool = PgPoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
             .acquire_timeout(PATIENCE)
-            .connect(url)
-            .await
-            .map_err(|source| StoreError::Open {
-                database: "PostgreSQL",
-                source,
-            })?;
+            .connect(url);
+        let pool = match pool.await {
+            Ok(pool) => pool,
+            // A pool that got no connection in time does not say why; a connection of its own does.
+            Err(sqlx::Error::PoolTimedOut) => {
+                let reason = PgConnection::connect(url).await.err();
+                return Err(unopened(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
+            }
+            Err(error) => return Err(unopened(error)),
+        };
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Postgres(pool))
     }
@@ -221,6 +228,16 @@ fn sqlite_rows(rows: Vec<SqliteRow>) -> Vec<Row> {
 
 fn postgres_rows(rows: Vec<PgRow>) -> Vec<Row> {
     rows.into_iter().map(Row::Postgres).collect()
+}
+
+fn unopened(source: sqlx::Error) -> StoreError {
+    match source {
+        sqlx::Error::Tls(_) if !cfg!(feature = "cloud") => StoreError::NoTls,
+        source => StoreError::Open {
+            database: "PostgreSQL",
+            source,
+        },
+    }
 }
 
 fn migrations() -> Migrator {

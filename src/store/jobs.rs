@@ -229,12 +229,12 @@ impl Store {
         rows.iter().map(JobRow::of).collect()
     }
 
-    /// How many jobs are in each state that some are in. Errors: `Query`.
-    pub async fn jobs_by_state(&self) -> Result<Vec<(String, i64)>, StoreError> {
-        let sql = "SELECT state, COUNT(*) AS jobs FROM jobs GROUP BY state";
+    /// How many jobs there are of each kind and state, where there are any. Errors: `Query`.
+    pub async fn count_jobs(&self) -> Result<Vec<(String, String, i64)>, StoreError> {
+        let sql = "SELECT kind, state, COUNT(*) AS jobs FROM jobs GROUP BY kind, state";
         let rows = self.database.fetch(sql, vec![]).await?;
         rows.iter()
-            .map(|row| Ok((row.get("state")?, row.get("jobs")?)))
+            .map(|row| Ok((row.get("kind")?, row.get("state")?, row.get("jobs")?)))
             .collect()
     }
 

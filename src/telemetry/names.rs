@@ -1,16 +1,27 @@
-//! The names of all metrics, with their kinds, units and meanings. Units are last in the names; labels are of few values.
+//! The names of all metrics, with their kinds, units and meanings. Units are last in the names. Labels are of few values:
+//! kinds, states, reasons, the templates of routes, and the models that there are.
 
-use metrics::{Unit, describe_counter, describe_gauge, describe_histogram};
+use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram};
 
 macro_rules! names {
     ($($describe:ident $name:ident = $text:literal in $unit:ident: $help:literal;)*) => {
         $(#[doc = $help] pub const $name: &str = $text;)*
+
+        /// Every name there is.
+        pub const ALL: &[&str] = &[$($name),*];
 
         /// Tells the recorder what each metric means.
         pub(super) fn describe() {
             $($describe!($text, Unit::$unit, $help);)*
         }
     };
+}
+
+/// Shows what seldom happens as 0 until it does, so that its first time is seen as a rise.
+pub(super) fn begin() {
+    for name in [HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
+        counter!(name).increment(0);
+    }
 }
 
 names! {
@@ -38,19 +49,23 @@ names! {
     describe_gauge STREAMS = "foreframe_streams_active" in Count: "Open WebSocket streams.";
     describe_gauge SESSIONS = "foreframe_sessions_active" in Count: "Sessions that hold state.";
     describe_counter SESSIONS_EVICTED = "foreframe_sessions_evicted_total" in Count:
-        "Sessions ended by the server, by reason: idle or grace.";
-    describe_counter STREAM_FRAMES = "foreframe_stream_frames_total" in Count: "Frames taken by streams, by model.";
+        "Sessions that nobody used for `session_grace_ms`, and that were ended.";
+    describe_counter STREAM_FRAMES = "foreframe_stream_frames_total" in Count:
+        "Frames that came over streams, those refused or sent again included, by model.";
     describe_counter STREAM_DROPPED = "foreframe_stream_predictions_dropped_total" in Count:
-        "Predictions dropped because their reader was slow or their computation failed.";
+        "Predictions that were computed and not sent, because the client read too slowly.";
 
-    describe_gauge JOBS = "foreframe_jobs" in Count: "Jobs, by state.";
-    describe_counter JOBS_ENDED = "foreframe_jobs_ended_total" in Count: "Jobs that this process ended, by outcome.";
+    describe_gauge JOBS = "foreframe_jobs" in Count:
+        "Jobs in the store, whoever works on them, by kind and state.";
+    describe_counter JOBS_ENDED = "foreframe_jobs_ended_total" in Count:
+        "Jobs that this process worked on until they succeeded, failed or were cancelled, or that it left to be gone on with, \
+         by kind and outcome.";
     describe_gauge TRAINING_LOSS = "foreframe_training_loss" in Count:
-        "Latest loss of the training that runs here, by split: train or validation.";
+        "Latest loss of the training that this process works on, or last did, by split: train or validation.";
 
     describe_gauge MODELS_LOADED = "foreframe_models_loaded" in Count: "Models that answer.";
     describe_counter MODEL_LOADS = "foreframe_model_loads_total" in Count:
-        "Models and versions taken in, by outcome: ok or refused.";
+        "Versions of models that were to serve, by outcome: ok or refused.";
 
     describe_gauge PROCESS_RESIDENT_BYTES = "process_resident_memory_bytes" in Bytes: "Memory of this process.";
     describe_gauge PROCESS_OPEN_FDS = "process_open_fds" in Count: "Open files and sockets of this process.";

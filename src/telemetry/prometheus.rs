@@ -35,6 +35,7 @@ fn install() -> Result<PrometheusHandle, BuildError> {
         .set_buckets_for_metric(Matcher::Full(names::PREDICTION_BATCH_SIZE.to_owned()), &BATCH_SIZES)?
         .install_recorder()?;
     names::describe();
+    names::begin();
     let commit = env!("GIT_COMMIT_AT_BUILD");
     gauge!(names::BUILD_INFO, "version" => env!("CARGO_PKG_VERSION"), "commit" => commit).set(1.0);
     let started = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);

@@ -21,7 +21,10 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
-    ("versions", &["types", "files", "registry", "serving", "store"]),
+    (
+        "versions",
+        &["types", "files", "telemetry", "registry", "serving", "store"],
+    ),
     (
         "jobs",
         &[
@@ -45,6 +48,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         "server",
         &[
             "types",
+            "wording",
             "telemetry",
             "frame",
             "nn",
@@ -75,6 +79,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),
+    ("rustix", &["jobs"]),
 ];
 
 fn sources() -> Vec<(String, String)> {

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use foreframe::server::keys::Keys;
 use foreframe::server::{App, ServerConfig};
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
@@ -14,7 +15,8 @@ use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
-use crate::service::{PATIENCE, post, run};
+use crate::keys::new_key;
+use crate::service::{PATIENCE, Running, post, run};
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -125,10 +127,52 @@ impl Page {
         }
     }
 
-    async fn screenshot(&mut self, path: &Path) {
-        let picture = self.call("Page.captureScreenshot", json!({"format": "png"})).await;
-        std::fs::write(path, STANDARD.decode(picture["data"].as_str().unwrap()).unwrap()).unwrap();
+    /// The whole page as on a screen of that width, which it must fit.
+    async fn screenshot(&mut self, name: &str, width_px: u32, colors: &str) {
+        let screen = json!({"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 600});
+        self.call("Emulation.setDeviceMetricsOverride", screen).await;
+        let scheme = json!({"features": [{"name": "prefers-color-scheme", "value": colors}]});
+        self.call("Emulation.setEmulatedMedia", scheme).await;
+        let params = json!({"format": "png", "captureBeyondViewport": true});
+        let picture = self.call("Page.captureScreenshot", params).await;
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{width_px}-{colors}.png"));
+        std::fs::write(&path, STANDARD.decode(picture["data"].as_str().unwrap()).unwrap()).unwrap();
+        eprintln!("the page: {}", path.display());
+        let overhang_px = "document.documentElement.scrollWidth - innerWidth";
+        assert!(
+            self.value(overhang_px).await.as_i64().unwrap() <= 0,
+            "{name} at {width_px} px"
+        );
     }
+
+    /// Types a key into the form and sends it.
+    async fn unlock(&mut self, key: &str) {
+        let focus = "document.getElementById('key').focus(); document.getElementById('key').select()";
+        self.value(focus).await;
+        self.call("Input.insertText", json!({"text": key})).await;
+        for kind in ["keyDown", "keyUp"] {
+            let enter =
+                json!({"type": kind, "key": "Enter", "code": "Enter", "windowsVirtualKeyCode": 13, "text": "\r"});
+            self.call("Input.dispatchKeyEvent", enter).await;
+        }
+    }
+}
+
+/// Every step has its error, and every picture is there.
+const IS_COMPLETE: &str =
+    "[...document.querySelectorAll('#film #error td')].filter(cell => / %$/.test(cell.textContent)).length === 5
+    && [...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)";
+
+async fn serve(data_dir: &Path) -> (App, Keys, Running) {
+    let app = App::open(ServerConfig {
+        data_dir: data_dir.to_owned(),
+        ..ServerConfig::default()
+    })
+    .await
+    .unwrap();
+    let keys = Keys::of(app.store().clone(), false).await.unwrap();
+    let app = app.with_keys(keys.clone());
+    (app.clone(), keys, run(app).await)
 }
 
 #[tokio::test]
@@ -138,35 +182,73 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
         return;
     };
     let dir = tempfile::tempdir().unwrap();
-    let app = App::open(ServerConfig {
-        data_dir: dir.path().to_owned(),
-        ..ServerConfig::default()
-    })
-    .await
-    .unwrap();
-    let server = run(app.clone()).await;
-    let job = json!({"kind": "collect", "name": "seen", "scenario": "crowded", "trials": 3, "seed": 1});
-    post(&app, "/v1/jobs", &job).await;
+    let (app, _, server) = serve(dir.path()).await;
+    let collect = |name: &str, trials: u64| json!({"kind": "collect", "name": name, "scenario": "crowded", "trials": trials, "seed": 1});
+    post(&app, "/v1/jobs", &collect("seen", 3)).await;
+    post(&app, "/v1/jobs", &collect("more", 2000)).await;
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
-    page.until("document.querySelectorAll('#film #error td').length === 5")
-        .await;
-    page.until("[...document.querySelectorAll('#film #error td')].every(cell => / %$/.test(cell.textContent))")
-        .await;
+    page.until(IS_COMPLETE).await;
     assert_eq!(page.value("document.getElementById('model').value").await, "moving");
-    page.until("[...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)")
-        .await;
+    assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     let key = |kind: &str| json!({"type": kind, "key": "w", "code": "KeyW", "windowsVirtualKeyCode": 87});
     page.call("Input.dispatchKeyEvent", key("keyDown")).await;
     page.until("document.getElementById('status').textContent.includes('your keys: 0.35 m/s, 0.00 rad/s')")
         .await;
-    page.until("/collect seen/.test(document.getElementById('jobs').textContent)")
+    page.until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
         .await;
-    let picture = Path::new(env!("CARGO_TARGET_TMPDIR")).join("page.png");
-    page.screenshot(&picture).await;
-    eprintln!("the page: {}", picture.display());
+    // The second job goes on meanwhile.
+    page.until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
+        .await;
+    for (width_px, colors) in [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")] {
+        page.screenshot("page", width_px, colors).await;
+    }
     page.call("Input.dispatchKeyEvent", key("keyUp")).await;
     page.until("document.getElementById('status').textContent.includes('its own driver')")
         .await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addresses() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let (app, keys, server) = serve(dir.path()).await;
+    let [key, other] = [new_key(app.store(), &keys).await, new_key(app.store(), &keys).await];
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
+    let says = |text: &str| format!("document.getElementById('refused').textContent.includes('{text}')");
+    page.until("!document.getElementById('unlock').hidden && document.querySelector('main').hidden")
+        .await;
+    assert_eq!(page.value("document.getElementById('refused').textContent").await, "");
+    page.unlock("let me in").await;
+    page.until(&says("This is no key")).await;
+    page.unlock(&format!("{}x", key.text)).await;
+    page.until(&says("This key is not known here, or was revoked")).await;
+    for width_px in [1280, 400] {
+        page.screenshot("locked", width_px, "light").await;
+    }
+    page.unlock(&key.text).await;
+    page.until(IS_COMPLETE).await;
+    let addresses = "[location.href, ...performance.getEntriesByType('resource').map(entry => entry.name)].join(' ')";
+    let addresses = page.value(addresses).await;
+    assert!(
+        addresses.as_str().unwrap().contains("/v1/models") && !addresses.as_str().unwrap().contains("ffk_"),
+        "{addresses}"
+    );
+    // The tab keeps it.
+    page.call("Page.reload", json!({})).await;
+    page.until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+    assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
+    app.store().revoke_key(&key.id, 2.0).await.unwrap();
+    keys.refresh().await.unwrap();
+    page.until(&says("This key is not known here, or was revoked")).await;
+    page.unlock(&other.text).await;
+    page.until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
+        .await;
+    page.until(IS_COMPLETE).await;
     server.stop().await;
 }

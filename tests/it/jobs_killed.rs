@@ -29,12 +29,14 @@ impl Drop for Program {
 
 /// Starts the program with a data directory and no shipped models; returns the first line that it writes too.
 fn start(data_dir: &Path, arguments: &[&str]) -> (Program, String) {
+    let none_shipped = data_dir.join("none-shipped");
+    std::fs::create_dir_all(&none_shipped).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
         .args(arguments)
         .arg("--data-dir")
         .arg(data_dir)
         .arg("--set")
-        .arg(format!("models_dir={}", data_dir.join("none-shipped").display()))
+        .arg(format!("models_dir={}", none_shipped.display()))
         .env("RUST_LOG", "warn")
         .stdout(Stdio::piped())
         .spawn()

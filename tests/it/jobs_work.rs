@@ -136,6 +136,38 @@ async fn the_jobs_in_the_readme_run() {
 }
 
 #[tokio::test]
+async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
+    let dir = tempfile::tempdir().unwrap();
+    // The shipped models, which take frames as they are collected.
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    collected(&app).await;
+    let body =
+        json!({"kind": "evaluate", "model": "static", "dataset": "seen", "windows": 100_000, "resamples": 10_000});
+    post(&app, JOBS, &body).await;
+    let becomes = async |state: &str| {
+        until(async || {
+            let job = get(&app, "/v1/jobs/job-2").await.json();
+            assert!(job["state"] != "succeeded" && job["state"] != "failed", "{job}");
+            (job["state"] == state && job["progress"]["message"] != "").then_some(job)
+        })
+        .await
+    };
+    becomes("running").await;
+    post(&app, "/v1/jobs/job-2/cancel", &Value::Null).await;
+    let cancelled = becomes("cancelled").await;
+    assert_eq!(
+        (&cancelled["result"], &cancelled["error"]),
+        (&Value::Null, &Value::Null)
+    );
+    assert!(!dir.path().join("reports/job-2").exists());
+    assert_eq!(get(&app, "/v1/jobs/job-2/files/report.json").await.status, 404);
+}
+
+#[tokio::test]
 async fn versions_are_swapped_refused_deleted_and_remembered() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

@@ -22,7 +22,7 @@ async fn guarded(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
     (dir, store, keys, app)
 }
 
-async fn new_key(store: &Store, keys: &Keys) -> NewKey {
+pub(crate) async fn new_key(store: &Store, keys: &Keys) -> NewKey {
     let key = NewKey::generate().unwrap();
     store.create_key(&key.id, "robot", &key.hash, 1.0).await.unwrap();
     keys.refresh().await.unwrap();

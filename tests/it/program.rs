@@ -1,109 +1,15 @@
 //! The real program: what it says on the command line, and how it ends.
 
-use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
+use crate::process::{Served, foreframe, output, text};
 use crate::service::{PATIENCE, context, model, slow_spec, spec};
-
-fn foreframe(dir: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
-    command.current_dir(dir);
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("FOREFRAME_")) {
-        command.env_remove(name);
-    }
-    command
-}
-
-fn output(dir: &Path, arguments: &[&str]) -> Output {
-    foreframe(dir).args(arguments).output().unwrap()
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8(bytes.to_vec()).unwrap()
-}
-
-/// A running server; killed when a test ends before it.
-struct Served {
-    child: Child,
-    address: SocketAddr,
-    log: PathBuf,
-}
-
-impl Served {
-    fn start(dir: &Path, arguments: &[&str]) -> Self {
-        let log = dir.join("log");
-        let mut child = foreframe(dir)
-            .args(["serve", "--bind", "127.0.0.1:0"])
-            .args(arguments)
-            .env("RUST_LOG", "foreframe=debug")
-            .stdout(Stdio::piped())
-            .stderr(File::create(&log).unwrap())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.as_mut().unwrap())
-            .read_line(&mut line)
-            .unwrap();
-        let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
-        let served = Self {
-            address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
-            child,
-            log,
-        };
-        let deadline = Instant::now() + PATIENCE;
-        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
-            assert!(Instant::now() < deadline, "the server did not get ready");
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        served
-    }
-
-    fn get(&self, path: &str) -> String {
-        let mut stream = TcpStream::connect(self.address).unwrap();
-        write!(stream, "GET {path} HTTP/1.1\r\nhost: a\r\nconnection: close\r\n\r\n").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        answer
-    }
-
-    fn terminate(&self) {
-        let kill = Command::new("kill")
-            .args(["-TERM", &self.child.id().to_string()])
-            .status();
-        assert!(kill.unwrap().success());
-    }
-
-    /// Waits for the end; gives its log.
-    fn ended(mut self) -> String {
-        let deadline = Instant::now() + PATIENCE;
-        let status = loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                break status;
-            }
-            assert!(Instant::now() < deadline, "the server did not end");
-            std::thread::sleep(Duration::from_millis(5));
-        };
-        let log = std::fs::read_to_string(&self.log).unwrap();
-        assert!(status.success(), "{status}: {log}");
-        log
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        // It has ended already in a test that passes.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 /// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
 fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
@@ -205,7 +111,7 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
         "foreframe_prediction_batch_size_sum{model=\"plain\"} 1",
         "foreframe_prediction_queue_wait_seconds_count{model=\"plain\"} 1",
         "foreframe_prediction_compute_seconds_count{model=\"plain\"} 1",
-        "foreframe_jobs{state=\"running\"} 0",
+        "foreframe_jobs{kind=\"train\",state=\"running\"} 0",
         "foreframe_streams_active 0",
         "foreframe_models_loaded 1",
         "# TYPE process_resident_memory_bytes gauge",
@@ -277,6 +183,7 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
     );
     let served = Served::start(dir.path(), &["--set", "key_refresh_ms=100"]);
     assert!(served.get("/v1/models").starts_with("HTTP/1.1 401"));
+    assert!(served.get("/metrics").contains("\nforeframe_auth_refused_total 1\n"));
     let ask = |key: &str| {
         served.get(&format!(
             "/v1/models HTTP/1.1\r\nauthorization: Bearer {}\r\nx:",
@@ -294,6 +201,39 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
     assert!(ask(&keys[1]).starts_with("HTTP/1.1 200"));
     served.terminate();
     served.ended();
+}
+
+#[test]
+fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("file"), "").unwrap();
+    let none = "; name a directory that holds models, or none to serve those in ./models";
+    for (arguments, complaint) in [
+        (
+            ["serve", "--models", "modles"],
+            format!("models_dir is \"modles\" (--models), which is not there{none}"),
+        ),
+        (
+            ["worker", "--set", "models_dir=file"],
+            format!("models_dir is \"file\" (--set), which is a file{none}"),
+        ),
+        (
+            ["serve", "--data-dir", "file"],
+            "data_dir is \"file\" (--data-dir), which is a file; name a directory, which is made if it is not there"
+                .to_owned(),
+        ),
+    ] {
+        let refused = output(dir.path(), &arguments);
+        assert_eq!(
+            (refused.status.code(), text(&refused.stderr).trim()),
+            (Some(2), format!("error: {complaint}").as_str())
+        );
+    }
+    // Without any, it says what to do.
+    let served = Served::start(dir.path(), &[]);
+    assert!(served.get("/v1/models").ends_with("{\"models\":[]}"));
+    served.terminate();
+    assert!(served.ended().contains("no models there; train one by"));
 }
 
 #[test]

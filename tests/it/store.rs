@@ -405,3 +405,32 @@ async fn open_sharing(objects: &str) -> (TempDir, Store) {
     let store = Store::open(&config).await.unwrap();
     (dir, store)
 }
+
+#[tokio::test]
+async fn a_postgresql_that_cannot_be_reached_as_asked_is_refused_with_the_reason() {
+    let Some(url) = postgres("tls").await else { return };
+    let refused = async |url: String| {
+        let dir = tempfile::tempdir().unwrap();
+        let config = StoreConfig {
+            data_dir: dir.path().to_owned(),
+            database: Some(url),
+            objects: None,
+        };
+        Store::open(&config).await.err().unwrap().to_string()
+    };
+    // The tests' server speaks no TLS.
+    let error = refused(format!("{url}?sslmode=require")).await;
+    let reason = if cfg!(feature = "cloud") {
+        "server does not support TLS"
+    } else {
+        "built without; build it with --features cloud"
+    };
+    assert!(error.contains(reason), "{error}");
+    let nobody = tokio::net::TcpListener::bind("127.0.0.1:0")
+        .await
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    let error = refused(format!("postgres://foreframe@{nobody}/postgres")).await;
+    assert!(error.contains("Connection refused"), "{error}");
+}

@@ -6,13 +6,52 @@ const by_id = id => document.getElementById(id);
 const as_png = frame => `data:image/png;base64,${frame}`;
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
+// Where the server asks for a key, this tab keeps it: in headers, never in an address.
+let key = sessionStorage.getItem("key");
+class Locked extends Error {}
+
 async function call(method, path, body) {
-  const options = body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  const response = await fetch(path, { method, ...options });
+  const shown = key;
+  const headers = { ...(body !== undefined && { "Content-Type": "application/json" }), ...(shown && { Authorization: `Bearer ${shown}` }) };
+  const response = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
   const answer = response.status === 204 ? null : await response.json();
+  if (response.status === 401) {
+    if (shown === key) lock(shown ? "This key is not known here, or was revoked." : "");
+    throw new Locked(answer.detail);
+  }
   if (!response.ok) throw new Error(answer.detail);
   return answer;
 }
+
+function lock(why) {
+  run++; // The trial ends.
+  key = null;
+  sessionStorage.removeItem("key");
+  if (why || by_id("unlock").hidden) by_id("refused").textContent = why;
+  by_id("unlock").hidden = false;
+  document.querySelector("main").hidden = true;
+}
+by_id("unlock").addEventListener("submit", async event => {
+  event.preventDefault();
+  const given = by_id("key").value.trim();
+  // What is no key may not even be sent as one.
+  if (!/^ffk_[0-9a-f]+_[\w-]+$/.test(given)) return lock("This is no key: keys look like ffk_0123456789ab_… and are told once, when they are made.");
+  key = given;
+  try {
+    await call("GET", "/v1/models");
+  } catch (error) {
+    if (!(error instanceof Locked)) by_id("refused").textContent = error.message;
+    return;
+  }
+  sessionStorage.setItem("key", key);
+  by_id("key").value = "";
+  by_id("unlock").hidden = true;
+  by_id("bearer").hidden = false;
+  document.querySelector("main").hidden = false;
+  by_id("model").replaceChildren();
+  models = [];
+  refresh();
+});
 
 // The keys that are held, as a command in m/s and rad/s.
 const held = new Set();
@@ -22,23 +61,31 @@ function command() {
   const pull = (plus, minus) => held.has(plus) - held.has(minus);
   return held.size ? [SPEED_M_S * pull("w", "s"), TURN_RAD_S * pull("a", "d")] : null;
 }
+function hold(name, down) {
+  down ? held.add(name) : held.delete(name);
+  for (const button of document.querySelectorAll("#pad button")) button.classList.toggle("down", held.has(button.dataset.key));
+}
 function on_key(event, down) {
-  const key = KEYS[event.key.toLowerCase()];
-  if (!key || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  const name = KEYS[event.key.toLowerCase()];
+  if (!name || event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
   event.preventDefault();
-  down ? held.add(key) : held.delete(key);
-  for (const cap of document.querySelectorAll("kbd")) cap.classList.toggle("down", held.has(cap.textContent.toLowerCase()));
+  hold(name, down);
 }
 addEventListener("keydown", event => on_key(event, true));
 addEventListener("keyup", event => on_key(event, false));
-addEventListener("blur", () => held.clear());
+addEventListener("blur", () => [...held].forEach(name => hold(name, false)));
+for (const button of document.querySelectorAll("#pad button")) {
+  button.addEventListener("pointerdown", () => hold(button.dataset.key, true));
+  for (const end of ["pointerup", "pointercancel", "pointerleave"]) button.addEventListener(end, () => hold(button.dataset.key, false));
+}
 
 // A stream of one model: `send` answers with the message that belongs to the frame.
 class Stream {
   static open(model) {
     return new Promise((opened, failed) => {
       const address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/v1/models/${model}/stream`;
-      const stream = new Stream(new WebSocket(address, "foreframe.v1.json"));
+      // A browser sets no headers of a WebSocket; the key goes along as a sub-protocol.
+      const stream = new Stream(new WebSocket(address, ["foreframe.v1.json", ...(key ? [`foreframe.key.${key}`] : [])]));
       stream.waiting = { resolve: ready => opened(Object.assign(stream, { ready })), reject: failed };
     });
   }
@@ -79,7 +126,9 @@ async function pixels(frame) {
 const mse = (one, other) => one.reduce((sum, value, i) => sum + ((value - other[i]) / 255) ** 2, 0) / one.length;
 
 // The rows of film: one column for each predicted step.
-function lay_out(horizon) {
+function lay_out({ horizon, frame_width_px, frame_height_px }) {
+  by_id("drive").style.setProperty("--horizon", horizon);
+  by_id("drive").style.setProperty("--aspect", frame_width_px / frame_height_px);
   const head = document.querySelector("#film thead tr");
   for (const row of [head, ...document.querySelectorAll("#film tbody tr")]) while (row.cells.length > 1) row.deleteCell(1);
   for (let step = 1; step <= horizon; step++) {
@@ -102,8 +151,8 @@ async function drive(model) {
   const told = conditioning !== "none";
   const scenario = model.lineage.scenario ?? (told ? "moving-observer" : "static-observer");
   const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: scenario === "static-observer" ? 30 : 3600 };
-  lay_out(horizon);
-  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)} s ago`;
+  lay_out(model.spec);
+  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)}\u00a0s ago`;
   by_id("keys").hidden = scenario === "static-observer";
   const seed = Math.floor(Math.random() * 2 ** 32);
   const environment = await call("POST", "/v1/environments", { scenario, seed, world });
@@ -160,12 +209,14 @@ async function compare(origin, came) {
 async function start() {
   const model = models.find(({ name }) => name === by_id("model").value);
   if (!model) return;
+  const mine = run + 1;
   try {
     await drive(model);
   } catch (error) {
+    if (mine !== run) return;
     by_id("status").textContent = `${error.message}. Trying again…`;
     await pause(2000);
-    start();
+    if (mine === run) start();
   }
 }
 by_id("model").addEventListener("change", () => { by_id("model").blur(); start(); });
@@ -174,33 +225,46 @@ by_id("again").addEventListener("click", () => { by_id("again").blur(); start();
 // The tables of models and jobs.
 function fill(id, rows, empty) {
   const body = by_id(id);
-  const columns = body.parentElement.tHead.rows[0].cells.length;
+  const labels = [...body.parentElement.tHead.rows[0].cells].map(cell => cell.textContent);
   body.replaceChildren();
   if (!rows.length) {
     const cell = body.insertRow().insertCell();
-    Object.assign(cell, { colSpan: columns, className: "quiet", textContent: empty });
+    Object.assign(cell, { colSpan: labels.length, className: "quiet", textContent: empty });
   }
   for (const parts of rows) {
     const row = body.insertRow();
-    for (const part of parts) row.insertCell().append(part);
+    parts.forEach((part, column) => {
+      const cell = row.insertCell();
+      cell.dataset.label = labels[column];
+      cell.append(part);
+    });
   }
 }
-function progress(job) {
-  if (job.error) return job.error;
-  const { done, total, remaining_s, message } = job.progress;
-  const span = document.createElement("span"), bar = document.createElement("progress");
-  Object.assign(bar, { max: total || 1, value: done });
-  const left = remaining_s == null ? "" : `, ${Math.ceil(remaining_s)} s left`;
-  const loss = job.losses?.train == null ? "" : `, loss ${job.losses.train.toPrecision(3)}`;
-  span.append(bar, ` ${done}/${total} ${message}${left}${loss}`);
-  return span;
+function element(name, properties, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
 }
+function progress(job) {
+  if (job.error) return element("span", { className: "wrong" }, job.error);
+  const { done, total, remaining_s, message } = job.progress;
+  const is_running = job.state === "running";
+  const words = [total ? `${done} of ${total}` : "", is_running ? message : "",
+    is_running && remaining_s != null ? `${Math.ceil(remaining_s)} s left` : "",
+    job.losses?.train == null ? "" : `loss ${job.losses.train.toPrecision(3)}`];
+  // A bar without a value says that it is not known how far the work is.
+  const bar = element("progress", total ? { max: total, value: done } : is_running ? {} : { max: 1, value: 0 });
+  return element("span", {}, bar, element("span", { className: "quiet" }, words.filter(Boolean).join(", ")));
+}
+const does = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
 function skill({ metrics }) {
   const value = metrics.test?.skill;
   return value === undefined ? "not measured" : value.toFixed(2);
 }
 let models = [];
+let next_refresh;
 async function refresh() {
+  clearTimeout(next_refresh);
   try {
     const names = models.map(({ name }) => name).join();
     ({ models } = await call("GET", "/v1/models"));
@@ -218,11 +282,14 @@ async function refresh() {
       if (first) by_id("model").value = first.name;
       if (!chosen) start();
     }
-    const { jobs } = await call("GET", "/v1/jobs");
-    fill("jobs", jobs.map(job => [job.id, `${job.spec.kind} ${job.spec.name}`, job.state, progress(job)]), "none");
-  } catch {
+    const { jobs } = await call("GET", "/v1/jobs?limit=20");
+    fill("jobs", jobs.map(job => [job.id, does(job.spec), job.state, progress(job)]), "none");
+  } catch (error) {
+    if (error instanceof Locked) return; // Until there is a key.
     // The server is away; the next refresh may find it.
   }
-  setTimeout(refresh, 1000);
+  next_refresh = setTimeout(refresh, 1000);
 }
+by_id("origin").textContent = location.origin;
+by_id("bearer").hidden = !key;
 refresh();

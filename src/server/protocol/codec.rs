@@ -30,13 +30,13 @@ pub enum CodecError {
     Kind(Codec),
     /// Not JSON, or not a message.
     #[error("not a message of {JSON}: {0}")]
-    Json(#[from] serde_json::Error),
+    Json(#[from] serde_path_to_error::Error<serde_json::Error>),
     /// Not `MessagePack`, or not a message.
     #[error("not a message of {MSGPACK}: {0}")]
-    Msgpack(#[from] rmp_serde::decode::Error),
+    Msgpack(#[from] serde_path_to_error::Error<rmp_serde::decode::Error>),
     /// More than a message.
-    #[error("not a message of {MSGPACK}: bytes follow it")]
-    Trailing,
+    #[error("not a message of {}: {} follow it", .0.name(), if *.0 == Codec::Json { "letters" } else { "bytes" })]
+    Trailing(Codec),
 }
 
 impl Codec {
@@ -61,7 +61,7 @@ impl Codec {
     /// A message from the wire. Errors say where it goes wrong.
     pub fn decode<T: DeserializeOwned>(self, message: &Message) -> Result<T, CodecError> {
         match (self, message) {
-            (Self::Json, Message::Text(text)) => Ok(serde_json::from_str(text)?),
+            (Self::Json, Message::Text(text)) => from_json(text),
             (Self::Msgpack, Message::Binary(bytes)) => from_msgpack(bytes),
             _ => Err(CodecError::Kind(self)),
         }
@@ -78,16 +78,23 @@ impl Codec {
     }
 }
 
+fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, CodecError> {
+    let mut deserializer = serde_json::Deserializer::from_str(text);
+    let message = serde_path_to_error::deserialize(&mut deserializer)?;
+    deserializer.end().map_err(|_| CodecError::Trailing(Codec::Json))?;
+    Ok(message)
+}
+
 fn from_msgpack<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
     // Borrows from the bytes, so that no length they state is allocated before it is there.
     let mut deserializer = rmp_serde::Deserializer::from_read_ref(bytes);
     deserializer.set_max_depth(MAX_DEPTH);
-    let message = T::deserialize(&mut deserializer)?;
+    let message = serde_path_to_error::deserialize(&mut deserializer)?;
     // Whatever follows is more than nothing: a value, or one that is refused, for its depth if for nothing else.
     deserializer.set_max_depth(1);
     match IgnoredAny::deserialize(&mut deserializer) {
         Err(rmp_serde::decode::Error::InvalidMarkerRead(_)) => Ok(message),
-        _ => Err(CodecError::Trailing),
+        _ => Err(CodecError::Trailing(Codec::Msgpack)),
     }
 }
 
@@ -173,7 +180,10 @@ mod tests {
         let binary = |bytes: Vec<u8>| Codec::Msgpack.decode::<ClientMessage>(&Message::Binary(bytes.into()));
         assert!(binary(whole[..whole.len() - 1].to_vec()).is_err());
         for more in [&[0][..], &[0x92, 0], &[0xC1]] {
-            assert!(matches!(binary([&whole[..], more].concat()), Err(CodecError::Trailing)));
+            assert!(matches!(
+                binary([&whole[..], more].concat()),
+                Err(CodecError::Trailing(Codec::Msgpack))
+            ));
         }
         // An image that states four thousand million bytes and has none.
         assert!(

@@ -4,10 +4,12 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use metrics::counter;
 use tracing::info;
 
 use super::session::Session;
 use super::token::TokenHash;
+use crate::telemetry::names;
 
 /// Why a session cannot be had.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
@@ -101,12 +103,20 @@ impl Table {
         later.take(limit).map(|(_, session)| Arc::clone(session)).collect()
     }
 
+    /// How many are open.
+    pub(in crate::server) fn count(&self, now: Instant) -> usize {
+        let mut inner = self.inner();
+        self.evict(&mut inner, now);
+        inner.sessions.len()
+    }
+
     fn evict(&self, inner: &mut Inner, now: Instant) {
         let Inner { sessions, expired } = inner;
         sessions.retain(|id, session| {
             let is_over = session.left(self.grace, now).is_some_and(|left| left.is_zero());
             if is_over {
                 info!(session.id = %id, frames = session.next_seq(), "session expired");
+                counter!(names::SESSIONS_EVICTED).increment(1);
                 session.delete();
                 expired.push_back(id.clone());
             }

@@ -7,11 +7,14 @@ use std::time::Duration;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
+use metrics::counter;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tracing::{debug, info, trace};
+use tungstenite::error::ProtocolError;
 
 use super::outbox::{Next, Outbox};
+use crate::server::error::bounded;
 use crate::server::images;
 use crate::server::protocol::{
     ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, WarningCode,
@@ -21,6 +24,7 @@ use crate::server::sessions::limits;
 use crate::server::sessions::session::{Hold, Holder, Session};
 use crate::server::{App, streams};
 use crate::serving::{Premise, STEP, Told};
+use crate::telemetry::names;
 use crate::types::{Action, RobotState};
 
 /// How long a client may take to hang up after the end was said, so that it has read it.
@@ -31,6 +35,15 @@ enum Item {
     Frame(Box<Step>),
     Configure(ConfigureMessage),
     Refused(ErrorCode, String),
+}
+
+/// What came over the socket.
+enum Received {
+    Message(Message),
+    /// For too long.
+    Nothing,
+    /// And after it no more can be told apart.
+    Unreadable(ClosingReason, String),
 }
 
 /// The client is gone: nothing more can be said to it.
@@ -123,12 +136,20 @@ impl Connection {
         inbox: &mpsc::Sender<Item>,
     ) -> Result<ClosingReason, Gone> {
         loop {
-            let Some(message) = self.receive(stream).await? else {
-                return Ok(ClosingReason::Idle);
+            let message = match self.receive(stream).await? {
+                Received::Message(message) => message,
+                Received::Nothing => return Ok(ClosingReason::Idle),
+                Received::Unreadable(reason, detail) => {
+                    let refused = Item::Refused(ErrorCode::Malformed, detail);
+                    inbox.send(refused).await.map_err(|_| Gone)?;
+                    return Ok(reason);
+                }
             };
             let item = match self.codec.decode::<ClientMessage>(&message) {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
+                    let model = &self.hold.session().model().manifest.name;
+                    counter!(names::STREAM_FRAMES, "model" => model.clone()).increment(1);
                     self.checked(frame)
                         .map_or_else(|error| Item::Refused(error.code(), error.to_string()), Item::Frame)
                 }
@@ -145,18 +166,21 @@ impl Connection {
         }
     }
 
-    /// The next message of the protocol, warning once of silence; `None` if it lasts.
-    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Option<Message>, Gone> {
+    /// The next message of the protocol, warning once of silence.
+    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, Gone> {
         let quarter = Duration::from_millis(self.app.config().stream_idle_ms) / 4;
         let mut is_warned = false;
         loop {
             let wait = if is_warned { quarter } else { 3 * quarter };
             match timeout(wait, stream.next()).await {
-                Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => return Ok(Some(message)),
+                Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
+                    return Ok(Received::Message(message));
+                }
                 // Answered by the WebSocket itself; a sign of life.
                 Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
-                Ok(None | Some(Err(_) | Ok(Message::Close(_)))) => return Err(Gone),
-                Err(_) if is_warned => return Ok(None),
+                Ok(None | Some(Ok(Message::Close(_)))) => return Err(Gone),
+                Ok(Some(Err(error))) => return unreadable(error),
+                Err(_) if is_warned => return Ok(Received::Nothing),
                 Err(_) => {
                     is_warned = true;
                     let detail = format!("nothing came; in {} ms the stream is closed", quarter.as_millis());
@@ -212,7 +236,7 @@ impl Connection {
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
-        let next_seq = self.hold.session().next_seq();
+        let (detail, next_seq) = (bounded(detail), self.hold.session().next_seq());
         ServerMessage::Error { code, detail, next_seq }
     }
 
@@ -246,6 +270,19 @@ impl Connection {
     }
 }
 
+/// Why what came could not be read, if its sender is still there to be told.
+fn unreadable(error: axum::Error) -> Result<Received, Gone> {
+    let error = error.into_inner();
+    let reason = match error.downcast_ref::<tungstenite::Error>() {
+        Some(tungstenite::Error::Capacity(_)) => ClosingReason::TooLong,
+        Some(tungstenite::Error::Utf8(_)) => ClosingReason::NotUtf8,
+        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return Err(Gone),
+        Some(tungstenite::Error::Protocol(_)) => ClosingReason::Malformed,
+        _ => return Err(Gone),
+    };
+    Ok(Received::Unreadable(reason, error.to_string()))
+}
+
 async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), Gone> {
     let frame = CloseFrame {
         code,
@@ -259,6 +296,9 @@ fn code_of(reason: ClosingReason) -> u16 {
     match reason {
         ClosingReason::Asked | ClosingReason::Idle | ClosingReason::Deleted => close_code::NORMAL,
         ClosingReason::Replaced => close_code::POLICY,
+        ClosingReason::TooLong => close_code::SIZE,
+        ClosingReason::Malformed => close_code::PROTOCOL,
+        ClosingReason::NotUtf8 => close_code::INVALID,
         ClosingReason::Slow => close_code::AGAIN,
         ClosingReason::Shutdown => close_code::AWAY,
     }

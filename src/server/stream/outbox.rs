@@ -4,11 +4,13 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use metrics::counter;
 use tokio::sync::Notify;
 
 use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
+use crate::telemetry::names;
 
-/// What a message weighs besides its images, in bytes: more than any but `ready` takes.
+/// What a message weighs besides its images and what it quotes, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
 
 /// What the writer does next.
@@ -104,10 +106,7 @@ impl State {
         let was_dropping = self.dropped > 0;
         while self.bytes + bytes(&message) > limit_bytes && self.drop_oldest() {}
         if self.dropped > 0 && !was_dropping {
-            self.push(ServerMessage::Warning {
-                code: WarningCode::Slow,
-                detail: "answers are read too slowly: the oldest predictions are dropped and counted".to_owned(),
-            });
+            self.push(slow());
         }
         self.push(message);
     }
@@ -121,6 +120,7 @@ impl State {
         };
         self.bytes -= bytes(&message);
         self.dropped += 1;
+        counter!(names::STREAM_DROPPED).increment(1);
         true
     }
 
@@ -136,10 +136,18 @@ impl State {
     }
 }
 
+fn slow() -> ServerMessage {
+    ServerMessage::Warning {
+        code: WarningCode::Slow,
+        detail: "answers are read too slowly: the oldest predictions are dropped and counted".to_owned(),
+    }
+}
+
 fn bytes(message: &ServerMessage) -> usize {
     MESSAGE_BYTES
         + match message {
             ServerMessage::Prediction { frames, .. } => frames.iter().map(|frame| frame.0.len()).sum(),
+            ServerMessage::Error { detail, .. } => detail.len(),
             _ => 0,
         }
 }
@@ -230,7 +238,7 @@ mod tests {
                     pushed += 1;
                 }
                 // One prediction and the warning are there even where they are over it.
-                prop_assert!(state.bytes <= limit + MESSAGE_BYTES, "{}", state.bytes);
+                prop_assert!(state.bytes <= limit + bytes(&slow()), "{}", state.bytes);
             }
             while count(&mut state) {}
             prop_assert_eq!(pushed, accounted);

@@ -1,0 +1,122 @@
+//! A client's message as it is read: flat, each field into its own type at once. What serde derives for the tagged enum
+//! would first keep the whole of a message in a form that takes up to a hundred times its bytes.
+
+use serde::de::{Error as _, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+
+use super::super::images::{ImageBytes, ImageFormat};
+use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, PingMessage};
+
+/// Items of a list in a message at most: more than any model takes.
+const MAX_ITEMS: usize = 4096;
+
+/// Any field of any message.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct AnyMessage {
+    r#type: Kind,
+    seq: Option<u64>,
+    timestamp_us: Option<i64>,
+    image: Option<ImageBytes>,
+    format: Option<ImageFormat>,
+    action: Option<List<f64>>,
+    state: Option<List<f64>>,
+    plan: Option<List<List<f64>>>,
+    on_gap: Option<OnGap>,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Kind {
+    Frame,
+    Configure,
+    Ping,
+    Close,
+}
+
+/// A list, refused at the first item too many.
+struct List<T>(Vec<T>);
+
+impl<'de, T: Deserialize<'de>> Deserialize<'de> for List<T> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_seq(ListVisitor(std::marker::PhantomData))
+    }
+}
+
+struct ListVisitor<T>(std::marker::PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>> Visitor<'de> for ListVisitor<T> {
+    type Value = List<T>;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("a list")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<List<T>, A::Error> {
+        let mut list = Vec::new();
+        while let Some(item) = items.next_element()? {
+            if list.len() == MAX_ITEMS {
+                return Err(A::Error::custom(format_args!(
+                    "over {MAX_ITEMS} items; no list has more"
+                )));
+            }
+            list.push(item);
+        }
+        Ok(List(list))
+    }
+}
+
+impl TryFrom<AnyMessage> for ClientMessage {
+    type Error = String;
+
+    fn try_from(mut any: AnyMessage) -> Result<Self, String> {
+        let message = match any.r#type {
+            Kind::Frame => Self::Frame(FrameMessage {
+                seq: any.seq.take().ok_or_else(|| missing("seq"))?,
+                timestamp_us: any.timestamp_us.take().ok_or_else(|| missing("timestamp_us"))?,
+                image: any.image.take().ok_or_else(|| missing("image"))?,
+                format: any.format.take().unwrap_or_default(),
+                action: any.action.take().map(numbers),
+                state: any.state.take().map(numbers),
+                plan: any.plan.take().map(|plan| plan.0.into_iter().map(numbers).collect()),
+            }),
+            Kind::Configure => Self::Configure(ConfigureMessage {
+                on_gap: any.on_gap.take(),
+                format: any.format.take(),
+            }),
+            Kind::Ping => Self::Ping(PingMessage {
+                timestamp_us: any.timestamp_us.take().unwrap_or_default(),
+            }),
+            Kind::Close => Self::Close(CloseMessage {}),
+        };
+        any.left().map_or(Ok(message), |field| {
+            Err(format!("unknown field `{field}`: a message of this type has none"))
+        })
+    }
+}
+
+impl AnyMessage {
+    /// A field that the message's type did not take.
+    fn left(&self) -> Option<&'static str> {
+        let fields = [
+            ("seq", self.seq.is_some()),
+            ("timestamp_us", self.timestamp_us.is_some()),
+            ("image", self.image.is_some()),
+            ("format", self.format.is_some()),
+            ("action", self.action.is_some()),
+            ("state", self.state.is_some()),
+            ("plan", self.plan.is_some()),
+            ("on_gap", self.on_gap.is_some()),
+        ];
+        fields.into_iter().find(|(_, is_left)| *is_left).map(|(name, _)| name)
+    }
+}
+
+fn missing(field: &str) -> String {
+    format!("missing field `{field}`")
+}
+
+/// What is too large for `f32` becomes infinite, and is refused by name where it is used.
+fn numbers(list: List<f64>) -> Vec<f32> {
+    list.0.into_iter().map(|value| value as f32).collect()
+}

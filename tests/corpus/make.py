@@ -1,0 +1,238 @@
+"""Makes the corpora that tests/hostile replays: `python make.py` (needs Pillow). What a file's name begins with is what
+becomes of it: `ok` or `refused`, or the HTTP status. They fit the tests' models: 16×12 px, 3 frames of context, 2 to come,
+8 features, an action of two numbers and a state of one."""
+
+import base64
+import io
+import json
+import struct
+import zlib
+from pathlib import Path
+
+from PIL import Image
+
+HERE = Path(__file__).parent
+SIZE = (16, 12)
+PIXELS = bytes(range(192))
+RAW = base64.b64encode(PIXELS).decode()
+
+
+def write(folder, name, content):
+    path = HERE / folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def chunk(kind, data, length=None, crc=None):
+    crc = zlib.crc32(kind + data) if crc is None else crc
+    return struct.pack(">I", len(data) if length is None else length) + kind + data + struct.pack(">I", crc)
+
+
+def header(width, height, depth=8, color=0, interlaced=0):
+    return chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, interlaced))
+
+
+def png(*chunks):
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks) + chunk(b"IEND", b"")
+
+
+def rows(width, height, data=PIXELS):
+    lines = (b"\0" + data[at * width : (at + 1) * width].ljust(width, b"\0") for at in range(height))
+    return chunk(b"IDAT", zlib.compress(b"".join(lines)))
+
+
+def bomb(size):
+    return zlib.compress(bytes(size), 9)
+
+
+def saved(mode, kind, **options):
+    out = io.BytesIO()
+    Image.frombytes("L", SIZE, PIXELS).convert(mode).save(out, kind, **options)
+    return out.getvalue()
+
+
+def images():
+    sound, jpeg = png(header(*SIZE), rows(*SIZE)), saved("L", "JPEG")
+    frame = jpeg.index(b"\xff\xc0")
+    huge = jpeg[: frame + 5] + b"\xff\xff\xff\xff" + jpeg[frame + 9 :]
+    for name, content in {
+        "ok-gray.png": sound,
+        "ok-colour.png": saved("RGB", "PNG"),
+        "ok-palette.png": saved("P", "PNG"),
+        "ok-alpha.png": saved("RGBA", "PNG"),
+        "ok-gray.jpeg": jpeg,
+        "ok-colour.jpeg": saved("RGB", "JPEG"),
+        "ok-progressive.jpeg": saved("RGB", "JPEG", progressive=True),
+        "ok-more-rows-than-said.png": png(header(*SIZE), chunk(b"IDAT", bomb(16 << 20))),
+        "refused-other-size.png": png(header(8, 8), rows(8, 8)),
+        "refused-fewer-rows-than-said.png": png(header(*SIZE), rows(16, 2)),
+        "refused-says-65535.png": png(header(65535, 65535), rows(*SIZE)),
+        "refused-says-65535.jpeg": huge,
+        "refused-says-2-gigapixels-a-side.png": png(header(0x7FFFFFFF, 0x7FFFFFFF), rows(*SIZE)),
+        "refused-no-width.png": png(header(0, 12), rows(*SIZE)),
+        "ok-profile-bomb.png": png(header(*SIZE), chunk(b"iCCP", b"a\0\0" + bomb(64 << 20)), rows(*SIZE)),
+        "refused-chunk-of-4-gigabytes.png": png(header(*SIZE), chunk(b"eXIf", b"II", length=0x7FFFFFFF), rows(*SIZE)),
+        "refused-wrong-checksum.png": png(header(*SIZE), chunk(b"PLTE", b"abc", crc=1), rows(*SIZE)),
+        "refused-half.png": sound[: len(sound) // 2],
+        "refused-half-a-header.jpeg": jpeg[: frame + 4],
+        "refused-animation.gif": saved("L", "GIF"),
+        "refused-text.txt": b"no image at all",
+        "refused-nothing.png": b"",
+    }.items():
+        write("images", name, content)
+
+
+def pack(value):
+    """MessagePack of what the messages hold."""
+    if value is None:
+        return b"\xc0"
+    if isinstance(value, dict):
+        return bytes([0x80 | len(value)]) + b"".join(pack(key) + pack(item) for key, item in value.items())
+    if isinstance(value, list):
+        return bytes([0x90 | len(value)]) + b"".join(map(pack, value))
+    if isinstance(value, str):
+        return bytes([0xA0 | len(value)]) + value.encode()
+    if isinstance(value, bytes):
+        return b"\xc4" + bytes([len(value)]) + value
+    if isinstance(value, float):
+        return b"\xca" + struct.pack(">f", value)
+    return b"\xcf" + struct.pack(">Q", value)
+
+
+def messages():
+    frame = {"type": "frame", "seq": 0, "timestamp_us": 0, "image": RAW, "format": "raw", "action": [0.5, -0.5], "state": [1.0]}
+    plan = frame | {"plan": [[0.5, 0.0], [0.0, 0.5]]}
+    others = {"configure": {"type": "configure", "on_gap": "skip"}, "ping": {"type": "ping"}, "close": {"type": "close"}}
+    for name, message in {"frame": frame, "plan": plan, **others}.items():
+        write("messages", f"ok-{name}.json", json.dumps(message))
+        image = {"image": PIXELS} if "image" in message else {}
+        write("messages", f"ok-{name}.msgpack", pack(message | image))
+    binary = frame | {"image": PIXELS}
+    text, packed = json.dumps(frame), pack(binary)
+    for name, content in {
+        "ok-type-last.json": json.dumps({key: frame[key] for key in reversed(frame)}),
+        "ok-not-a-number.msgpack": pack(binary | {"action": [float("nan"), float("inf")]}),
+        "refused-unknown-field.json": json.dumps(frame | {"colour": 1}),
+        "refused-long-key.json": json.dumps(frame | {"colour" * 10000: 1}),
+        "refused-field-of-another.json": '{"type":"close","seq":1}',
+        "refused-unknown-type.json": '{"type":"dance"}',
+        "refused-no-type.json": '{"seq":1}',
+        "refused-key-twice.json": text[:-1] + ',"seq":1}',
+        "refused-key-twice.msgpack": b"\x88" + packed[1:] + pack("seq") + pack(1),
+        "refused-half.json": text[: len(text) // 2],
+        "refused-half.msgpack": packed[: len(packed) // 2],
+        "refused-two.json": text + text,
+        "refused-two.msgpack": packed + packed,
+        "refused-deep.json": '{"type":"frame","plan":' + "[" * 5000,
+        "refused-deep.msgpack": b"\x82" + pack("type") + pack("frame") + pack("plan") + b"\x91" * 5000,
+        "refused-huge-number.json": '{"type":"ping","timestamp_us":1e999}',
+        "refused-seq-below-zero.json": json.dumps(frame | {"seq": -1}),
+        "refused-image-is-a-list.json": json.dumps(frame | {"image": [0, 0]}),
+        "refused-4097-numbers.json": json.dumps(frame | {"action": [0] * 4097}),
+        "refused-image-of-4-gigabytes.msgpack": b"\x82" + pack("type") + pack("frame") + pack("image") + b"\xc6\xff\xff\xff\xff",
+        "refused-list-of-4-billion.msgpack": b"\x82" + pack("type") + pack("frame") + pack("action") + b"\xdd\xff\xff\xff\xff",
+        "refused-map-of-4-billion.msgpack": b"\xdf\xff\xff\xff\xff",
+    }.items():
+        write("messages", name, content)
+
+
+def form(*parts):
+    lines = [f'--X\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() + data + b"\r\n" for name, data in parts]
+    return b"".join(lines) + b"--X--\r\n"
+
+
+def bodies():
+    predict = {"frames": [RAW] * 3, "format": "raw", "actions": [[0.5, -0.5]], "state": [1.0]}
+    rollouts = {"frames": [RAW] * 3, "format": "raw", "state": [1.0], "candidates": [[[0.5, 0.0], [0.0, 0.5]]] * 3}
+    collect = {"kind": "collect", "name": "small", "scenario": "crowded", "trials": 3}
+    train = {"kind": "train", "name": "mine", "preset": "moving", "dataset": "none", "settings": {"fit": {"steps": 10}}}
+    evaluate = {"kind": "evaluate", "model": "moving", "dataset": "none"}
+    small = {"frame_width_px": 16, "frame_height_px": 12}
+    environment = {"scenario": "moving-observer", "seed": 7, "world": small}
+    for name, body in {
+        "200-predict-sound": predict,
+        "200-rollouts-sound": rollouts,
+        "200-step-sound": {"action": [0.3, -0.2]},
+        "200-step-greatest-action": {"action": [1e30, -1e30]},
+        "200-predict-greatest-action": predict | {"actions": [[1e30, -1e30]], "state": [1e30]},
+        "201-sessions-sound": {"model": "moving", "on_gap": "skip", "format": "raw"},
+        "201-environments-sound": environment,
+        "202-jobs-collect": collect,
+        "400-predict-number-beyond-f32": predict | {"state": [1e39]},
+        "404-sessions-no-such-model": {"model": "../moving"},
+        "422-predict-unknown-field": predict | {"colour": "red"},
+        "422-predict-image-is-no-base64": predict | {"frames": ["%", RAW, RAW]},
+        "422-predict-image-too-short": predict | {"frames": [RAW, "AAAA", RAW]},
+        "422-predict-two-frames": predict | {"frames": [RAW] * 2},
+        "422-predict-action-of-three": predict | {"actions": [[1, 2, 3]]},
+        "422-predict-action-too-great": predict | {"actions": [[3e38, -3e38]]},
+        "422-predict-state-is-null": predict | {"state": None},
+        "422-rollouts-none": rollouts | {"candidates": []},
+        "422-rollouts-ragged": rollouts | {"candidates": [[[0.0, 0.0], [0.0]]]},
+        "422-sessions-unknown-gap": {"model": "moving", "on_gap": "dance"},
+        "422-jobs-name-leaves": collect | {"name": "../outside"},
+        "422-jobs-dataset-leaves": train | {"dataset": "../../etc"},
+        "422-jobs-model-leaves": evaluate | {"model": "%2e%2e%2f"},
+        "422-jobs-no-trials": collect | {"trials": 0},
+        "422-jobs-unknown-kind": {"kind": "delete", "name": "all"},
+        "422-jobs-huge-layer": train | {"settings": {"model": {"hidden": 10**9}}},
+        "422-jobs-null-setting": train | {"settings": {"fit": None}},
+        "422-jobs-seed-below-zero": collect | {"seed": -1},
+        "422-environments-huge-frame": environment | {"world": {"frame_width_px": 100000, "frame_height_px": 100000}},
+        "422-environments-no-period": environment | {"world": small | {"frame_period_s": 0}},
+        "422-environments-unknown-camera": environment | {"world": small | {"camera": {"zoom": 3}}},
+        "422-step-action-of-three": {"action": [1, 2, 3]},
+        "422-step-action-too-great": {"action": [3e38, 0]},
+    }.items():
+        write("bodies", f"{name}.json", json.dumps(body))
+    text = json.dumps(predict)
+    for name, content in {
+        "400-predict-half.json": text[:400],
+        "400-predict-nothing.json": "",
+        "422-predict-deep.json": '{"actions":' + "[" * 5000,
+        "400-predict-not-a-number.json": '{"frames":[],"state":[NaN]}',
+        "400-predict-not-utf8.json": b'{"format":"\xff\xfe"}',
+        "422-predict-long-key.json": json.dumps({"colour" * 10000: 1}),
+        "422-predict-key-twice.json": '{"format":"raw","format":"png"}',
+        "400-jobs-deep.json": '{"kind":"train","settings":' + '{"a":' * 5000,
+        "200-predict-sound.form": form(*[("frames", PIXELS)] * 3, ("request", json.dumps(predict | {"frames": []}).encode())),
+        "400-predict-half.form": form(("frames", PIXELS))[:-20],
+        "422-predict-unknown-part.form": form(("colour", b"red")),
+        "422-predict-request-is-no-json.form": form(("request", b"{")),
+        "422-predict-nothing.form": form(),
+    }.items():
+        write("bodies", name, content)
+
+
+def states():
+    memory = {"next_seq": 5, "features": [[0.25] * 8] * 3, "actions": [[0.5, -0.5]] * 2, "state": [1.0]}
+    # tests/hostile puts the model's own hash in the place of WEIGHTS.
+    state = {"model": "moving", "version": 1, "weights_sha256": "WEIGHTS", "on_gap": "error", "memory": memory}
+    with_memory = lambda **more: state | {"memory": memory | more}
+    for name, content in {
+        "201-sound": state,
+        "201-of-a-fresh-session": with_memory(next_seq=0, features=[], actions=[], state=None),
+        "201-greatest-seq": with_memory(next_seq=2**64 - 1),
+        "404-other-model": state | {"model": "../moving"},
+        "409-other-weights": state | {"weights_sha256": "00"},
+        "422-unknown-field": state | {"colour": 1},
+        "422-seq-too-great": with_memory(next_seq=2**64),
+        "422-fewer-seen-than-kept": with_memory(next_seq=1),
+        "422-too-many-frames": with_memory(features=[[0.25] * 8] * 4),
+        "422-frame-of-one-feature": with_memory(features=[[0.25]] * 3),
+        "422-feature-of-two": with_memory(features=[[2.0] * 8] * 3),
+        "422-no-actions": with_memory(actions=[]),
+        "422-action-too-great": with_memory(actions=[[3e38, 0]] * 2),
+        "422-state-of-three": with_memory(state=[1, 2, 3]),
+        "422-version-below-zero": state | {"version": -1},
+    }.items():
+        write("states", f"{name}.json", json.dumps(content))
+    text = json.dumps(state)
+    write("states", "400-half.json", text[: len(text) // 2])
+    write("states", "422-deep.json", text.replace("[[", "[" * 5000, 1))
+    write("states", "422-key-twice.json", text[:-1] + ',"version":1}')
+
+
+if __name__ == "__main__":
+    for make in (images, messages, bodies, states):
+        make()

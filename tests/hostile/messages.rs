@@ -1,0 +1,86 @@
+//! Both sub-protocols' codec.
+
+use axum::extract::ws::Message;
+use foreframe::server::protocol::{ClientMessage, Codec};
+use proptest::prelude::*;
+use proptest::sample::Index;
+
+use crate::corpus::samples;
+use crate::mutation::{mutated, mutations};
+use crate::{alone, within};
+
+/// Bytes of memory for each byte of a message at most, and beside them: what it holds, and a list of lists of numbers.
+const PER_BYTE: usize = 4;
+const BESIDE: usize = 1 << 20;
+
+fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
+    if is_text {
+        (
+            Codec::Json,
+            Message::Text(String::from_utf8_lossy(&bytes).into_owned().into()),
+        )
+    } else {
+        (Codec::Msgpack, Message::Binary(bytes.into()))
+    }
+}
+
+/// What becomes of a message; an error names the sub-protocol.
+fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, String> {
+    let limit = BESIDE + PER_BYTE * bytes.len();
+    let (codec, message) = message(is_text, bytes);
+    let decoded = within(limit, name, || {
+        codec.decode(&message).map_err(|error| error.to_string())
+    });
+    if let Err(error) = &decoded {
+        assert!(error.contains(codec.name()), "{name}: {error}");
+    }
+    decoded
+}
+
+#[test]
+fn every_kept_message_is_read_or_refused_as_its_name_says() {
+    let _alone = alone();
+    for sample in samples("messages") {
+        let decoded = decode(&sample.name, sample.is("json"), sample.bytes.clone());
+        assert_eq!(decoded.is_ok(), sample.part(0) == "ok", "{}: {decoded:?}", sample.name);
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_mutated_message_is_read_or_refused(which: Index, mutations in mutations()) {
+        let _alone = alone();
+        let samples = samples("messages");
+        let sample = which.get(&samples);
+        let _ = decode(&sample.name, sample.is("json"), mutated(&sample.bytes, &mutations));
+    }
+}
+
+#[test]
+fn a_message_takes_no_more_memory_than_its_length_allows() {
+    let _alone = alone();
+    let filled = |head: &[u8], item: &[u8]| [head, &item.repeat((1 << 20) / item.len())].concat();
+    for (is_text, bytes) in [
+        (true, filled(br#"{"type":"frame","plan":["#, b"[],")),
+        (true, filled(br#"{"type":"frame","plan":[["#, b"0,")),
+        (true, filled(br#"{"type":"frame","state":["#, b"0,")),
+        (true, filled(br#"{"plan":["#, b"[],")),
+        (true, filled(br#"{"colour":["#, b"0,")),
+        (true, filled(b"{", br#""":0,"#)),
+        (true, filled(br#"{"type":""#, b"\\n")),
+        (
+            false,
+            filled(b"\x82\xA4type\xA5frame\xA4plan\xDD\x7F\xFF\xFF\xFF", b"\x90"),
+        ),
+        (false, filled(b"\x82\xA4plan\xDD\x7F\xFF\xFF\xFF", b"\x90")),
+        (
+            false,
+            filled(b"\x82\xA4type\xA5frame\xA5state\xDD\x7F\xFF\xFF\xFF", b"\x00"),
+        ),
+        (false, filled(b"\x82\xA6colour\xDD\x7F\xFF\xFF\xFF", b"\x00")),
+        (false, filled(b"\xDF\x7F\xFF\xFF\xFF", b"\xA0\x00")),
+    ] {
+        let name = String::from_utf8_lossy(&bytes[..40]).into_owned();
+        assert!(decode(&name, is_text, bytes).is_err(), "{name}");
+    }
+}

@@ -1,0 +1,95 @@
+//! A service in this process, and what its answers must be like.
+
+use std::sync::LazyLock;
+
+use axum::body::Body;
+use axum::http::{Request, header};
+use foreframe::server::{App, ServerConfig};
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+
+use crate::service::{Answer, app, send};
+use crate::within;
+
+/// Bytes of memory for each byte of a body at most, and beside them: the service's own work, and the longest request for a
+/// job, of which a byte may take more.
+const PER_BYTE: usize = 32;
+const BESIDE: usize = 12 << 20;
+
+/// The statuses with which a body can be answered.
+const STATUSES: [u16; 11] = [200, 201, 202, 400, 404, 406, 409, 413, 415, 422, 503];
+
+pub(crate) struct World {
+    runtime: Runtime,
+    pub(crate) app: App,
+    _dir: TempDir,
+}
+
+/// One for all tests of this binary. Its jobs are taken and never run.
+pub(crate) static WORLD: LazyLock<World> = LazyLock::new(|| {
+    let dir = tempfile::tempdir().unwrap();
+    let runtime = Runtime::new().unwrap();
+    let config = ServerConfig {
+        no_jobs: true,
+        max_queued_jobs: 10_000,
+        session_grace_ms: 1000,
+        max_sessions: 100_000,
+        ..ServerConfig::default()
+    };
+    let app = runtime.block_on(async { app(dir.path(), config) });
+    World {
+        runtime,
+        app,
+        _dir: dir,
+    }
+});
+
+impl World {
+    /// Asks; the answer is one of the contract's, and took no more memory than it may.
+    pub(crate) fn post(&self, name: &str, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
+        let limit = BESIDE + PER_BYTE * body.len();
+        let request = Request::post(path)
+            .header(header::CONTENT_TYPE, media_type)
+            .body(Body::from(body));
+        let answer = within(limit, name, || self.send(request.unwrap()));
+        let status = answer.status.as_u16();
+        let text = String::from_utf8_lossy(&answer.body);
+        assert!(STATUSES.contains(&status), "{name}: {status} {text}");
+        if status >= 400 {
+            let detail = answer.detail(status);
+            assert!(detail.len() < 1100 && names_something(&detail), "{name}: {detail}");
+        }
+        answer
+    }
+
+    pub(crate) fn json(&self, name: &str, path: &str, body: Vec<u8>) -> Answer {
+        self.post(name, path, "application/json", body)
+    }
+
+    pub(crate) fn send(&self, request: Request<Body>) -> Answer {
+        self.runtime.block_on(send(&self.app, request))
+    }
+
+    pub(crate) fn delete(&self, path: &str) {
+        let request = Request::delete(path).body(Body::empty()).unwrap();
+        assert_eq!(self.send(request).status, 204, "{path}");
+    }
+}
+
+/// Whether a detail says where: a field, a place in the body, or what was longer than it may be.
+fn names_something(detail: &str) -> bool {
+    let words = ["line ", "field `", "body", "model", "request", "name", "kind"];
+    let is_field = |word: &str| word.contains(['_', '[', '.', ':']) || FIELDS.contains(&word);
+    words.iter().any(|word| detail.contains(word)) || detail.split_whitespace().any(is_field)
+}
+
+const FIELDS: [&str; 8] = [
+    "frames",
+    "actions",
+    "state",
+    "states",
+    "candidates",
+    "action",
+    "plan",
+    "episode",
+];

@@ -1,0 +1,230 @@
+//! Clients whose streams break the rules, beside one whose does not.
+
+use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, ErrorCode, FrameMessage, ServerMessage};
+use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
+use serde_json::json;
+use tokio::io::AsyncWriteExt as _;
+use tokio_tungstenite::tungstenite::Message;
+
+use futures_util::SinkExt as _;
+
+use crate::client::{Client, send_frame, step};
+use crate::neighbour::Scene;
+use crate::service::{get, until};
+
+const CODECS: [Codec; 2] = [Codec::Json, Codec::Msgpack];
+
+fn refusal(message: &ServerMessage) -> (ErrorCode, &str, u64) {
+    match message {
+        ServerMessage::Error { code, detail, next_seq } => (*code, detail, *next_seq),
+        other => panic!("{other:?}"),
+    }
+}
+
+fn kept(name: &str) -> Vec<u8> {
+    std::fs::read(format!("{}/tests/corpus/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap()
+}
+
+#[tokio::test]
+async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009() {
+    let mut scene = Scene::open(ServerConfig {
+        max_body_bytes: 4096,
+        ..ServerConfig::default()
+    })
+    .await;
+    let (address, session) = (scene.address(), scene.session().await);
+    for (answered, codec) in CODECS.into_iter().enumerate() {
+        let greedy = async {
+            let mut client = Client::connect(address, &session.path("/stream"), codec).await.unwrap();
+            client.send(&send_frame(answered as u64)).await;
+            let image = ImageBytes(vec![0; 3 << 20]);
+            client
+                .send(&ClientMessage::Frame(FrameMessage { image, ..step(9) }))
+                .await;
+            assert!(matches!(client.receive().await, ServerMessage::Warming { .. }));
+            let refused = client.receive().await;
+            let (code, detail, next_seq) = refusal(&refused);
+            assert_eq!((code, next_seq), (ErrorCode::Malformed, answered as u64 + 1));
+            assert!(
+                detail.contains("Message too long") && detail.ends_with("> 4096"),
+                "{detail}"
+            );
+            assert_eq!(client.end().await, (Some(ClosingReason::TooLong), Some(1009)));
+        };
+        scene.beside(greedy).await;
+    }
+    let client = Client::connect(address, &session.path("/stream"), Codec::Json).await;
+    assert_eq!(client.unwrap().next_seq, 2);
+    scene.close().await;
+}
+
+#[tokio::test]
+async fn what_breaks_the_websockets_own_rules_is_told_so_and_closed() {
+    let mut scene = Scene::open(ServerConfig::default()).await;
+    let (address, session) = (scene.address(), scene.session().await);
+    for (bytes, reason, code) in [
+        // Text that is not masked.
+        (&b"\x81\x01x"[..], ClosingReason::Malformed, 1002),
+        // An operation that there is not.
+        (b"\x83\x80\0\0\0\0", ClosingReason::Malformed, 1002),
+        // The rest of nothing.
+        (b"\x80\x80\0\0\0\0", ClosingReason::Malformed, 1002),
+        // A reserved bit, as of compression, which is not spoken here.
+        (b"\xC1\x80\0\0\0\0", ClosingReason::Malformed, 1002),
+        (b"\x81\x82\0\0\0\0\xFF\xFE", ClosingReason::NotUtf8, 1007),
+    ] {
+        let breaking = async {
+            let mut client = Client::connect(address, &session.path("/stream"), Codec::Json)
+                .await
+                .unwrap();
+            client.socket.get_mut().write_all(bytes).await.unwrap();
+            assert_eq!(refusal(&client.receive().await).0, ErrorCode::Malformed);
+            assert_eq!(client.end().await, (Some(reason), Some(code)), "{bytes:?}");
+        };
+        scene.beside(breaking).await;
+    }
+    scene.close().await;
+}
+
+#[tokio::test]
+async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_goes_on() {
+    let mut scene = Scene::open(ServerConfig::default()).await;
+    let (address, session) = (scene.address(), scene.session().await);
+    for (codec, message, kind) in [
+        (Codec::Msgpack, Message::text(r#"{"type":"ping"}"#), "binary"),
+        (Codec::Json, Message::binary(vec![0x80]), "text"),
+    ] {
+        let confused = async {
+            let mut client = Client::connect(address, &session.path("/stream"), codec).await.unwrap();
+            let seq = client.next_seq;
+            client.socket.send(message).await.unwrap();
+            let answer = client.receive().await;
+            let detail = format!("{} takes {kind} messages", codec.name());
+            assert_eq!(refusal(&answer), (ErrorCode::Malformed, detail.as_str(), seq));
+            assert!(matches!(
+                client.ask(&send_frame(seq)).await,
+                ServerMessage::Warming { .. }
+            ));
+        };
+        scene.beside(confused).await;
+    }
+    scene.close().await;
+}
+
+#[tokio::test]
+async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_goes_on() {
+    let mut scene = Scene::open(ServerConfig::default()).await;
+    let (address, session) = (scene.address(), scene.session().await);
+    let frame = |change: &dyn Fn(&mut FrameMessage)| {
+        let mut message = step(0);
+        change(&mut message);
+        ClientMessage::Frame(message)
+    };
+    let image = |name: &'static str| {
+        move |message: &mut FrameMessage| {
+            message.image = ImageBytes(kept(&format!("images/{name}")));
+            message.format = ImageFormat::Png;
+        }
+    };
+    let bad: [(ClientMessage, &str); 8] = [
+        (
+            frame(&|m| m.action = Some(vec![0.0, f32::NAN])),
+            "action: action component 1 is NaN",
+        ),
+        (
+            frame(&|m| m.plan = Some(vec![vec![f32::INFINITY; 2]; 2])),
+            "plan: action component 0 is inf",
+        ),
+        (frame(&|m| m.state = Some(vec![3e38])), "state: state component 0 is 3"),
+        (frame(&|m| m.action = Some(vec![0.0; 3])), "action holds 3 numbers"),
+        (
+            frame(&|m| m.image = ImageBytes(vec![0; 191])),
+            "image holds 191 raw bytes",
+        ),
+        (frame(&image("refused-says-65535.png")), "image is 65535×65535 px"),
+        (frame(&image("refused-says-65535.jpeg")), "image is 65535×65535 px"),
+        (
+            frame(&image("refused-fewer-rows-than-said.png")),
+            "image is not a readable",
+        ),
+    ];
+    let lying = async {
+        let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
+            .await
+            .unwrap();
+        for (message, expected) in &bad {
+            let answer = client.ask(message).await;
+            let (code, detail, next_seq) = refusal(&answer);
+            assert_eq!((code, next_seq), (ErrorCode::Invalid, 0));
+            assert!(detail.starts_with(expected), "{detail}");
+        }
+        for name in [
+            "refused-list-of-4-billion.msgpack",
+            "refused-deep.msgpack",
+            "refused-half.msgpack",
+        ] {
+            let bytes = kept(&format!("messages/{name}"));
+            client.socket.send(Message::binary(bytes)).await.unwrap();
+            assert_eq!(refusal(&client.receive().await).0, ErrorCode::Malformed, "{name}");
+        }
+        assert!(matches!(
+            client.ask(&send_frame(0)).await,
+            ServerMessage::Warming { .. }
+        ));
+    };
+    scene.beside(lying).await;
+    scene.close().await;
+}
+
+#[tokio::test]
+async fn what_a_client_sent_is_not_quoted_back_at_length() {
+    let mut scene = Scene::open(ServerConfig::default()).await;
+    let (address, session) = (scene.address(), scene.session().await);
+    let verbose = async {
+        let mut client = Client::connect(address, &session.path("/stream"), Codec::Json)
+            .await
+            .unwrap();
+        let key = "colour".repeat(100_000);
+        client.send_text(&json!({"type": "ping", key: 1}).to_string()).await;
+        let answer = client.receive().await;
+        let (_, detail, _) = refusal(&answer);
+        assert!(
+            detail.len() < 1100 && detail.contains("expected one of `type`"),
+            "{detail}"
+        );
+    };
+    scene.beside(verbose).await;
+    scene.close().await;
+}
+
+#[tokio::test]
+async fn a_socket_that_ends_in_the_midst_of_a_frame_leaves_its_session_where_it_was() {
+    let mut scene = Scene::open(ServerConfig::default()).await;
+    let (address, session) = (scene.address(), scene.session().await);
+    // A binary message of 16 KiB of which ten bytes come; half a header; the first of many fragments.
+    for part in [
+        &b"\x82\xFE\x40\0\0\0\0\0half a mess"[..],
+        b"\x82",
+        b"\x02\x83\0\0\0\0abc",
+    ] {
+        let broken = async {
+            let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
+                .await
+                .unwrap();
+            let seq = client.next_seq;
+            client.ask(&send_frame(seq)).await;
+            client.socket.get_mut().write_all(part).await.unwrap();
+            client.socket.get_mut().shutdown().await.unwrap();
+            drop(client);
+            seq + 1
+        };
+        let next_seq = scene.beside(broken).await;
+        let path = format!("/v1/sessions/{}", session.id);
+        until(async || {
+            let described = get(&scene.app, &path).await.json();
+            (described["connected"] == false).then(|| assert_eq!(described["next_seq"], next_seq))
+        })
+        .await;
+    }
+    scene.close().await;
+}

@@ -1,0 +1,83 @@
+//! The priorities of the real program's threads while it serves and works on a job; Linux has them for each thread.
+#![cfg(target_os = "linux")]
+
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use crate::process::{Program, Served};
+use crate::service::PATIENCE;
+
+/// Name and niceness of a process's threads.
+fn threads(process: u32) -> Vec<(String, i64)> {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let stats = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("stat")).ok());
+    stats
+        .map(|stat| {
+            let (head, rest) = stat.rsplit_once(") ").unwrap();
+            let (_, name) = head.split_once('(').unwrap();
+            // The 19th field of all; the third is the first after the name.
+            let niceness = rest.split(' ').nth(16).unwrap().parse().unwrap();
+            (name.to_owned(), niceness)
+        })
+        .collect()
+}
+
+/// Whether all of a job's threads are there, below the others; and the others where the process began.
+fn stands_back(process: u32) -> bool {
+    let threads = threads(process);
+    // Threads that candle shares would have predictions wait for the training.
+    assert!(
+        !threads.iter().any(|(name, _)| name.starts_with("candle")),
+        "{threads:?}"
+    );
+    let (jobs, others): (Vec<_>, Vec<_>) = threads.iter().partition(|(name, _)| name.starts_with("jobs"));
+    let of_process = others.iter().find(|(name, _)| name == "foreframe").unwrap().1;
+    assert!(
+        others.iter().all(|(_, niceness)| *niceness == of_process),
+        "{threads:?}"
+    );
+    let low = (of_process + 10).min(19);
+    // One that waits for the work, and two of the pool.
+    jobs.len() >= 3 && jobs.iter().all(|(_, niceness)| *niceness == low)
+}
+
+fn wait_until_it_stands_back(process: u32) {
+    let deadline = Instant::now() + PATIENCE;
+    while !stands_back(process) {
+        assert!(Instant::now() < deadline, "{:?}", threads(process));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+fn collect(name: &str, trials: u64) -> Value {
+    json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials})
+}
+
+#[test]
+fn the_threads_of_jobs_stand_back_behind_those_that_serve() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = Served::start(dir.path(), &["--set", "job_threads=2"]);
+    served.ask("POST", "/v1/jobs", &collect("seen", 40));
+    served.job_until("job-1", |job| job["state"] == "succeeded");
+    let settings = json!({"data": {"windows": 64, "validation_windows": 8}});
+    let train = json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings});
+    for job in [&train, &collect("more", 100_000)] {
+        let id = served.ask("POST", "/v1/jobs", job)["id"].as_str().unwrap().to_owned();
+        served.job_until(&id, |job| job["progress"]["done"].as_u64() > Some(0));
+        wait_until_it_stands_back(served.program.id());
+        served.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
+    }
+    let names: Vec<String> = threads(served.program.id()).into_iter().map(|(name, _)| name).collect();
+    assert!(names.iter().any(|name| name == "inference"), "{names:?}");
+}
+
+#[test]
+fn so_do_those_of_a_worker() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = Served::start(dir.path(), &["--no-jobs"]);
+    let worker = Program::start(dir.path(), &["worker", "--set", "job_threads=2"]);
+    served.ask("POST", "/v1/jobs", &collect("seen", 100_000));
+    served.job_until("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
+    wait_until_it_stands_back(worker.id());
+}

@@ -1,0 +1,256 @@
+//! What the real program measures, after each thing that it measures has been done.
+
+use std::io::Read as _;
+use std::net::TcpStream;
+use std::path::Path;
+use std::time::Instant;
+
+use foreframe::nn::{Conditioning, ModelSpec};
+use foreframe::server::protocol::{ClientMessage, Codec, ServerMessage};
+use foreframe::server::{ImageBytes, ImageFormat};
+use foreframe::telemetry::names;
+use serde_json::{Value, json};
+
+use crate::client::{Client, Opened, send_frame, step};
+use crate::process::Served;
+use crate::service::{PATIENCE, context, model, slow_spec, spec};
+
+const SIDE: u32 = 256;
+const CONNECTIONS: usize = 24;
+
+/// The value of a series, as it is scraped.
+fn measured(served: &Served, series: &str) -> Option<f64> {
+    let text = served.get("/metrics");
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix(series)?.strip_prefix(' '));
+    line.map(|value| value.parse().unwrap())
+}
+
+#[track_caller]
+fn becomes(served: &Served, series: &str, value: f64) {
+    let deadline = Instant::now() + PATIENCE;
+    while measured(served, series) != Some(value) {
+        let found = measured(served, series);
+        assert!(Instant::now() < deadline, "{series} is {found:?}, not {value}");
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
+}
+
+#[track_caller]
+fn is(served: &Served, series: &str, value: f64) {
+    assert_eq!(measured(served, series), Some(value), "{series}");
+}
+
+fn models(dir: &Path) {
+    model(dir, "plain", spec(Conditioning::None));
+    model(dir, "slow", slow_spec());
+    // One whose answers soon fill a socket.
+    let large = ModelSpec {
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        context: 1,
+        horizon: 8,
+        ..spec(Conditioning::None)
+    };
+    model(dir, "large", large);
+    model(dir, "broken", spec(Conditioning::None));
+    std::fs::write(dir.join("broken/model.safetensors"), "no weights").unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_program_does_is_counted() {
+    let dir = tempfile::tempdir().unwrap();
+    models(&dir.path().join("models"));
+    let bounds = [
+        "session_grace_ms=1000".to_owned(),
+        "max_stream_buffer_bytes=1048576".to_owned(),
+        "max_queued_predictions=1".to_owned(),
+        format!("max_connections={CONNECTIONS}"),
+    ];
+    let settings: Vec<&str> = bounds.iter().flat_map(|bound| ["--set", bound]).collect();
+    let served = Served::start(dir.path(), &settings);
+    is(&served, "foreframe_models_loaded", 3.0);
+    is(&served, "foreframe_model_loads_total{outcome=\"ok\"}", 3.0);
+    is(&served, "foreframe_model_loads_total{outcome=\"refused\"}", 1.0);
+    for seldom in [
+        names::SESSIONS_EVICTED,
+        names::STREAM_DROPPED,
+        names::AUTH_REFUSED,
+        names::HTTP_CONNECTIONS_REFUSED,
+    ] {
+        is(&served, seldom, 0.0);
+    }
+    sessions(&served).await;
+    a_slow_reader(&served).await;
+    a_full_queue(&served);
+    jobs(&served);
+    connections(&served);
+    let text = served.get("/metrics");
+    for name in names::ALL {
+        assert!(text.contains(&format!("# HELP {name} ")), "{name} is not in\n{text}");
+    }
+    served.terminate();
+    served.ended();
+}
+
+async fn sessions(served: &Served) {
+    let mut clients = Vec::new();
+    for _ in 0..2 {
+        let opened = Opened::of(&served.ask("POST", "/v1/sessions", &json!({"model": "plain"})));
+        let path = opened.path("/stream");
+        clients.push(Client::connect(served.address, &path, Codec::Msgpack).await.unwrap());
+    }
+    for seq in 0..3 {
+        clients[0].ask(&send_frame(seq)).await;
+    }
+    // One that is refused has come all the same.
+    let refused = clients[1].ask(&send_frame(9)).await;
+    assert!(matches!(refused, ServerMessage::Error { .. }), "{refused:?}");
+    is(served, "foreframe_sessions_active", 2.0);
+    is(served, "foreframe_streams_active", 2.0);
+    is(served, "foreframe_stream_frames_total{model=\"plain\"}", 4.0);
+    is(served, "foreframe_sessions_evicted_total", 0.0);
+    drop(clients);
+    becomes(served, "foreframe_sessions_evicted_total", 2.0);
+    becomes(served, "foreframe_sessions_active", 0.0);
+    becomes(served, "foreframe_streams_active", 0.0);
+}
+
+async fn a_slow_reader(served: &Served) {
+    let path = "/v1/models/large/stream";
+    let mut client = Client::connect(served.address, path, Codec::Msgpack).await.unwrap();
+    let frame = ClientMessage::Frame(foreframe::server::protocol::FrameMessage {
+        image: ImageBytes(vec![7; (SIDE * SIDE) as usize]),
+        format: ImageFormat::Raw,
+        action: None,
+        state: None,
+        ..step(0)
+    });
+    client.ask(&frame).await;
+    let sent = 100;
+    for _ in 0..sent {
+        // The kept answer is sent again for each.
+        client.send(&frame).await;
+    }
+    let (mut missed, mut read) = (0, 0);
+    while missed + read < sent {
+        if let ServerMessage::Prediction { dropped, .. } = client.receive().await {
+            missed += dropped;
+            read += 1;
+        }
+    }
+    assert!(missed > 0);
+    is(served, "foreframe_stream_predictions_dropped_total", missed as f64);
+    is(
+        served,
+        "foreframe_stream_frames_total{model=\"large\"}",
+        1.0 + sent as f64,
+    );
+}
+
+/// Asks for predictions at once until one finds the queue full.
+fn a_full_queue(served: &Served) {
+    let body = json!({"frames": context()});
+    let (mut computed, mut refused) = (0, 0);
+    let deadline = Instant::now() + PATIENCE;
+    while refused == 0 {
+        assert!(Instant::now() < deadline);
+        std::thread::scope(|scope| {
+            let ask = || served.ask("POST", "/v1/models/slow/predict", &body)["status"] == 503;
+            let asked: Vec<_> = (0..8).map(|_| scope.spawn(ask)).collect();
+            for is_refused in asked.into_iter().map(|asked| asked.join().unwrap()) {
+                *(if is_refused { &mut refused } else { &mut computed }) += 1;
+            }
+        });
+    }
+    is(
+        served,
+        "foreframe_predictions_refused_total{reason=\"full\"}",
+        f64::from(refused),
+    );
+    for name in [
+        "foreframe_prediction_batch_size_sum",
+        "foreframe_prediction_queue_wait_seconds_count",
+    ] {
+        is(served, &format!("{name}{{model=\"slow\"}}"), f64::from(computed));
+    }
+    let seconds = measured(served, "foreframe_prediction_compute_seconds_sum{model=\"slow\"}");
+    assert!(seconds.is_some_and(|seconds| seconds > 0.0), "{seconds:?}");
+    is(served, "foreframe_predictions_waiting", 0.0);
+    let route = "method=\"POST\",route=\"/v1/models/{model}/predict\"";
+    for (status, count) in [(200, computed), (503, refused)] {
+        let series = format!("foreframe_http_requests_total{{{route},status=\"{status}\"}}");
+        is(served, &series, f64::from(count));
+    }
+}
+
+fn jobs(served: &Served) {
+    let collect = |name: &str, trials: u64| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials});
+    let post = |body: &Value| served.ask("POST", "/v1/jobs", body);
+    post(&collect("seen", 40));
+    served.job_until("job-1", |job| job["state"] == "succeeded");
+    let settings = json!({
+        "model": {"features": 8, "hidden": 8},
+        "data": {"windows": 8, "validation_windows": 4},
+        "pretrain": {"steps": 2, "batch_size": 4},
+        "fit": {"steps": 2, "batch_size": 4},
+        "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
+    });
+    post(&json!({"kind": "train", "name": "new", "preset": "paper", "dataset": "seen", "settings": settings}));
+    let trained = served.job_until("job-2", |job| job["state"] == "succeeded");
+    for split in ["train", "validation"] {
+        let series = format!("foreframe_training_loss{{split=\"{split}\"}}");
+        is(served, &series, trained["losses"][split].as_f64().unwrap());
+    }
+    post(&collect("long", 100_000));
+    served.job_until("job-3", |job| job["state"] == "running");
+    is(served, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 1.0);
+    post_cancel(served, "job-3");
+    for (kind, state, count) in [
+        ("collect", "succeeded", 1.0),
+        ("train", "succeeded", 1.0),
+        ("collect", "cancelled", 1.0),
+    ] {
+        is(
+            served,
+            &format!("foreframe_jobs{{kind=\"{kind}\",state=\"{state}\"}}"),
+            count,
+        );
+        becomes(
+            served,
+            &format!("foreframe_jobs_ended_total{{kind=\"{kind}\",outcome=\"{state}\"}}"),
+            count,
+        );
+    }
+    is(served, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
+    becomes(served, "foreframe_models_loaded", 4.0);
+    is(served, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
+}
+
+fn post_cancel(served: &Served, id: &str) {
+    served.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
+    served.job_until(id, |job| job["state"] == "cancelled");
+}
+
+fn connections(served: &Served) {
+    // The one that asks.
+    becomes(served, "foreframe_http_connections_open", 1.0);
+    let mut held: Vec<TcpStream> = (0..CONNECTIONS + 4)
+        .map(|_| TcpStream::connect(served.address).unwrap())
+        .collect();
+    for over in held.iter_mut().skip(CONNECTIONS) {
+        let mut told = String::new();
+        over.read_to_string(&mut told).unwrap();
+        assert!(told.starts_with("HTTP/1.1 503"), "{told}");
+    }
+    drop(held);
+    let deadline = Instant::now() + PATIENCE;
+    let refused = loop {
+        if let Some(refused) = measured(served, "foreframe_http_connections_refused_total") {
+            break refused;
+        }
+        assert!(Instant::now() < deadline);
+    };
+    assert!(refused >= 4.0, "{refused}");
+}

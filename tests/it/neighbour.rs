@@ -1,0 +1,110 @@
+//! A robot that streams beside bad clients, and is answered as if there were none.
+
+use std::cell::Cell;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use foreframe::frame::Frame;
+use foreframe::nn::Conditioning;
+use foreframe::registry::LoadedModel;
+use foreframe::server::protocol::{Codec, ServerMessage};
+use foreframe::server::{App, ServerConfig};
+use foreframe::serving::{self, PredictionInput};
+use foreframe::types::{Action, RobotState};
+use serde_json::json;
+
+use crate::client::{Client, Opened, send_frame, step};
+use crate::service::{CONTEXT, HEIGHT, Running, WIDTH, app, model, run, spec};
+
+/// From one frame to the next.
+const PERIOD: Duration = Duration::from_millis(5);
+
+/// A running server with a robot that streams.
+pub(crate) struct Scene {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) app: App,
+    pub(crate) server: Running,
+    model: LoadedModel,
+    robot: Client,
+}
+
+impl Scene {
+    pub(crate) async fn open(config: ServerConfig) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let app = app(dir.path(), config);
+        let server = run(app.clone()).await;
+        let model = model(&dir.path().join("again"), "moving", spec(Conditioning::StateAction));
+        let session = Opened::open(&app, &json!({"model": "moving"})).await;
+        let robot = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
+            .await
+            .unwrap();
+        let mut scene = Self {
+            dir,
+            app,
+            server,
+            model,
+            robot,
+        };
+        for _ in 0..CONTEXT {
+            scene.step().await;
+        }
+        scene
+    }
+
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.server.address
+    }
+
+    /// A session of its own for a bad client.
+    pub(crate) async fn session(&self) -> Opened {
+        Opened::open(&self.app, &json!({"model": "moving"})).await
+    }
+
+    /// Does the bad thing while the robot streams; the robot notices nothing, neither meanwhile nor afterwards.
+    pub(crate) async fn beside<T>(&mut self, bad: impl Future<Output = T>) -> T {
+        let is_over = Cell::new(false);
+        let bad = async {
+            let result = bad.await;
+            is_over.set(true);
+            result
+        };
+        let robot = async {
+            while !is_over.get() {
+                self.step().await;
+                tokio::time::sleep(PERIOD).await;
+            }
+            self.step().await;
+        };
+        tokio::join!(bad, robot).0
+    }
+
+    /// Sends the robot's next frame; the answer is what the model predicts when it is asked alone.
+    async fn step(&mut self) {
+        let seq = self.robot.next_seq;
+        self.robot.next_seq += 1;
+        let answer = self.robot.ask(&send_frame(seq)).await;
+        let Some(first) = (seq + 1).checked_sub(CONTEXT as u64) else {
+            assert!(matches!(answer, ServerMessage::Warming { .. }), "{answer:?}");
+            return;
+        };
+        let ServerMessage::Prediction { frames, .. } = answer else {
+            panic!("{answer:?}")
+        };
+        let image = |seq| Frame::new(WIDTH, HEIGHT, step(seq).image.0).unwrap();
+        let input = PredictionInput {
+            frames: (first..=seq).map(image).collect(),
+            actions: vec![Action::try_from(step(seq).action.unwrap()).unwrap()],
+            state: RobotState::try_from(step(seq).state.unwrap()).ok(),
+            future_actions: None,
+        };
+        let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0);
+        let found: Vec<&[u8]> = frames.iter().map(|frame| frame.0.as_slice()).collect();
+        let expected: Vec<&[u8]> = expected.iter().map(Frame::pixels).collect();
+        assert_eq!(found, expected, "frame {seq}");
+    }
+
+    pub(crate) async fn close(self) {
+        drop(self.robot);
+        self.server.stop().await;
+    }
+}

@@ -1,0 +1,159 @@
+//! The real program in a process of its own, asked over sockets and told to stop.
+
+use std::fs::File;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::service::PATIENCE;
+
+/// The program in a directory, with no setting from the environment, as users start it.
+pub(crate) fn foreframe(dir: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
+    command.current_dir(dir).env_remove("CANDLE_NUM_THREADS");
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("FOREFRAME_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+pub(crate) fn output(dir: &Path, arguments: &[&str]) -> Output {
+    foreframe(dir).args(arguments).output().unwrap()
+}
+
+pub(crate) fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// A running program that has said its first line; killed when a test ends before it.
+pub(crate) struct Program {
+    child: Child,
+    line: String,
+    log: PathBuf,
+}
+
+impl Program {
+    pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
+        let log = dir.join(format!("{}.log", arguments[0]));
+        let mut child = foreframe(dir)
+            .args(arguments)
+            .env("RUST_LOG", "foreframe=debug")
+            .stdout(Stdio::piped())
+            .stderr(File::create(&log).unwrap())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.as_mut().unwrap())
+            .read_line(&mut line)
+            .unwrap();
+        Self { child, line, log }
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub(crate) fn terminate(&self) {
+        let kill = Command::new("kill").args(["-TERM", &self.id().to_string()]).status();
+        assert!(kill.unwrap().success());
+    }
+
+    /// Waits for the end; gives its log.
+    pub(crate) fn ended(mut self) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(Instant::now() < deadline, "the program did not end");
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        let log = std::fs::read_to_string(&self.log).unwrap();
+        assert!(status.success(), "{status}: {log}");
+        log
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // It has ended already in a test that passes.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A server that is ready.
+pub(crate) struct Served {
+    pub(crate) program: Program,
+    pub(crate) address: SocketAddr,
+}
+
+impl Served {
+    pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
+        let program = Program::start(dir, &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat());
+        let line = &program.line;
+        let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
+        let served = Self {
+            address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
+            program,
+        };
+        let deadline = Instant::now() + PATIENCE;
+        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
+            assert!(Instant::now() < deadline, "the server did not get ready");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        served
+    }
+
+    /// The whole answer.
+    pub(crate) fn get(&self, path: &str) -> String {
+        self.send("GET", path, "")
+    }
+
+    /// The JSON of the answer.
+    pub(crate) fn ask(&self, method: &str, path: &str, body: &Value) -> Value {
+        let answer = self.send(method, path, &body.to_string());
+        let body = answer.split_once("\r\n\r\n").map(|(_, body)| body).unwrap();
+        serde_json::from_str(body).unwrap_or_else(|_| panic!("{answer}"))
+    }
+
+    fn send(&self, method: &str, path: &str, body: &str) -> String {
+        let mut stream = TcpStream::connect(self.address).unwrap();
+        let head = "host: a\r\nconnection: close\r\ncontent-type: application/json";
+        let length = body.len();
+        write!(
+            stream,
+            "{method} {path} HTTP/1.1\r\n{head}\r\ncontent-length: {length}\r\n\r\n{body}"
+        )
+        .unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        answer
+    }
+
+    /// Asks for a job until that has come.
+    pub(crate) fn job_until(&self, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let job = self.ask("GET", &format!("/v1/jobs/{id}"), &Value::Null);
+            if has_come(&job) {
+                return job;
+            }
+            assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    pub(crate) fn terminate(&self) {
+        self.program.terminate();
+    }
+
+    /// Waits for the end; gives its log.
+    pub(crate) fn ended(self) -> String {
+        self.program.ended()
+    }
+}
