@@ -39,7 +39,6 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::middleware::from_fn_with_state;
 use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
 use tokio::time::{timeout, timeout_at};
@@ -267,8 +266,8 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(app.config().max_body_bytes))
-        .layer(from_fn_with_state(app.clone(), origin::check))
-        .layer(from_fn_with_state(app.clone(), middleware::trace))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), origin::check))
+        .layer(axum::middleware::from_fn_with_state(app.clone(), middleware::trace))
         .with_state(app)
 }
 
@@ -281,10 +280,7 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/models/{model}", get(models::get))
         .route("/v1/models/{model}/versions/{version}", delete(models::delete))
         .route("/v1/models/{model}/versions/{version}/activate", post(models::activate))
-        .route(
-            "/v1/models/{model}/predict",
-            post(predict::predict).layer(from_fn_with_state(app.clone(), admission::check)),
-        )
+        .route("/v1/models/{model}/predict", post(predict::predict))
         .route("/v1/models/{model}/preview.png", get(preview::preview))
         .route("/v1/models/{model}/rollouts", post(rollouts::of_model))
         .route("/v1/models/{model}/stream", get(stream::of_model))
@@ -315,7 +311,7 @@ fn api(app: &App) -> Router<App> {
         .route("/v1/environments/{id}", delete(environments::delete))
         .route("/v1/environments/{id}/reset", post(environments::reset))
         .route("/v1/environments/{id}/step", post(environments::step))
-        .route_layer(from_fn_with_state(app.clone(), keys::check))
+        .route_layer(axum::middleware::from_fn_with_state(app.clone(), keys::check))
 }
 
 /// Answers on the listener until `shutdown` completes. Then it is not ready but goes on for `drain_ms`; takes no more

@@ -5,34 +5,14 @@
 use std::sync::Arc;
 
 use axum::RequestExt as _;
-use axum::extract::{Request, State};
-use axum::middleware::Next;
-use axum::response::{IntoResponse as _, Response};
+use axum::extract::Request;
 use futures_util::StreamExt as _;
 use metrics::counter;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::ServerConfig;
 use super::error::ApiError;
-use super::{App, ServerConfig};
 use crate::telemetry::names;
-
-/// Lets a request pass unless it is known before its body that there is no place. It takes none: whoever sends slowly
-/// keeps nobody out.
-pub(super) async fn check(State(app): State<App>, request: Request, next: Next) -> Response {
-    match app.admission().refusal() {
-        None => next.run(request).await,
-        Some(refusal) => {
-            skim(request).await;
-            refusal.into_response()
-        }
-    }
-}
-
-/// Reads what is not wanted, so that the connection can be kept.
-async fn skim(request: Request) {
-    let mut chunks = request.into_limited_body().into_data_stream();
-    while let Some(Ok(_)) = chunks.next().await {}
-}
 
 /// The places of requests for predictions.
 pub(super) struct Admission {
@@ -53,9 +33,14 @@ impl Admission {
         Arc::clone(&self.places).try_acquire_owned().map_err(|_| self.full())
     }
 
-    /// Why there is no place, if all are taken.
-    fn refusal(&self) -> Option<ApiError> {
-        (self.places.available_permits() == 0).then(|| self.full())
+    /// The request, unless it is known before its body that there is no place. It takes none: whoever sends slowly keeps
+    /// nobody out. Errors: `Unavailable`.
+    pub(super) async fn pass(&self, request: Request) -> Result<Request, ApiError> {
+        if self.places.available_permits() > 0 {
+            return Ok(request);
+        }
+        skim(request).await;
+        Err(self.full())
     }
 
     fn full(&self) -> ApiError {
@@ -64,12 +49,18 @@ impl Admission {
     }
 }
 
+/// Reads what is not wanted, so that the connection can be kept.
+async fn skim(request: Request) {
+    let mut chunks = request.into_limited_body().into_data_stream();
+    while let Some(Ok(_)) = chunks.next().await {}
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn one_more_than_may_wait_and_be_computed_is_refused_until_one_has_left() {
+    #[tokio::test]
+    async fn one_more_than_may_wait_and_be_computed_is_refused_until_one_has_left() {
         let admission = Admission::new(&ServerConfig {
             max_queued_predictions: 1,
             max_batch: 2,
@@ -77,8 +68,8 @@ mod tests {
         });
         let mut places: Vec<_> = (0..3).map(|_| admission.enter().unwrap()).collect();
         assert!(matches!(admission.enter(), Err(ApiError::Unavailable { .. })));
-        assert_eq!(admission.refusal(), admission.enter().err());
+        assert!(admission.pass(Request::default()).await.is_err());
         places.pop();
-        assert!(admission.refusal().is_none() && admission.enter().is_ok());
+        assert!(admission.pass(Request::default()).await.is_ok() && admission.enter().is_ok());
     }
 }

@@ -16,13 +16,14 @@ pub(super) trait WithFrames {
 }
 
 /// A JSON body, or a form (`multipart/form-data`): a part `request`, which is the JSON body, and a part `frames` for each
-/// image, in order.
+/// image, in order. Refused unread where there is no place for its prediction.
 pub(super) struct Upload<T>(pub(super) T);
 
 impl<T: DeserializeOwned + WithFrames> FromRequest<App> for Upload<T> {
     type Rejection = ApiError;
 
     async fn from_request(request: Request, app: &App) -> Result<Self, ApiError> {
+        let request = app.admission().pass(request).await?;
         let media_type = request
             .headers()
             .get(header::CONTENT_TYPE)
