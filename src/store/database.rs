@@ -100,7 +100,7 @@ impl Database {
                 })?;
                 Self::open_sqlite(options).await
             }
-            "postgres" | "postgresql" => Self::open_postgres(url).await,
+            "postgres" | "postgresql" => Box::pin(Self::open_postgres(url)).await,
             _ => Err(StoreError::Url {
                 flag: "database",
                 scheme: scheme.chars().take(16).collect(),
