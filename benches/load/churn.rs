@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// How many do so at a time, each on a kept connection
     #[arg(long, default_value_t = 8)]
     workers: usize,
-    /// Bound: growth of the server's memory after the first tenth
+    /// Bound: growth of the server's memory after the warm-up
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
 }
@@ -82,11 +82,17 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     tokio::time::sleep(REST).await;
     let before = server.process.taken();
     println!("after the warm-up: {}", list(&before));
+    // What starting took is given back in time: the first part may find less than the warm-up left.
+    let mut least_mb = before.rss_mb;
     for (deed, count, _, name) in &deeds {
         let (since, part) = (Instant::now(), count / PARTS);
         for done in 1..=PARTS {
             doing(deed, part).await;
-            println!("after {} {name}: {}", done * part, list(&server.process.taken()));
+            let taken = server.process.taken();
+            println!("after {} {name}: {}", done * part, list(&taken));
+            if done == 1 {
+                least_mb = least_mb.min(taken.rss_mb);
+            }
         }
         println!("{:.0} {name}/s", (PARTS * part) as f64 / since.elapsed().as_secs_f64());
     }
@@ -96,7 +102,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     );
     let after = settled(&server, &before).await;
     println!("at the end: {}", list(&after));
-    let growth_mb = after.rss_mb - before.rss_mb;
+    let growth_mb = after.rss_mb - least_mb;
     let what = format!("memory grew by {growth_mb:.1} MB, at most {} MB", args.growth_mb);
     bounds.hold(growth_mb <= args.growth_mb, what);
     bounds.hold(after.descriptors <= before.descriptors, "no descriptor was lost");

@@ -65,9 +65,9 @@ enum Scenario {
 /// The scenarios as CI runs them: on a machine that is busy, so latencies are only kept from growing absurd.
 const SHORT_FORMS: [&str; 5] = [
     "stream --sessions 4 --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
-    "saturate --peak-s 1 --seconds 4 --goodput-share 0.5 --sessions 32",
-    "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000",
-    "churn --sessions 300 --requests 3000",
+    "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mb 40 --sessions 32",
+    "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mb 40",
+    "churn --sessions 300 --requests 3000 --growth-mb 40",
     "health --seconds 3 --livez-p99-ms 1000 --p99-ms 1000",
 ];
 

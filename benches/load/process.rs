@@ -1,17 +1,23 @@
 //! What a process takes, read from `/proc`.
 
 use std::fs;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// Ticks of `/proc/PID/stat` in a second: the same on every Linux that people run.
 const TICKS_PER_S: f64 = 100.0;
+/// What the database's files are named.
+const DATABASE: &str = "foreframe.db";
+/// How the names of its connections' threads begin.
+const DATABASE_THREAD: &str = "sqlx-";
 
 /// A process, by its number or `self`.
 #[derive(Clone)]
 pub(crate) struct Process(pub(crate) String);
 
-/// What a process takes at a time.
-#[derive(Clone, Copy, Debug)]
+/// What a process takes at a time. Of descriptors and threads without those of the connections to its database: they are
+/// a bounded number, and come when they are needed.
+#[derive(Clone, Copy)]
 pub(crate) struct Taken {
     pub(crate) rss_mb: f64,
     pub(crate) peak_rss_mb: f64,
@@ -35,9 +41,21 @@ impl Process {
         Taken {
             rss_mb: field("VmRSS:") / 1024.0,
             peak_rss_mb: field("VmHWM:") / 1024.0,
-            descriptors: fs::read_dir(format!("/proc/{}/fd", self.0)).unwrap().count(),
-            threads: field("Threads:") as usize,
+            descriptors: self.count("fd", |entry| {
+                // One that is closed meanwhile counts no more.
+                fs::read_link(entry).is_ok_and(|target| !target.to_string_lossy().contains(DATABASE))
+            }),
+            threads: self.count("task", |entry| {
+                fs::read_to_string(entry.join("comm")).is_ok_and(|name| !name.starts_with(DATABASE_THREAD))
+            }),
         }
+    }
+
+    fn count(&self, dir: &str, is_counted: impl Fn(&Path) -> bool) -> usize {
+        let entries = fs::read_dir(format!("/proc/{}/{dir}", self.0)).unwrap();
+        entries
+            .filter(|entry| is_counted(&entry.as_ref().unwrap().path()))
+            .count()
     }
 
     /// Processor time so far.
