@@ -123,10 +123,13 @@ async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
     // The shipped models, which take frames as they are collected.
     let config = ServerConfig {
         data_dir: dir.path().to_owned(),
+        job_lease_ms: 1000,
         ..ServerConfig::default()
     };
     let app = App::open(config).await.unwrap();
-    collected(&app).await;
+    // So many that it takes longer than the job's standing is written and looked at.
+    let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 100});
+    done(&app, &seen).await;
     let body =
         json!({"kind": "evaluate", "model": "static", "dataset": "seen", "windows": 100_000, "resamples": 10_000});
     post(&app, JOBS, &body).await;
