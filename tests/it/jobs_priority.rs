@@ -37,7 +37,7 @@ fn stands_back(process: u32) -> bool {
         others.iter().all(|(_, niceness)| *niceness == of_process),
         "{threads:?}"
     );
-    let low = (of_process + 5).min(19);
+    let low = (of_process + 10).min(19);
     // One that waits for the work, and two of the pool.
     jobs.len() >= 3 && jobs.iter().all(|(_, niceness)| *niceness == low)
 }
