@@ -90,11 +90,7 @@ fn answer(batch: Vec<Waiting>) {
     match compute::run(&model, &tasks) {
         Ok(computations) => {
             let compute_us = micros_since(started);
-            meter::computed(
-                &model.manifest.name,
-                batch.iter().map(|waiting| waiting.accepted),
-                started,
-            );
+            let accepted: Vec<Instant> = batch.iter().map(|waiting| waiting.accepted).collect();
             for (waiting, computation) in batch.into_iter().zip(computations) {
                 let computed = Computed {
                     features: computation.features,
@@ -105,6 +101,8 @@ fn answer(batch: Vec<Waiting>) {
                 // Nobody listens if the client has gone.
                 let _ = waiting.reply.send(Ok(computed));
             }
+            // Whoever waits for the answer does not wait for this.
+            meter::computed(&model.manifest.name, &accepted, started, compute_us);
         }
         // One bad task must not fail its neighbours.
         Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(vec![waiting])),
