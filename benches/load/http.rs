@@ -2,7 +2,7 @@
 
 use std::io::{self, ErrorKind};
 use std::net::SocketAddr;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
@@ -70,15 +70,19 @@ impl Answer {
     }
 }
 
+/// The server closes connections that ask nothing for a while: one that has rested so long is not asked again.
+const REST: Duration = Duration::from_secs(5);
+
 /// One connection, opened when it is needed.
 pub(crate) struct Http {
     address: SocketAddr,
-    stream: Option<BufReader<TcpStream>>,
+    /// With when it was last asked.
+    kept: Option<(BufReader<TcpStream>, Instant)>,
 }
 
 impl Http {
     pub(crate) fn new(address: SocketAddr) -> Self {
-        Self { address, stream: None }
+        Self { address, kept: None }
     }
 
     /// The answer. Errors: the connection ended before it, or it did not come.
@@ -96,13 +100,13 @@ impl Http {
     }
 
     async fn exchange(&mut self, request: &Request) -> io::Result<Answer> {
-        let mut stream = match self.stream.take() {
-            Some(stream) => stream,
-            None => connect(self.address).await?,
+        let mut stream = match self.kept.take() {
+            Some((stream, asked)) if asked.elapsed() < REST => stream,
+            _ => connect(self.address).await?,
         };
         stream.get_mut().write_all(&request.0).await?;
         let (answer, is_last) = read(&mut stream).await?;
-        self.stream = (!is_last).then_some(stream);
+        self.kept = (!is_last).then(|| (stream, Instant::now()));
         Ok(answer)
     }
 }
