@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use foreframe::server::protocol::{ClientMessage, CloseMessage, ServerMessage};
+use foreframe::server::protocol::{ClientMessage, CloseMessage, OnLate, ServerMessage};
 use futures_util::SinkExt as _;
 use tokio::task::JoinSet;
 
@@ -191,7 +191,7 @@ async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::h
 
 /// Opens a session and its stream, has a prediction of each frame that fills the context, closes and deletes.
 async fn session(http: &mut Http, address: SocketAddr, material: &Material, frames: u64) -> Result<(), String> {
-    let session = Session::of(&ask(http, &Session::request(material.model()), 201).await?);
+    let session = Session::of(&ask(http, &Session::request(material.model(), OnLate::Predict), 201).await?);
     let socket = session::connect(address, &session.stream_path()).await;
     let mut socket = socket.map_err(|error| format!("no stream: {error}"))?;
     for seq in 0..frames {

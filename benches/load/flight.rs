@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use foreframe::server::protocol::OnLate;
 use futures_util::future::join_all;
 use tokio::sync::mpsc;
 use tokio::time::sleep_until;
@@ -38,6 +39,8 @@ pub(crate) enum Drive {
 pub(crate) struct Flight {
     pub(crate) sessions: usize,
     pub(crate) drive: Drive,
+    /// What frames mean that newer ones have overtaken.
+    pub(crate) on_late: OnLate,
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
 }
@@ -59,7 +62,7 @@ impl Flight {
         let mut http = Http::new(server.address);
         let (mut sessions, mut sockets) = (Vec::new(), Vec::new());
         for _ in 0..self.sessions {
-            let session = Session::open(&mut http, material.model()).await;
+            let session = Session::open(&mut http, material.model(), self.on_late).await;
             let socket = session::connect(server.address, &session.stream_path()).await;
             sockets.push(socket.expect("a stream"));
             sessions.push(session);

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use foreframe::server::protocol::OnLate;
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
@@ -123,6 +124,7 @@ async fn measure(args: &Args, server: &Server, material: &Arc<Material>) -> (f64
     let flight = Flight {
         sessions: args.sessions,
         drive: Drive::Paced(args.rate_hz),
+        on_late: OnLate::Predict,
         warm_up: WARM_UP,
         measured: Duration::from_secs_f64(args.seconds),
     };

@@ -16,6 +16,8 @@ pub(crate) struct Tally {
     pub(crate) sent: u64,
     /// Frames that only filled the context.
     pub(crate) warming: u64,
+    /// Taken in without a prediction, since a newer one waited.
+    pub(crate) overtaken: u64,
     /// Refused because the server is too busy.
     pub(crate) overloaded: u64,
     /// Refused for other reasons, and why the first was.
@@ -42,13 +44,15 @@ pub(crate) struct Answer {
 impl Tally {
     /// Frames of which nothing was heard again.
     pub(crate) fn unanswered(&self) -> u64 {
-        let heard = self.answers.len() as u64 + self.warming + self.overloaded + self.refused + self.dropped;
+        let heard =
+            self.answers.len() as u64 + self.warming + self.overtaken + self.overloaded + self.refused + self.dropped;
         self.sent.saturating_sub(heard)
     }
 
     pub(crate) fn add(&mut self, other: Self) {
         self.sent += other.sent;
         self.warming += other.warming;
+        self.overtaken += other.overtaken;
         self.overloaded += other.overloaded;
         self.refused += other.refused;
         self.dropped += other.dropped;
@@ -70,12 +74,9 @@ pub(crate) async fn fly(
     let log = Mutex::new(Vec::<(Instant, Instant)>::new());
     let sending = async {
         while let Some(scheduled) = cues.recv().await {
-            let seq = {
-                let mut log = log.lock().unwrap();
-                log.push((scheduled, Instant::now()));
-                log.len() as u64 - 1
-            };
-            if sender.send(material.frame(seq)).await.is_err() {
+            let frame = material.frame(log.lock().unwrap().len() as u64);
+            log.lock().unwrap().push((scheduled, Instant::now()));
+            if sender.send(frame).await.is_err() {
                 return;
             }
         }
@@ -85,8 +86,7 @@ pub(crate) async fn fly(
     };
     let receiving = async {
         let mut tally = Tally::default();
-        while let Some(message) = session::receive(&mut receiver).await {
-            let came = Instant::now();
+        while let Some((came, message)) = session::receive_timed(&mut receiver).await {
             match message {
                 ServerMessage::Prediction {
                     seq, timing, dropped, ..
@@ -102,6 +102,7 @@ pub(crate) async fn fly(
                     tally.dropped += dropped;
                 }
                 ServerMessage::Warming { .. } => tally.warming += 1,
+                ServerMessage::Overtaken { .. } => tally.overtaken += 1,
                 ServerMessage::Error {
                     code: ErrorCode::Overloaded,
                     ..

@@ -36,6 +36,13 @@ pub(crate) struct Args {
     /// Bound: memory of the last fifth of the time over that of the first
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
+    /// Frames that newer ones have overtaken are not predicted from (on_late: skip); what is bounded is the latency, not the
+    /// goodput
+    #[arg(long)]
+    skip_late: bool,
+    /// Bound with --skip-late: 99th percentile of the latency from schedule to prediction
+    #[arg(long, default_value_t = 100.0)]
+    late_p99_ms: f64,
     /// Predictions that may wait in the server
     #[arg(long, default_value_t = 256)]
     queue: usize,

@@ -2,18 +2,23 @@
 
 use std::io;
 use std::net::SocketAddr;
+use std::time::Instant;
 
 use axum::http::HeaderValue;
-use foreframe::server::protocol::{Codec, ServerMessage};
+use foreframe::server::protocol::{Codec, OnLate, ServerMessage};
 use futures_util::StreamExt as _;
 use serde_json::json;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
 use crate::http::{Answer, Http, PATIENCE, Request};
+
+/// Read at once: more than an answer takes. As much is zeroed before every read.
+const READ_BYTES: usize = 32 << 10;
 
 pub(crate) type Socket = WebSocketStream<TcpStream>;
 
@@ -25,8 +30,9 @@ pub(crate) struct Session {
 
 impl Session {
     /// The request for one, that goes on with what comes when frames are missing: robots want the present.
-    pub(crate) fn request(model: &str) -> Request {
-        Request::json("/v1/sessions", &json!({"model": model, "on_gap": "skip"}))
+    pub(crate) fn request(model: &str, on_late: OnLate) -> Request {
+        let settings = json!({"model": model, "on_gap": "skip", "on_late": on_late});
+        Request::json("/v1/sessions", &settings)
     }
 
     pub(crate) fn of(answer: &Answer) -> Self {
@@ -38,8 +44,8 @@ impl Session {
         }
     }
 
-    pub(crate) async fn open(http: &mut Http, model: &str) -> Self {
-        Self::of(&http.expect(201, &Self::request(model)).await)
+    pub(crate) async fn open(http: &mut Http, model: &str, on_late: OnLate) -> Self {
+        Self::of(&http.expect(201, &Self::request(model, on_late)).await)
     }
 
     pub(crate) fn stream_path(&self) -> String {
@@ -63,7 +69,8 @@ pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> 
     let mut request = format!("ws://{address}{path}").into_client_request()?;
     let protocol = HeaderValue::from_static(Codec::Msgpack.name());
     request.headers_mut().insert("sec-websocket-protocol", protocol);
-    let (mut socket, _) = tokio_tungstenite::client_async(request, stream).await?;
+    let config = WebSocketConfig::default().read_buffer_size(READ_BYTES);
+    let (mut socket, _) = tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await?;
     match receive(&mut socket).await {
         Some(ServerMessage::Ready { .. }) => Ok(socket),
         _ => Err(Box::new(Error::Io(io::ErrorKind::InvalidData.into()))),
@@ -74,9 +81,19 @@ pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> 
 pub(crate) async fn receive(
     socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
 ) -> Option<ServerMessage> {
+    receive_timed(socket).await.map(|(_, message)| message)
+}
+
+/// The same, with when it came: before it was decoded, which is the client's own time.
+pub(crate) async fn receive_timed(
+    socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
+) -> Option<(Instant, ServerMessage)> {
     loop {
         match timeout(PATIENCE, socket.next()).await {
-            Ok(Some(Ok(Message::Binary(bytes)))) => return Some(rmp_serde::from_slice(&bytes).unwrap()),
+            Ok(Some(Ok(Message::Binary(bytes)))) => {
+                let came = Instant::now();
+                return Some((came, rmp_serde::from_slice(&bytes).unwrap()));
+            }
             Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => {}
             _ => return None,
         }

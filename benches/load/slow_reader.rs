@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foreframe::server::protocol::OnLate;
 use futures_util::SinkExt as _;
 use tokio::net::TcpSocket;
 
@@ -101,6 +102,7 @@ async fn round(args: &Args, server: &Server, material: &Arc<Material>) -> Round 
     let flight = Flight {
         sessions: args.sessions,
         drive: Drive::Paced(args.rate_hz),
+        on_late: OnLate::Predict,
         warm_up: Duration::from_secs_f64(args.warm_up_s),
         measured: Duration::from_secs_f64(args.seconds),
     };

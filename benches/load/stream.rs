@@ -3,6 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use foreframe::server::protocol::OnLate;
+
 use crate::figures::Bounds;
 use crate::flight::{Drive, Flight, Flown};
 use crate::material::Material;
@@ -72,6 +74,7 @@ impl Args {
         Flight {
             sessions,
             drive: Drive::Paced(self.rate_hz),
+            on_late: OnLate::Predict,
             warm_up: Duration::from_secs_f64(self.warm_up_s),
             measured: Duration::from_secs_f64(self.seconds),
         }

@@ -57,6 +57,9 @@ pub struct ConfigureMessage {
     /// What a missing frame means.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_gap: Option<OnGap>,
+    /// What a frame means that a newer one has overtaken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub on_late: Option<OnLate>,
     /// How predicted frames are encoded, whatever the format of those sent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub format: Option<ImageFormat>,
@@ -70,6 +73,18 @@ pub enum OnGap {
     #[default]
     Error,
     /// The session goes on with it, and its answer says how many are missing.
+    Skip,
+}
+
+/// What a frame means that a newer one has overtaken: it waits behind it when its turn comes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnLate {
+    /// It is predicted from as any other.
+    #[default]
+    Predict,
+    /// It is taken into the context, and nothing is predicted from it: what is predicted is never of the past for long,
+    /// and a server that is too busy for all frames predicts from the newest.
     Skip,
 }
 
@@ -137,10 +152,21 @@ pub enum ServerMessage {
         /// Frames left out before this one.
         skipped: u64,
     },
+    /// The frame is in the context; nothing was predicted from it, for a newer one had overtaken it.
+    Overtaken {
+        /// The frame's number.
+        seq: u64,
+        /// The frame's time, echoed.
+        timestamp_us: i64,
+        /// Frames left out before this one.
+        skipped: u64,
+    },
     /// Answers `configure`: how the session behaves now.
     Configured {
         /// What a missing frame means.
         on_gap: OnGap,
+        /// What a frame means that a newer one has overtaken.
+        on_late: OnLate,
         /// How predicted frames are encoded; absent for as those sent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         format: Option<ImageFormat>,

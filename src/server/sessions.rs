@@ -149,6 +149,7 @@ pub(super) async fn state(session: Owned) -> axum::Json<ExportedState> {
         version: manifest.version,
         weights_sha256: manifest.weights_sha256.clone(),
         on_gap: settings.on_gap,
+        on_late: settings.on_late,
         format: settings.format,
         memory: state.memory(),
     })

@@ -22,6 +22,10 @@ use super::sessions::{self, Owned};
 use crate::serving::SessionState;
 use connection::Connection;
 
+/// What is read of a socket at once, in bytes. Before every read as much is zeroed, and a stream holds it as long as it is
+/// open; a longer message has its own room.
+const READ_BYTES: usize = 16 << 10;
+
 type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
 
 /// Opens the stream of a session: a WebSocket that takes frames with action and state and answers each with the frames to
@@ -83,7 +87,10 @@ fn open(app: App, session: Arc<Session>, is_kept: bool, upgrade: Upgrade) -> Res
     }
     let place = app.streams().enter()?;
     let limit = app.config().max_body_bytes;
-    let upgrade = upgrade.max_message_size(limit).max_frame_size(limit);
+    let upgrade = upgrade
+        .max_message_size(limit)
+        .max_frame_size(limit)
+        .read_buffer_size(READ_BYTES);
     Ok(upgrade.on_upgrade(move |socket| {
         let connection = Connection::new(app, &session, is_kept, chosen.unwrap_or_default());
         async move {

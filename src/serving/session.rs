@@ -148,16 +148,16 @@ impl SessionState {
         self.premise.state.as_ref()
     }
 
-    /// What to compute for the next frame: its features and, if it fills the context, its future.
+    /// What to compute for the next frame: its features and, if it fills the context, its future under the premise.
     #[must_use]
-    pub fn step(&self, frame: Frame, premise: Premise, spec: &ModelSpec) -> Task {
+    pub fn step(&self, frame: Frame, premise: Option<Premise>, spec: &ModelSpec) -> Task {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
         let known: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
         let is_full = known.len() + 1 == spec.context;
         Task {
             known,
             frames: vec![frame],
-            premises: is_full.then_some(premise).into_iter().collect(),
+            premises: premise.filter(|_| is_full).into_iter().collect(),
         }
     }
 
@@ -242,7 +242,7 @@ mod tests {
         let spec = model.model.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
-            let task = state.step(frame(seq), premise(f32::from(seq)), spec);
+            let task = state.step(frame(seq), Some(premise(f32::from(seq))), spec);
             let computed = compute::run(&model, &[&task]).unwrap().remove(0);
             state.advance(
                 u64::from(seq),

@@ -52,6 +52,8 @@ names! {
         "Sessions that nobody used for `session_grace_ms`, and that were ended.";
     describe_counter STREAM_FRAMES = "foreframe_stream_frames_total" in Count:
         "Frames that came over streams, those refused or sent again included, by model.";
+    describe_counter STREAM_OVERTAKEN = "foreframe_stream_frames_overtaken_total" in Count:
+        "Frames that nothing was predicted from, since a newer one waited and `on_late` is `skip`, by model.";
     describe_counter STREAM_DROPPED = "foreframe_stream_predictions_dropped_total" in Count:
         "Predictions that were computed and not sent, because the client read too slowly.";
 

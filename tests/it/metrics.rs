@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use foreframe::nn::{Conditioning, ModelSpec};
-use foreframe::server::protocol::{ClientMessage, Codec, ServerMessage};
+use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, OnLate, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
 use foreframe::telemetry::names;
 use serde_json::{Value, json};
@@ -82,6 +82,7 @@ async fn what_the_program_does_is_counted() {
         is(&served, seldom, 0.0);
     }
     sessions(&served).await;
+    late_frames(&served).await;
     a_slow_reader(&served).await;
     a_full_queue(&served);
     jobs(&served);
@@ -115,6 +116,27 @@ async fn sessions(served: &Served) {
     becomes(served, "foreframe_sessions_evicted_total", 2.0);
     becomes(served, "foreframe_sessions_active", 0.0);
     becomes(served, "foreframe_streams_active", 0.0);
+}
+
+async fn late_frames(served: &Served) {
+    let path = "/v1/models/plain/stream";
+    let mut client = Client::connect(served.address, path, Codec::Msgpack).await.unwrap();
+    let configure = ConfigureMessage {
+        on_late: Some(OnLate::Skip),
+        ..ConfigureMessage::default()
+    };
+    client.ask(&ClientMessage::Configure(configure)).await;
+    let sent = 100;
+    for seq in 0..sent {
+        client.send(&send_frame(seq)).await;
+    }
+    let mut overtaken = 0;
+    for _ in 0..sent {
+        overtaken += u32::from(matches!(client.receive().await, ServerMessage::Overtaken { .. }));
+    }
+    assert!(overtaken > 0);
+    let name = "foreframe_stream_frames_overtaken_total{model=\"plain\"}";
+    is(served, name, f64::from(overtaken));
 }
 
 async fn a_slow_reader(served: &Served) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::http::Request;
 use foreframe::server::protocol::{
-    ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, ServerMessage,
+    ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, OnLate, ServerMessage,
 };
 use foreframe::server::{ImageFormat, ServerConfig};
 use proptest::prelude::*;
@@ -207,10 +207,12 @@ async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() 
     assert_eq!(code(&client.ask(&send_frame(2)).await), (ErrorCode::Gap, 0));
     let configure = ClientMessage::Configure(ConfigureMessage {
         on_gap: Some(OnGap::Skip),
+        on_late: None,
         format: Some(ImageFormat::Png),
     });
     let configured = ServerMessage::Configured {
         on_gap: OnGap::Skip,
+        on_late: OnLate::Predict,
         format: Some(ImageFormat::Png),
     };
     assert_eq!(client.ask(&configure).await, configured);
@@ -232,6 +234,56 @@ async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() 
         (&settings["on_gap"], &settings["format"]),
         (&json!("skip"), &json!("png"))
     );
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let server = run(app.clone()).await;
+    let (skipping, predicting) = (Opened::open(&app, &moving()).await, Opened::open(&app, &moving()).await);
+    let connect = async |session: &Opened| {
+        let client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack).await;
+        client.unwrap()
+    };
+    let (mut skipped, mut predicted) = (connect(&skipping).await, connect(&predicting).await);
+    let configure = ClientMessage::Configure(ConfigureMessage {
+        on_late: Some(OnLate::Skip),
+        ..ConfigureMessage::default()
+    });
+    let configured = ServerMessage::Configured {
+        on_gap: OnGap::Error,
+        on_late: OnLate::Skip,
+        format: None,
+    };
+    assert_eq!(skipped.ask(&configure).await, configured);
+    let count = 200;
+    for seq in 0..count {
+        skipped.send(&send_frame(seq)).await;
+    }
+    // What is sent again overtakes nothing.
+    skipped.send(&send_frame(count - 1)).await;
+    let mut overtaken = 0;
+    for expected in 0..count {
+        let from_all = predicted.ask(&send_frame(expected)).await;
+        let answer = skipped.receive().await;
+        match &answer {
+            ServerMessage::Overtaken { seq, timestamp_us, .. } => {
+                assert_eq!((*seq, *timestamp_us), (expected, step(expected).timestamp_us));
+                overtaken += 1;
+            }
+            ServerMessage::Warming { seq, .. } => assert_eq!(*seq, expected),
+            // From the same context, whatever was predicted on the way.
+            _ => assert_eq!(frames(&answer), frames(&from_all)),
+        }
+        if expected + 1 == count {
+            assert_eq!(frames(&skipped.receive().await), frames(&answer));
+        }
+    }
+    assert!(overtaken > 0);
+    let settings = get(&app, &skipping.path("/state")).await.json();
+    assert_eq!(settings["on_late"], json!("skip"));
     server.stop().await;
 }
 

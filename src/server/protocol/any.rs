@@ -5,7 +5,7 @@ use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use super::super::images::{ImageBytes, ImageFormat};
-use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, PingMessage};
+use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
 
 /// Items of a list in a message at most: more than any model takes.
 const MAX_ITEMS: usize = 4096;
@@ -23,6 +23,7 @@ pub(super) struct AnyMessage {
     state: Option<List<f64>>,
     plan: Option<List<List<f64>>>,
     on_gap: Option<OnGap>,
+    on_late: Option<OnLate>,
 }
 
 #[derive(Clone, Copy, Deserialize)]
@@ -82,6 +83,7 @@ impl TryFrom<AnyMessage> for ClientMessage {
             }),
             Kind::Configure => Self::Configure(ConfigureMessage {
                 on_gap: any.on_gap.take(),
+                on_late: any.on_late.take(),
                 format: any.format.take(),
             }),
             Kind::Ping => Self::Ping(PingMessage {
@@ -107,6 +109,7 @@ impl AnyMessage {
             ("state", self.state.is_some()),
             ("plan", self.plan.is_some()),
             ("on_gap", self.on_gap.is_some()),
+            ("on_late", self.on_late.is_some()),
         ];
         fields.into_iter().find(|(_, is_left)| *is_left).map(|(name, _)| name)
     }

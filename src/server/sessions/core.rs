@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::server::images::{self, ImageError, ImageFormat};
-use crate::server::protocol::{ErrorCode, OnGap, ServerMessage, Timing};
+use crate::server::protocol::{ErrorCode, OnGap, OnLate, ServerMessage, Timing};
 use crate::serving::{Computed, InputError, Premise, ServingError, SessionState, Task};
 use crate::types::ValueError;
 
@@ -17,6 +17,8 @@ pub(in crate::server) struct Step {
     pub(in crate::server) frame: Frame,
     pub(in crate::server) premise: Premise,
     pub(in crate::server) format: ImageFormat,
+    /// Whether a newer frame waits behind this one.
+    pub(in crate::server) is_overtaken: bool,
 }
 
 /// Why a frame was refused; the session stands where it stood.
@@ -61,6 +63,7 @@ impl StepError {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(in crate::server) struct Settings {
     pub(in crate::server) on_gap: OnGap,
+    pub(in crate::server) on_late: OnLate,
     pub(in crate::server) format: Option<ImageFormat>,
 }
 
@@ -79,7 +82,7 @@ pub(super) struct Kept {
     timestamp_us: i64,
     skipped: u64,
     have: usize,
-    /// None while the context was not full.
+    /// None while the context was not full, and of a frame that was overtaken.
     prediction: Option<(Arc<[Frame]>, Timing)>,
 }
 
@@ -121,10 +124,16 @@ impl Core {
                 expected: next,
             });
         }
+        let premise = (!self.is_skipped(step)).then(|| step.premise.clone());
         Ok(Begun::New {
-            task: self.state.step(step.frame.clone(), step.premise.clone(), spec),
+            task: self.state.step(step.frame.clone(), premise, spec),
             skipped: step.seq - next,
         })
+    }
+
+    /// Whether nothing is to be predicted from the step.
+    fn is_skipped(&self, step: &Step) -> bool {
+        step.is_overtaken && self.settings.on_late == OnLate::Skip
     }
 
     /// Takes the step, of which this was computed.
@@ -169,6 +178,13 @@ impl Kept {
             prediction,
         } = self;
         let Some((frames, timing)) = prediction else {
+            if have == spec.context {
+                return Ok(ServerMessage::Overtaken {
+                    seq,
+                    timestamp_us,
+                    skipped,
+                });
+            }
             return Ok(ServerMessage::Warming {
                 seq,
                 timestamp_us,

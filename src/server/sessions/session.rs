@@ -106,9 +106,11 @@ impl Session {
         let mut inner = self.inner();
         let settings = &mut inner.core.settings;
         settings.on_gap = message.on_gap.unwrap_or(settings.on_gap);
+        settings.on_late = message.on_late.unwrap_or(settings.on_late);
         settings.format = message.format.map(ImageFormat::answer).or(settings.format);
         ServerMessage::Configured {
             on_gap: settings.on_gap,
+            on_late: settings.on_late,
             format: settings.format,
         }
     }

@@ -11,7 +11,7 @@ use crate::registry::LoadedModel;
 use crate::server::App;
 use crate::server::error::ApiError;
 use crate::server::images::ImageFormat;
-use crate::server::protocol::{OnGap, StreamLimits};
+use crate::server::protocol::{OnGap, OnLate, StreamLimits};
 use crate::serving::{SessionMemory, SessionState};
 
 /// Which session to open.
@@ -24,6 +24,9 @@ pub(in crate::server) struct CreateSession {
     /// What a missing frame means.
     #[serde(default)]
     pub(super) on_gap: Option<OnGap>,
+    /// What a frame means that a newer one has overtaken.
+    #[serde(default)]
+    pub(super) on_late: Option<OnLate>,
     /// How predicted frames are encoded; default: as those sent.
     #[serde(default)]
     pub(super) format: Option<ImageFormat>,
@@ -44,6 +47,9 @@ pub(in crate::server) struct ExportedState {
     pub(super) weights_sha256: String,
     /// What a missing frame means.
     pub(super) on_gap: OnGap,
+    /// What a frame means that a newer one has overtaken.
+    #[serde(default)]
+    pub(super) on_late: OnLate,
     /// How predicted frames are encoded; absent for as those sent.
     #[serde(default)]
     pub(super) format: Option<ImageFormat>,
@@ -109,7 +115,7 @@ pub(in crate::server) struct Page {
 
 impl CreateSession {
     pub(super) fn resolve(self, app: &App) -> Result<(Arc<LoadedModel>, SessionState, Settings), ApiError> {
-        let (on_gap, format) = (self.on_gap, self.format.map(ImageFormat::answer));
+        let (on_gap, on_late, format) = (self.on_gap, self.on_late, self.format.map(ImageFormat::answer));
         let Some(exported) = self.state else {
             let Some(name) = self.model else {
                 return Err(ApiError::Unprocessable(
@@ -118,6 +124,7 @@ impl CreateSession {
             };
             let settings = Settings {
                 on_gap: on_gap.unwrap_or_default(),
+                on_late: on_late.unwrap_or_default(),
                 format,
             };
             return Ok((app.predictor().active(&name)?, SessionState::default(), settings));
@@ -138,6 +145,7 @@ impl CreateSession {
         }
         let settings = Settings {
             on_gap: on_gap.unwrap_or(exported.on_gap),
+            on_late: on_late.unwrap_or(exported.on_late),
             format: format.or(exported.format.map(ImageFormat::answer)),
         };
         let state = SessionState::restore(exported.memory, &manifest.name, &manifest.spec)

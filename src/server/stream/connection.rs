@@ -7,7 +7,7 @@ use std::time::Duration;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
-use metrics::counter;
+use metrics::{Counter, counter};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tracing::{debug, info, trace};
@@ -55,6 +55,8 @@ pub(super) struct Connection {
     is_kept: bool,
     codec: Codec,
     outbox: Outbox,
+    frames: Counter,
+    overtaken: Counter,
 }
 
 impl Connection {
@@ -62,7 +64,10 @@ impl Connection {
     pub(super) fn new(app: App, session: &Arc<Session>, is_kept: bool, codec: Codec) -> Self {
         let outbox = Outbox::new(app.config().max_stream_buffer_bytes);
         let hold = session.hold();
+        let model = &session.model().manifest.name;
         Self {
+            frames: counter!(names::STREAM_FRAMES, "model" => model.clone()),
+            overtaken: counter!(names::STREAM_OVERTAKEN, "model" => model.clone()),
             app,
             hold,
             is_kept,
@@ -148,8 +153,7 @@ impl Connection {
             let item = match self.codec.decode::<ClientMessage>(&message) {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
-                    let model = &self.hold.session().model().manifest.name;
-                    counter!(names::STREAM_FRAMES, "model" => model.clone()).increment(1);
+                    self.frames.increment(1);
                     self.checked(frame)
                         .map_or_else(|error| Item::Refused(error.code(), error.to_string()), Item::Frame)
                 }
@@ -215,22 +219,38 @@ impl Connection {
             premise: Premise::new(told, &STEP, &manifest.name, &manifest.spec)?,
             frame: images::decode("image", message.image, message.format, manifest)?,
             format: message.format,
+            is_overtaken: false,
         }))
     }
 
     /// Answers what was read, in order, until there is no more.
     async fn answer(&self, mut items: mpsc::Receiver<Item>) {
-        while let Some(item) = items.recv().await {
-            let answer = match item {
-                Item::Frame(step) => match self.hold.step(self.app.predictor(), *step).await {
-                    Ok(answer) => answer,
-                    // The reader has been told as well, and says why.
-                    Err(StepError::NotHeld) => return,
-                    Err(error) => self.error(error.code(), error.to_string()),
+        let mut following = None;
+        loop {
+            let item = match following.take() {
+                Some(item) => item,
+                None => match items.recv().await {
+                    Some(item) => item,
+                    None => return,
                 },
+            };
+            following = items.try_recv().ok();
+            let answer = match item {
+                Item::Frame(mut step) => {
+                    step.is_overtaken = matches!(&following, Some(Item::Frame(newer)) if newer.seq > step.seq);
+                    match self.hold.step(self.app.predictor(), *step).await {
+                        Ok(answer) => answer,
+                        // The reader has been told as well, and says why.
+                        Err(StepError::NotHeld) => return,
+                        Err(error) => self.error(error.code(), error.to_string()),
+                    }
+                }
                 Item::Configure(message) => self.hold.session().configure(message),
                 Item::Refused(code, detail) => self.error(code, detail),
             };
+            if let ServerMessage::Overtaken { .. } = answer {
+                self.overtaken.increment(1);
+            }
             self.outbox.push(answer).await;
         }
     }
