@@ -36,8 +36,7 @@ pub(crate) struct Args {
     /// Bound: memory of the last fifth of the time over that of the first
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
-    /// Frames that newer ones have overtaken are not predicted from (on_late: skip); what is bounded is the latency, not the
-    /// goodput
+    /// Frames that newer ones have overtaken are not predicted from (`on_late: skip`); what is bounded is the latency
     #[arg(long)]
     skip_late: bool,
     /// Bound with --skip-late: 99th percentile of the latency from schedule to prediction

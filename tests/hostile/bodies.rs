@@ -40,10 +40,17 @@ fn ask(sample: &Sample, bytes: Vec<u8>) -> Answer {
     };
     match (endpoint, answer.status.as_u16()) {
         ("environments", 201) => WORLD.delete(answer.headers["location"].to_str().unwrap()),
+        // Or its name would be taken.
+        ("jobs", 202) => cancel(answer.json()["id"].as_str().unwrap()),
         ("step", 200) if answer.json()["truncated"] == true => reset(),
         _ => {}
     }
     answer
+}
+
+fn cancel(job: &str) {
+    let path = format!("/v1/jobs/{job}/cancel");
+    assert_eq!(WORLD.json("a cancellation", &path, Vec::new()).status, 202);
 }
 
 fn reset() {
