@@ -84,7 +84,7 @@ pub enum OnLate {
     #[default]
     Predict,
     /// It is taken into the context, and nothing is predicted from it: what is predicted is never of the past for long,
-    /// and a server that is too busy for all frames predicts from the newest.
+    /// and a server that is too busy for all frames predicts from the newest. Of at most `pipelined_frames` in a row.
     Skip,
 }
 

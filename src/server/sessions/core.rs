@@ -17,7 +17,7 @@ pub(in crate::server) struct Step {
     pub(in crate::server) frame: Frame,
     pub(in crate::server) premise: Premise,
     pub(in crate::server) format: ImageFormat,
-    /// Whether a newer frame waits behind this one.
+    /// Whether newer frames wait behind this one, and need not wait for it to be predicted from.
     pub(in crate::server) is_overtaken: bool,
 }
 

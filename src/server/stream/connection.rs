@@ -225,7 +225,9 @@ impl Connection {
 
     /// Answers what was read, in order, until there is no more.
     async fn answer(&self, mut items: mpsc::Receiver<Item>) {
-        let mut following = None;
+        // So that who never stops sending hears of the future at times.
+        let limit = self.app.config().max_pipelined_frames;
+        let (mut following, mut overtaken_in_a_row) = (None, 0);
         loop {
             let item = match following.take() {
                 Some(item) => item,
@@ -237,7 +239,8 @@ impl Connection {
             following = items.try_recv().ok();
             let answer = match item {
                 Item::Frame(mut step) => {
-                    step.is_overtaken = matches!(&following, Some(Item::Frame(newer)) if newer.seq > step.seq);
+                    let is_behind = matches!(&following, Some(Item::Frame(newer)) if newer.seq > step.seq);
+                    step.is_overtaken = is_behind && overtaken_in_a_row < limit;
                     match self.hold.step(self.app.predictor(), *step).await {
                         Ok(answer) => answer,
                         // The reader has been told as well, and says why.
@@ -250,6 +253,9 @@ impl Connection {
             };
             if let ServerMessage::Overtaken { .. } = answer {
                 self.overtaken.increment(1);
+                overtaken_in_a_row += 1;
+            } else {
+                overtaken_in_a_row = 0;
             }
             self.outbox.push(answer).await;
         }
