@@ -42,7 +42,7 @@ use axum::extract::DefaultBodyLimit;
 use axum::routing::{delete, get, post};
 use tokio::net::TcpListener;
 use tokio::time::{timeout, timeout_at};
-use tracing::{info, warn};
+use tracing::{Instrument as _, info, warn};
 
 use admission::Admission;
 pub use config::ServerConfig;
@@ -368,6 +368,13 @@ async fn follow(app: App) {
             warn!(%error, "could not look for newly activated versions");
         }
     }
+}
+
+/// Goes on with what must not end half-way, even if whoever asked for it goes. Errors: `Internal` if it panicked.
+async fn to_its_end<T: Send + 'static>(work: impl Future<Output = T> + Send + 'static) -> Result<T, ApiError> {
+    tokio::spawn(work.in_current_span())
+        .await
+        .map_err(|error| ApiError::Internal(error.to_string()))
 }
 
 /// Runs what would hold up the other requests on a thread for such work. Errors: `Internal` if it panicked.

@@ -254,8 +254,14 @@ impl Versions {
     /// theirs. One that is refused changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
     pub async fn activate(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
+        let before = predictor.model(model).map(|manifest| manifest.version);
         counted(self.take_in(predictor, model, version).await)?;
-        self.store.set_active(model, version, unix_s()).await?;
+        if let Err(error) = self.store.set_active(model, version, unix_s()).await {
+            if let Ok(before) = before {
+                self.take_in(predictor, model, before).await?;
+            }
+            return Err(error.into());
+        }
         info!(model, version, "version activated");
         Ok(())
     }
@@ -289,7 +295,7 @@ impl Versions {
     }
 
     /// Loads what was chosen since, here or by another server. What is refused is logged and put into `refused`, so as not
-    /// to be tried again and again. Errors: `Registry`, `Store`.
+    /// to be tried again and again; what could not be looked at is tried again the next time. Errors: `Registry`, `Store`.
     pub async fn follow(
         &self,
         predictor: &Predictor,
@@ -307,7 +313,9 @@ impl Versions {
                 Ok(()) => info!(model, version, "version loaded"),
                 Err(error) => {
                     warn!(model, version, %error, "a version was not loaded");
-                    refused.insert((model, version));
+                    if let VersionError::Refused { .. } = error {
+                        refused.insert((model, version));
+                    }
                 }
             }
         }

@@ -5,6 +5,7 @@ use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use futures_util::future::BoxFuture;
 use serde_json::json;
 use tokio::runtime::Handle;
 
@@ -51,15 +52,8 @@ impl Pipeline {
 }
 
 impl Execute for Pipeline {
-    fn check(&self, spec: &JobSpec) -> Result<(), JobError> {
-        let objects = self.store.objects();
-        let datasets = self.runtime.block_on(datasets::names(objects))?;
-        let models = self.runtime.block_on(self.versions.all())?;
-        spec.check(Ground {
-            data_dir: objects.data_dir(),
-            datasets: &datasets,
-            models: &models,
-        })
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+        Box::pin(self.look_over(spec.clone()))
     }
 
     fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
@@ -76,6 +70,21 @@ impl Execute for Pipeline {
 }
 
 impl Pipeline {
+    async fn look_over(&self, spec: JobSpec) -> Result<(), JobError> {
+        let objects = self.store.objects();
+        let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
+        let data_dir = objects.data_dir().to_owned();
+        // It looks at the disk, and must wait for nothing that needs a thread of the same kind: there are only so many.
+        let checked = tokio::task::spawn_blocking(move || {
+            spec.check(Ground {
+                data_dir: &data_dir,
+                datasets: &datasets,
+                models: &models,
+            })
+        });
+        checked.await.unwrap_or(Err(JobError::Stopping))
+    }
+
     fn collect(&self, spec: &CollectSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;

@@ -8,7 +8,7 @@ use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use super::instance::Instance;
-use super::job::number_of;
+use super::job::{id_of, number_of};
 use super::notes::Standing;
 use super::runner::{self, Execute};
 use super::{Event, Job, JobError, JobFilter, JobSpec, JobState, unix_s};
@@ -88,7 +88,7 @@ impl Jobs {
                 return same(&row, &spec);
             }
         }
-        let spec = self.checked(spec).await?;
+        shared.execute.check(&spec).await?;
         let new = NewJob {
             kind: spec.kind().to_owned(),
             makes: spec.makes().map(|(kind, name)| format!("{kind} {name}")),
@@ -106,13 +106,6 @@ impl Jobs {
             Enqueued::Same(row) => same(&row, &spec),
             other => Err(self.refused(&other, &spec)),
         }
-    }
-
-    /// Checks a job off the runtime's threads, since that looks at the disk.
-    async fn checked(&self, spec: JobSpec) -> Result<JobSpec, JobError> {
-        let execute = Arc::clone(&self.shared.execute);
-        let checked = tokio::task::spawn_blocking(move || execute.check(&spec).map(|()| spec)).await;
-        checked.unwrap_or(Err(JobError::Stopping))
     }
 
     fn refused(&self, enqueued: &Enqueued, spec: &JobSpec) -> JobError {
@@ -179,7 +172,9 @@ impl Jobs {
                 Some(_) => store.cancel_queued(row.number, unix_s()).await?,
             };
             if asked {
-                return self.get(id).await;
+                let job = self.get(id).await;
+                self.shared.forget_oldest().await;
+                return job;
             }
         }
     }
@@ -233,6 +228,23 @@ impl Jobs {
             None => None,
         };
         found.ok_or_else(|| JobError::Unknown { id: id.to_owned() })
+    }
+}
+
+impl Shared {
+    /// What ended jobs leave is deleted with the last memory of them.
+    pub(super) async fn forget_oldest(&self) {
+        let forgotten = match self.store.forget_ended(self.limits.ended as i64).await {
+            Ok(forgotten) => forgotten,
+            Err(error) => return warn!(%error, "could not forget old jobs"),
+        };
+        for id in forgotten.into_iter().map(id_of) {
+            for dir in ["runs", "reports"] {
+                if let Err(error) = self.store.objects().delete(&format!("{dir}/{id}")).await {
+                    warn!(job.id = %id, %error, "could not delete what a job left");
+                }
+            }
+        }
     }
 }
 

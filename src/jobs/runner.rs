@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use futures_util::future::BoxFuture;
 use metrics::{counter, gauge};
 use rayon::ThreadPool;
 use tokio::sync::{oneshot, watch};
@@ -47,7 +48,7 @@ pub struct Outcome {
 pub trait Execute: Send + Sync + 'static {
     /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and what keeps it
     /// from looking.
-    fn check(&self, spec: &JobSpec) -> Result<(), JobError>;
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 
     /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.
     fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure>;
@@ -314,27 +315,11 @@ impl<'a> Work<'a> {
                 .store
                 .end(self.report.lease, ending.clone(), account.clone());
             match written.await {
-                Ok(true) => return self.forget_oldest().await,
+                Ok(true) => return self.shared.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its end was written"),
                 Err(error) => warn!(job.id = %id, %error, attempt, "could not write how a job ended"),
             }
             tokio::time::sleep(POLL_EVERY).await;
-        }
-    }
-
-    /// What ended jobs leave is deleted with the last memory of them.
-    async fn forget_oldest(&self) {
-        let store = &self.shared.store;
-        let forgotten = match store.forget_ended(self.shared.limits.ended as i64).await {
-            Ok(forgotten) => forgotten,
-            Err(error) => return warn!(%error, "could not forget old jobs"),
-        };
-        for id in forgotten.into_iter().map(id_of) {
-            for dir in ["runs", "reports"] {
-                if let Err(error) = store.objects().delete(&format!("{dir}/{id}")).await {
-                    warn!(job.id = %id, %error, "could not delete what a job left");
-                }
-            }
         }
     }
 }

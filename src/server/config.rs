@@ -89,7 +89,8 @@ pub struct ServerConfig {
     pub shutdown_deadline_ms: u64,
     /// How often keys are read: how long a revoked one may still be taken, in milliseconds.
     pub key_refresh_ms: u64,
-    /// Origins of other pages whose scripts may call this server, for example `https://robots.example`.
+    /// Origins of other pages whose scripts may call this server, for example `https://robots.example`. Where no key is
+    /// asked for, the hosts in them are also the only names with a dot that the server answers to.
     pub cors_origins: Vec<String>,
 }
 

@@ -148,9 +148,14 @@ impl Keys {
         }
     }
 
+    /// Whether callers must show one.
+    pub(super) fn are_asked_for(&self) -> bool {
+        self.shared.is_required || self.count() > 0
+    }
+
     async fn check(&self, presented: Option<&str>) -> Result<(), ApiError> {
         const UNKNOWN: ApiError = ApiError::Unauthorized("the key is not known here, or was revoked");
-        if self.count() == 0 && !self.shared.is_required {
+        if !self.are_asked_for() {
             return Ok(());
         }
         let key = presented.ok_or(ApiError::Unauthorized(

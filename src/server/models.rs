@@ -4,9 +4,9 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use serde::Serialize;
 
-use super::App;
 use super::error::{ApiError, Problem};
 use super::extract::Path;
+use super::{App, to_its_end};
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 
@@ -138,7 +138,8 @@ pub(super) async fn activate(
     State(app): State<App>,
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
-    app.versions().activate(app.predictor(), &model, version).await?;
+    let (switched, name) = (app.clone(), model.clone());
+    to_its_end(async move { switched.versions().activate(switched.predictor(), &name, version).await }).await??;
     get(State(app), Path(model)).await
 }
 
@@ -159,6 +160,6 @@ pub(super) async fn delete(
     State(app): State<App>,
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<StatusCode, ApiError> {
-    app.versions().delete(app.predictor(), &model, version).await?;
+    to_its_end(async move { app.versions().delete(app.predictor(), &model, version).await }).await??;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -196,8 +196,10 @@ impl Store {
 
     /// Forgets ended jobs but the latest `kept`; returns their numbers. Errors: `Query`.
     pub async fn forget_ended(&self, kept: i64) -> Result<Vec<i64>, StoreError> {
-        let sql = "DELETE FROM jobs WHERE number IN (SELECT number FROM jobs WHERE state IN ('succeeded', 'failed', \
-             'cancelled') ORDER BY ended_s DESC, number DESC LIMIT 1000000 OFFSET $1) RETURNING number";
+        // Both look at the state: one may be resumed between them.
+        let sql = "DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND number IN (SELECT number \
+             FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') ORDER BY ended_s DESC, number DESC \
+             LIMIT 1000000 OFFSET $1) RETURNING number";
         let rows = self.database.fetch(sql, vec![kept.into()]).await?;
         rows.iter().map(|row| row.get("number")).collect()
     }

@@ -200,6 +200,43 @@ async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
 }
 
 #[tokio::test]
+async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        cors_origins: vec!["https://robots.example".to_owned()],
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let asked = |host: &str| {
+        let request = Request::get("/v1/models").header(header::HOST, host);
+        // As a page of that host would.
+        let request = request.header(header::ORIGIN, format!("http://{host}"));
+        send(&app, request.body(Body::empty()).unwrap())
+    };
+    let own = [
+        "localhost:8642",
+        "127.0.0.1:8642",
+        "127.0.0.1",
+        "[::1]:8642",
+        "robot-7",
+        "a.localhost",
+        "robots.example",
+    ];
+    for host in own {
+        assert_eq!(asked(host).await.status, 200, "{host}");
+    }
+    for host in [
+        "evil.example:8642",
+        "evil.example",
+        "127.0.0.1.evil.example:8642",
+        "localhost.:8642",
+    ] {
+        let refused = asked(host).await.detail(403);
+        assert!(refused.contains(host) && refused.contains("cors_origins"), "{refused}");
+    }
+}
+
+#[tokio::test]
 async fn the_contract_can_be_browsed_without_the_internet() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

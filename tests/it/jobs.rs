@@ -11,6 +11,7 @@ use foreframe::jobs::{Execute, Failure, JobError, JobLimits, JobSpec, Jobs, Outc
 use foreframe::nn::Conditioning;
 use foreframe::server::{App, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
+use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
 
 use crate::service::{app, get, model, post, run, send, spec, store, until, with_data};
@@ -24,8 +25,8 @@ struct Puppet {
 }
 
 impl Execute for Puppet {
-    fn check(&self, _: &JobSpec) -> Result<(), JobError> {
-        Ok(())
+    fn check<'a>(&'a self, _: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+        Box::pin(async { Ok(()) })
     }
 
     fn execute(&self, _: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::http::Request;
 use foreframe::server::{App, ServerConfig};
+use futures_util::FutureExt as _;
 use serde_json::{Value, json};
 
 use crate::service::{Answer, app, context, get, post, send, store, until, with_data};
@@ -201,6 +202,15 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
         (&swapped["active_version"], &swapped["spec"]["frame_width_px"]),
         (&json!(2), &json!(64))
     );
+    // Who asks and goes is obeyed all the same.
+    let and_gone = post(&app, "/v1/models/plain/versions/1/activate", &Value::Null).now_or_never();
+    assert!(and_gone.is_none());
+    serves(&app, "plain", 1).await;
+    until(async || (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(()))
+        .await;
+    post(&app, "/v1/models/plain/versions/2/activate", &Value::Null)
+        .await
+        .json();
     let weights = |version: u32| dir.path().join(format!("models/plain/{version}/model.safetensors"));
     let mut bytes = std::fs::read(weights(3)).unwrap();
     let last = bytes.len() - 1;

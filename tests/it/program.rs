@@ -261,3 +261,17 @@ fn the_configuration_is_printed_with_where_it_comes_from() {
     assert_eq!(refused.status.code(), Some(2));
     assert!(text(&refused.stderr).contains("max_stream (foreframe.toml) is no field"));
 }
+
+#[test]
+fn one_thread_for_requests_is_enough_to_check_a_job() {
+    let dir = tempfile::tempdir().unwrap();
+    let arguments = ["--objects-url", "objects", "--set", "request_threads=1"];
+    let served = Served::start(dir.path(), &arguments);
+    let job = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "none"});
+    for _ in 0..2 {
+        let refused = served.ask("POST", "/v1/jobs", &job);
+        assert_eq!(refused["status"], 422, "{refused}");
+    }
+    served.terminate();
+    served.ended();
+}

@@ -285,6 +285,18 @@ async fn a_client_that_never_reads_loses_its_stream() {
 }
 
 #[tokio::test]
+async fn a_close_of_the_websocket_itself_is_answered() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    let mut socket = open(&server, "plain").await;
+    socket.close(None).await.unwrap();
+    let answer = socket.next().await;
+    assert!(matches!(answer, Some(Ok(Message::Close(_)))), "{answer:?}");
+    assert!(socket.next().await.is_none());
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn stopping_ends_streams_with_1001_and_is_not_ready() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

@@ -95,7 +95,7 @@ impl Connection {
         };
         if ended.is_ok() {
             // Closing with unread bytes would reset the connection before the client has read why.
-            let _ = timeout(LINGER, async { while let Some(Ok(_)) = stream.next().await {} }).await;
+            read_out(&mut stream).await;
         }
         info!(
             frames = self.hold.session().next_seq(),
@@ -145,7 +145,7 @@ impl Connection {
                 Received::Message(message) => message,
                 Received::Nothing => return Ok(ClosingReason::Idle),
                 Received::Unreadable(reason, detail) => {
-                    let refused = Item::Refused(ErrorCode::Malformed, detail);
+                    let refused = Item::Refused(ErrorCode::Malformed, bounded(detail));
                     inbox.send(refused).await.map_err(|_| Gone)?;
                     return Ok(reason);
                 }
@@ -154,8 +154,10 @@ impl Connection {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
-                    self.checked(frame)
-                        .map_or_else(|error| Item::Refused(error.code(), error.to_string()), Item::Frame)
+                    self.checked(frame).map_or_else(
+                        |error| Item::Refused(error.code(), bounded(error.to_string())),
+                        Item::Frame,
+                    )
                 }
                 Ok(ClientMessage::Configure(message)) => Item::Configure(message),
                 Ok(ClientMessage::Ping(ping)) => {
@@ -164,7 +166,7 @@ impl Connection {
                     continue;
                 }
                 Ok(ClientMessage::Close(_)) => return Ok(ClosingReason::Asked),
-                Err(error) => Item::Refused(ErrorCode::Malformed, error.to_string()),
+                Err(error) => Item::Refused(ErrorCode::Malformed, bounded(error.to_string())),
             };
             inbox.send(item).await.map_err(|_| Gone)?;
         }
@@ -182,7 +184,12 @@ impl Connection {
                 }
                 // Answered by the WebSocket itself; a sign of life.
                 Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
-                Ok(None | Some(Ok(Message::Close(_)))) => return Err(Gone),
+                Ok(None) => return Err(Gone),
+                Ok(Some(Ok(Message::Close(_)))) => {
+                    // The answer to a close is sent with the next read.
+                    read_out(stream).await;
+                    return Err(Gone);
+                }
                 Ok(Some(Err(error))) => return unreadable(error),
                 Err(_) if is_warned => return Ok(Received::Nothing),
                 Err(_) => {
@@ -307,6 +314,13 @@ fn unreadable(error: axum::Error) -> Result<Received, Gone> {
         _ => return Err(Gone),
     };
     Ok(Received::Unreadable(reason, error.to_string()))
+}
+
+/// Reads what still comes, for a moment.
+async fn read_out(stream: &mut SplitStream<WebSocket>) {
+    let all = async { while let Some(Ok(_)) = stream.next().await {} };
+    // Whoever does not hang up by then is left.
+    let _ = timeout(LINGER, all).await;
 }
 
 async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), Gone> {
