@@ -94,14 +94,16 @@ pub enum ConfigError {
 }
 
 /// All settings, checked.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default)]
 pub struct Config {
     /// Where to listen.
+    #[schema(value_type = String)]
     pub bind: SocketAddr,
     /// Listen on other than a loopback address although nobody needs a key.
     pub insecure: bool,
     /// `text` or `json`.
+    #[schema(value_type = String)]
     pub log_format: LogFormat,
     /// Where traces go, for example `http://127.0.0.1:4318`; needs the feature `otlp`.
     pub otlp_endpoint: Option<String>,
@@ -214,11 +216,12 @@ impl Loaded {
         })
     }
 
-    /// The settings as a TOML text, each with where it came from; passwords in URLs are masked.
+    /// The settings as a TOML text, each with what it means and where it came from; passwords in URLs are not shown.
     #[must_use]
     pub fn to_toml(&self) -> String {
-        let fields = Layer::defaults();
-        fields.keys().map(|field| print::line(&self.values, field)).collect()
+        let (fields, meanings) = (Layer::defaults(), print::meanings());
+        let entry = |field| print::entry(&self.values, field, &meanings);
+        fields.keys().map(|field| entry(field)).collect::<Vec<_>>().join("\n")
     }
 }
 

@@ -29,13 +29,13 @@ pub use state::{Event, JobState};
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
     /// No job has that id.
-    #[error("there is no job \"{id}\"")]
+    #[error("there is no job \"{id}\"; of those that ended only the latest are remembered")]
     Unknown {
         /// The id asked for.
         id: String,
     },
     /// The job's state does not allow it.
-    #[error("job {id} has {state}; it cannot {event} any more")]
+    #[error("job {id} has {state}; only one that {} can {event}", event.whose())]
     IllegalTransition {
         /// The job.
         id: String,
@@ -81,8 +81,13 @@ pub enum JobError {
         why: &'static str,
     },
     /// The directory holds what an earlier job left, which this one cannot go on with.
-    #[error("name: {0}")]
-    Occupied(#[source] Box<DatasetError>),
+    #[error("name: data set \"{name}\" {why}, or choose another name")]
+    Occupied {
+        /// The name asked for.
+        name: String,
+        /// What is there, and what would help.
+        why: String,
+    },
     /// A job that has not ended needs it.
     #[error("{kind} \"{name}\" is in use by {job}; wait for its end or cancel it")]
     InUse {

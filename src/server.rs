@@ -20,6 +20,7 @@ mod middleware;
 mod models;
 mod multipart;
 mod origin;
+mod page;
 mod picture;
 mod predict;
 mod preview;
@@ -261,6 +262,7 @@ pub fn router(app: App) -> Router {
         .route("/readyz", get(health::readyz))
         .route("/metrics", get(metrics::metrics))
         .route("/openapi.json", get(openapi::openapi_json))
+        .route("/asyncapi.yaml", get(openapi::asyncapi_yaml))
         .merge(docs::router())
         .merge(api(&app))
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)

@@ -3,12 +3,12 @@
 use super::settings::Settings;
 use super::{CliError, say};
 
-/// Print every setting with where it comes from, and its range.
+/// Print every setting with what it means, its range, and where its value comes from.
 ///
 /// The output is a configuration file: edit it and pass it with --config. Flags go over the environment (`FOREFRAME_BIND`,
-/// `FOREFRAME_MAX_STREAMS`, …), that over the file, that over the defaults. Passwords in URLs are masked.
+/// `FOREFRAME_MAX_STREAMS`, …), that over the file, that over the defaults. Passwords in URLs are not shown.
 #[derive(clap::Args)]
-#[command(after_help = "Example: FOREFRAME_MAX_STREAMS=8 foreframe config --set drain_ms=2000 > foreframe.toml")]
+#[command(after_help = "Example: FOREFRAME_MAX_STREAMS=8 foreframe config --set drain_ms=2000 > mine.toml")]
 pub(super) struct Args {
     #[command(flatten)]
     settings: Settings,

@@ -79,7 +79,13 @@ async fn list(store: &Store) -> Result<(), CliError> {
 
 async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
     if store.revoke_key(id, unix_s()).await? {
-        return say(format!("{id} is revoked"));
+        let is_last = store.list_keys().await?.iter().all(|key| key.revoked_s.is_some());
+        let then = if is_last {
+            "; it was the last: nobody may call until another is made"
+        } else {
+            ""
+        };
+        return say(format!("{id} is revoked{then}"));
     }
     Err(CliError::Usage(format!(
         "there is no valid key {id}; foreframe keys list names them"

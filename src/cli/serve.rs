@@ -1,7 +1,7 @@
 //! `foreframe serve`
 
 use tokio::net::TcpListener;
-use tracing::info;
+use tracing::{info, warn};
 
 use super::settings::{Settings, checked, open_store};
 use super::{CliError, say};
@@ -56,7 +56,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
         info!(model.id = %manifest.name, model.version = manifest.version, "model loaded");
     }
     if models.is_empty() {
-        info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs or foreframe train");
+        info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs, or copy there what foreframe train made");
     }
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
     server::serve(listener, app, server::shutdown::requested()).await;
@@ -74,9 +74,12 @@ async fn keys(config: &Config) -> Result<Keys, CliError> {
             config.bind
         )));
     }
-    info!(
-        keys = keys.count(),
-        "whoever has a key may call; without keys, everybody"
-    );
+    match keys.count() {
+        0 if keys.are_asked_for() => {
+            warn!("all keys are revoked: nobody may call until foreframe keys create makes one")
+        }
+        0 => info!("no key was ever made: everybody may call"),
+        count => info!(keys = count, "whoever has a key may call"),
+    }
     Ok(keys)
 }

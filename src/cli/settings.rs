@@ -1,6 +1,5 @@
 //! The flags that go over file and environment, shared by the commands that run long.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::CliError;
@@ -56,7 +55,7 @@ impl StoreSettings {
 pub(super) struct Settings {
     /// Where to listen [default: 127.0.0.1:8642]
     #[arg(long, value_name = "ADDRESS:PORT")]
-    bind: Option<SocketAddr>,
+    bind: Option<String>,
     /// The directory of the models to serve [default: models]
     #[arg(long, value_name = "DIR")]
     models: Option<PathBuf>,
@@ -74,8 +73,10 @@ impl Settings {
     /// The configuration with these flags over everything else.
     pub(super) fn load(&self) -> Result<Loaded, CliError> {
         let models = self.models.as_ref().map(|dir| dir.to_string_lossy().into_owned());
-        let bind = self.bind.map(|bind| bind.to_string());
-        let mut flags = given([("--bind", "bind", bind), ("--models", "models_dir", models)]);
+        let mut flags = given([
+            ("--bind", "bind", self.bind.clone()),
+            ("--models", "models_dir", models),
+        ]);
         flags.extend(self.no_jobs.then(|| Layer::one("--no-jobs", "no_jobs", true)));
         flags.extend(self.insecure.then(|| Layer::one("--insecure", "insecure", true)));
         self.store.load_with(flags)

@@ -1,20 +1,54 @@
 //! Values and ranges as people read them.
 
+use std::collections::HashMap;
+
 use figment::Figment;
 use figment::error::Kind;
 use figment::value::Value;
 
-use super::origin;
+use utoipa::PartialSchema as _;
+use utoipa::openapi::{RefOr, Schema};
+
+use super::{Config, origin};
 use crate::server::ServerConfig;
 
-/// `field = value  # where it came from; its range`
-pub(super) fn line(values: &Figment, field: &str) -> String {
+/// What each field means, from its documentation.
+pub(super) fn meanings() -> HashMap<String, String> {
+    let schemas = [Config::schema(), ServerConfig::schema()];
+    let properties = schemas.into_iter().filter_map(|schema| match schema {
+        RefOr::T(Schema::Object(object)) => Some(object.properties),
+        _ => None,
+    });
+    let meaning = |(field, schema)| match schema {
+        RefOr::T(Schema::Object(object)) => Some((field, object.description?)),
+        RefOr::T(Schema::Array(array)) => Some((field, array.description?)),
+        _ => None,
+    };
+    properties.flatten().filter_map(meaning).collect()
+}
+
+/// What it means, and `field = value  # where it came from; its range`. What hides a password is a remark, not to be taken
+/// for a value.
+pub(super) fn entry(values: &Figment, field: &str, meanings: &HashMap<String, String>) -> String {
+    let meaning: String = meanings
+        .get(field)
+        .into_iter()
+        .flat_map(|meaning| meaning.lines())
+        .map(|line| format!("# {line}\n"))
+        .collect();
     let range = range(field).map_or_else(String::new, |range| format!("; {range}"));
     let origin = origin(values, field);
-    match values.find_value(field) {
-        Ok(Value::Empty(..)) | Err(_) => format!("# {field} is not set\n"),
-        Ok(_) => format!("{field} = {}  # {origin}{range}\n", shown(values, field)),
-    }
+    let line = match values.find_value(field) {
+        Ok(Value::Empty(..)) | Err(_) => format!("# {field} is not set"),
+        Ok(Value::String(_, text)) if masked(&text) != text => {
+            format!(
+                "# {field} is {}, its password not shown  # {origin}",
+                shown(values, field)
+            )
+        }
+        Ok(_) => format!("{field} = {}  # {origin}{range}", shown(values, field)),
+    };
+    format!("{meaning}{line}\n")
 }
 
 /// A value as TOML, with the password in a URL masked.

@@ -49,7 +49,8 @@ pub struct CollectSpec {
     #[schema(minimum = 1, maximum = 1_000_000)]
     pub trials: u64,
     /// The seed all randomness comes from.
-    #[serde(default)]
+    #[serde(default = "default_seed")]
+    #[schema(default = 1)]
     pub seed: u64,
 }
 
@@ -96,6 +97,10 @@ pub struct EvaluateSpec {
     /// Seed of the resamples and the shuffled actions.
     #[serde(default)]
     pub seed: u64,
+}
+
+fn default_seed() -> u64 {
+    1
 }
 
 fn default_windows() -> usize {
@@ -201,11 +206,19 @@ impl CollectSpec {
                 name: self.name.clone(),
                 why: "exists",
             }),
-            Err(error @ (DatasetError::OutExists { .. } | DatasetError::OtherArguments { .. })) => {
-                Err(JobError::Occupied(Box::new(error)))
+            Err(DatasetError::OutExists { .. }) => {
+                Err(self.occupied("has its place taken by other files; move them".to_owned()))
             }
+            Err(DatasetError::OtherArguments { differences, .. }) => Err(self.occupied(format!(
+                "was begun with other arguments ({differences}); use those to go on"
+            ))),
             Err(error) => Err(error.into()),
         }
+    }
+
+    fn occupied(&self, why: String) -> JobError {
+        let name = self.name.clone();
+        JobError::Occupied { name, why }
     }
 
     /// What to collect into a directory of that name below `datasets`. Errors: `Invalid`, which names the scenarios.

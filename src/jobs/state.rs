@@ -80,6 +80,19 @@ impl JobState {
     }
 }
 
+impl Event {
+    /// Of which jobs it may be said.
+    #[must_use]
+    pub fn whose(self) -> &'static str {
+        match self {
+            Self::Start => "waits",
+            Self::Succeed | Self::Fail | Self::Leave => "runs",
+            Self::Cancel => "waits or runs",
+            Self::Resume => "failed or was cancelled",
+        }
+    }
+}
+
 impl FromStr for JobState {
     type Err = String;
 

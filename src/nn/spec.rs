@@ -127,9 +127,9 @@ pub struct ModelSpec {
     pub reconstruction: Reconstruction,
     /// What the prediction is conditioned on.
     pub conditioning: Conditioning,
-    /// Components of an action.
+    /// Components of an action of the data it was trained on; taken only where `conditioning` names actions.
     pub actions: Vec<ChannelScale>,
-    /// Components of a state.
+    /// Components of a state of that data; taken only where `conditioning` names states.
     pub states: Vec<ChannelScale>,
 }
 

@@ -12,12 +12,14 @@ use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
 
 /// All settings of the server, with their defaults.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default)]
 pub struct ServerConfig {
     /// Where jobs write: `datasets`, `runs`, `reports` and `models` below it.
+    #[schema(value_type = String)]
     pub data_dir: PathBuf,
     /// The directory of the models that are served without having been published by a job.
+    #[schema(value_type = String)]
     pub models_dir: PathBuf,
     /// `sqlite:FILE` or `postgres://…`; a file in the data directory where it is not given.
     pub database_url: Option<String>,

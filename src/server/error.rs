@@ -3,6 +3,7 @@
 use axum::Json;
 use axum::body::Body;
 use axum::extract::multipart::MultipartError;
+use axum::extract::path::ErrorKind;
 use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection, QueryRejection};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -237,7 +238,7 @@ impl From<JobError> for ApiError {
             JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
             JobError::IllegalTransition { .. }
             | JobError::Taken { .. }
-            | JobError::Occupied(_)
+            | JobError::Occupied { .. }
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
             JobError::Record { .. }
@@ -314,7 +315,16 @@ impl From<MultipartError> for ApiError {
 
 impl From<PathRejection> for ApiError {
     fn from(rejection: PathRejection) -> Self {
-        Self::Malformed(rejection.body_text())
+        let detail = match &rejection {
+            PathRejection::FailedToDeserializePathParams(error) => match error.kind() {
+                ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } => Some(format!(
+                    "\"{value}\" in the path is no whole number, or too great a one"
+                )),
+                _ => None,
+            },
+            _ => None,
+        };
+        Self::Malformed(detail.unwrap_or_else(|| rejection.body_text()))
     }
 }
 

@@ -9,7 +9,8 @@ use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::serving::{InputError, check_size};
 
-/// How images are encoded, in both directions.
+/// How images are encoded, in both directions: `raw` is gray bytes, row by row, of the model's size; `jpeg` is answered by
+/// `png`, which loses nothing; `png` where nothing is said.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ImageFormat {

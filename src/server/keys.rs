@@ -89,6 +89,8 @@ struct Shared {
 struct Known {
     /// Hashes of the keys that are not revoked, by id.
     hashes: HashMap<String, String>,
+    /// Whether there has been any key, revoked or not.
+    were_made: bool,
     /// Keys that were checked against their hash, as their SHA-256: the slow hash is computed once a key.
     verified: HashMap<[u8; 32], String>,
 }
@@ -100,7 +102,8 @@ impl Keys {
         Self::with(None, false)
     }
 
-    /// Whoever has a key of the store may; everybody while there is none, unless `is_required`. Errors: `Query`.
+    /// Whoever has a key of the store may; everybody while none was ever made, unless `is_required`: one that is revoked
+    /// opens the server to nobody. Errors: `Query`.
     pub async fn of(store: Store, is_required: bool) -> Result<Self, StoreError> {
         let keys = Self::with(Some(store), is_required);
         keys.refresh().await?;
@@ -127,14 +130,17 @@ impl Keys {
     /// Takes new keys in, and drops revoked ones. Errors: `Query`, and then those known before are still taken.
     pub async fn refresh(&self) -> Result<(), StoreError> {
         let Some(store) = &self.shared.store else { return Ok(()) };
-        let rows = store.list_keys().await?.into_iter();
+        let rows = store.list_keys().await?;
+        let were_made = !rows.is_empty();
         let hashes: HashMap<_, _> = rows
+            .into_iter()
             .filter(|row| row.revoked_s.is_none())
             .map(|row| (row.id, row.hash))
             .collect();
         let mut known = self.known();
         known.verified.retain(|_, id| hashes.contains_key(id));
         known.hashes = hashes;
+        known.were_made = were_made;
         Ok(())
     }
 
@@ -149,8 +155,9 @@ impl Keys {
     }
 
     /// Whether callers must show one.
-    pub(super) fn are_asked_for(&self) -> bool {
-        self.shared.is_required || self.count() > 0
+    #[must_use]
+    pub fn are_asked_for(&self) -> bool {
+        self.shared.is_required || self.known().were_made
     }
 
     async fn check(&self, presented: Option<&str>) -> Result<(), ApiError> {

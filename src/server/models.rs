@@ -5,7 +5,8 @@ use axum::http::StatusCode;
 use serde::Serialize;
 
 use super::error::{ApiError, Problem};
-use super::extract::Path;
+use super::extract::{Path, Query};
+use super::page::Page;
 use super::{App, to_its_end};
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
@@ -15,6 +16,9 @@ use crate::registry::Manifest;
 pub(super) struct ModelList {
     /// In the order of their names.
     models: Vec<ModelDescription>,
+    /// What to give as `after` for those that follow; absent at the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next: Option<String>,
 }
 
 /// What a model takes and gives, how good it is and where it comes from.
@@ -90,16 +94,20 @@ impl ModelDescription {
 }
 
 /// Lists the loaded models.
-#[utoipa::path(get, path = "/v1/models", tag = "models", responses((status = 200, body = ModelList)))]
-pub(super) async fn list(State(app): State<App>) -> Result<axum::Json<ModelList>, ApiError> {
+#[utoipa::path(
+    get, path = "/v1/models", tag = "models", params(Page),
+    responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range", body = Problem))
+)]
+pub(super) async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
+    let (manifests, next) = page.of(app.predictor().models(), |manifest| &manifest.name)?;
     let mut versions = app.versions().all().await?;
-    let manifests = app.predictor().models();
     let models = manifests.iter().map(|manifest| {
         let versions = versions.remove(&manifest.name).unwrap_or_default();
         ModelDescription::new(manifest, versions)
     });
     Ok(axum::Json(ModelList {
         models: models.collect(),
+        next,
     }))
 }
 

@@ -4,12 +4,15 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::openapi::{Content, Header, Ref, RefOr, Response, ResponseBuilder};
 use utoipa::{Modify, OpenApi};
 
 use super::{
     App, dashboard, datasets, environments, error, events, health, jobs, metrics, models, predict, preview, rollouts,
     sessions, stream,
 };
+
+const STREAMS: &str = include_str!("../../openapi/asyncapi.yaml");
 
 #[derive(OpenApi)]
 #[openapi(
@@ -57,10 +60,11 @@ use super::{
         datasets::sheet,
         datasets::animation,
         openapi_json,
+        asyncapi_yaml,
         dashboard::page,
     ),
     components(schemas(error::Problem)),
-    modifiers(&Keys),
+    modifiers(&Keys, &Problems),
     security((), ("key" = [])),
     tags(
         (name = "models", description = "Models and their predictions"),
@@ -90,6 +94,48 @@ impl Modify for Keys {
     }
 }
 
+/// What all refusals have in common: their media type, when to try again, and that a key may be missing.
+struct Problems;
+
+impl Modify for Problems {
+    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
+        for (path, item) in &mut contract.paths.paths {
+            let operations = [&mut item.get, &mut item.post, &mut item.delete];
+            for operation in operations.into_iter().flatten() {
+                let responses = &mut operation.responses.responses;
+                if path.starts_with("/v1") {
+                    responses.insert("401".to_owned(), RefOr::T(no_key()));
+                }
+                for (status, response) in responses {
+                    if let RefOr::T(response) = response
+                        && status.starts_with(['4', '5'])
+                    {
+                        as_problem(status, response);
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn no_key() -> Response {
+    let problem = Content::new(Some(Ref::from_schema_name("Problem")));
+    ResponseBuilder::new()
+        .description("No valid key, where the server asks for one")
+        .content("application/json", problem)
+        .build()
+}
+
+fn as_problem(status: &str, response: &mut Response) {
+    if let Some(content) = response.content.swap_remove("application/json") {
+        response.content.insert("application/problem+json".to_owned(), content);
+    }
+    if status == "503" {
+        let seconds = Header::new(utoipa::schema!(u64));
+        response.headers.insert("Retry-After".to_owned(), RefOr::T(seconds));
+    }
+}
+
 /// The OpenAPI 3.1 document of the whole service, as JSON with a line break at its end.
 #[must_use]
 pub fn document() -> String {
@@ -105,4 +151,13 @@ pub fn document() -> String {
 )]
 pub(super) async fn openapi_json(State(app): State<App>) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], app.contract().to_owned())
+}
+
+/// The contract of the streams: their messages with examples.
+#[utoipa::path(
+    get, path = "/asyncapi.yaml", tag = "about",
+    responses((status = 200, description = "AsyncAPI 3.0", content_type = "application/yaml"))
+)]
+pub(super) async fn asyncapi_yaml() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/yaml")], STREAMS)
 }

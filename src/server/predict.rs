@@ -26,7 +26,7 @@ pub(super) struct PredictRequest {
     /// The context's images, oldest first; in a form, its parts `frames`.
     #[serde(default)]
     frames: Vec<ImageBytes>,
-    /// How the images are encoded, and those of the answer shall be.
+    /// How the images are encoded, and those of the answer shall be (`png` for `jpeg`).
     #[serde(default)]
     format: ImageFormat,
     /// What acted at each frame, oldest first; the last one is held where there are no `future_actions`.
@@ -118,6 +118,7 @@ impl WithFrames for PredictRequest {
             (PredictResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
         (status = 400, description = "Not JSON", body = Problem),
+        (status = 406, description = "None of the media types in `Accept` can be had", body = Problem),
         (status = 404, description = "No such model", body = Problem),
         (status = 413, description = "A body or a list over the limit", body = Problem),
         (status = 415, description = "Declared neither as JSON nor as a form", body = Problem),

@@ -26,7 +26,7 @@ pub(super) struct RolloutRequest {
     /// The context's images, oldest first; in a form, its parts `frames`.
     #[serde(default)]
     frames: Vec<ImageBytes>,
-    /// How the images are encoded, and those of the answer shall be.
+    /// How the images are encoded, and those of the answer shall be (`png` for `jpeg`).
     #[serde(default)]
     format: ImageFormat,
     /// What the robot says of itself at the last frame.
@@ -85,7 +85,7 @@ impl WithFrames for RolloutRequest {
         )),
         (status = 400, description = "Not JSON", body = Problem),
         (status = 404, description = "No such model", body = Problem),
-        (status = 406, description = "Too many for a picture", body = Problem),
+        (status = 406, description = "Too many for a picture, or none of the media types in `Accept` can be had", body = Problem),
         (status = 413, description = "A body, a list or an answer over the limit", body = Problem),
         (status = 422, description = "Does not fit the model", body = Problem),
         (status = 503, description = "Too many predictions wait", body = Problem),
@@ -109,7 +109,7 @@ pub(super) async fn of_model(
     post, path = "/v1/sessions/{id}/rollouts", tag = "sessions", request_body = SessionRolloutRequest,
     params(
         ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = String, Header, description = "The session's token; or as query parameter `token`"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
     ),
     responses(
         (status = 200, description = "The futures", content(

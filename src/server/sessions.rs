@@ -10,24 +10,20 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
 use serde::Deserialize;
 
 use self::core::Settings;
 use self::session::Session;
-use self::wire::{CreateSession, CreatedSession, ExportedState, Page, SessionDescription, SessionList};
+use self::wire::{CreateSession, CreatedSession, ExportedState, SessionDescription, SessionList};
 use super::error::{ApiError, Problem};
 use super::extract::{Json, Path, Query};
+use super::page::Page;
 use super::protocol::StreamLimits;
 use super::{App, ServerConfig};
 use crate::registry::LoadedModel;
 use crate::serving::SessionState;
-
-/// Sessions of a page, unless asked otherwise.
-const PAGE: usize = 100;
-/// Sessions of a page at most.
-const MAX_PAGE: usize = 1000;
 
 /// Opens a session, or goes on with one from its exported state.
 #[utoipa::path(
@@ -54,7 +50,8 @@ pub(super) async fn create(
         token,
         limits: limits(app.config(), true),
     };
-    Ok((StatusCode::CREATED, axum::Json(created)))
+    let location = format!("/v1/sessions/{}", created.session.id);
+    Ok((StatusCode::CREATED, [(header::LOCATION, location)], axum::Json(created)))
 }
 
 /// Lists the open sessions.
@@ -66,23 +63,15 @@ pub(super) async fn list(
     State(app): State<App>,
     Query(page): Query<Page>,
 ) -> Result<axum::Json<SessionList>, ApiError> {
-    let limit = page.limit.unwrap_or(PAGE);
-    if !(1..=MAX_PAGE).contains(&limit) {
-        return Err(ApiError::Unprocessable(format!(
-            "limit is {limit}; it must be 1 to {MAX_PAGE}"
-        )));
-    }
     let now = Instant::now();
-    let mut found = app.sessions().page(&page.after, limit + 1, now);
-    let is_more = found.len() > limit;
-    found.truncate(limit);
+    let found = app.sessions().page(&page.after, page.limit()? + 1, now);
+    let (found, next) = page.of(found, |session| session.id())?;
     let grace = app.sessions().grace();
-    let sessions: Vec<SessionDescription> = found
-        .iter()
-        .map(|session| SessionDescription::of(session, grace, now))
-        .collect();
-    let next = sessions.last().filter(|_| is_more).map(|last| last.id.clone());
-    Ok(axum::Json(SessionList { sessions, next }))
+    let describe = |session: &Arc<Session>| SessionDescription::of(session, grace, now);
+    Ok(axum::Json(SessionList {
+        sessions: found.iter().map(describe).collect(),
+        next,
+    }))
 }
 
 /// Describes a session.
@@ -113,7 +102,7 @@ pub(super) async fn get(
     delete, path = "/v1/sessions/{id}", tag = "sessions",
     params(
         ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = String, Header, description = "The session's token; or as query parameter `token`"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
     ),
     responses(
         (status = 204, description = "Ended"),
@@ -132,7 +121,7 @@ pub(super) async fn delete(State(app): State<App>, session: Owned) -> StatusCode
     get, path = "/v1/sessions/{id}/state", tag = "sessions",
     params(
         ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = String, Header, description = "The session's token; or as query parameter `token`"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
     ),
     responses(
         (status = 200, body = ExportedState),

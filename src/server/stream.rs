@@ -29,13 +29,13 @@ const READ_BYTES: usize = 16 << 10;
 type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
 
 /// Opens the stream of a session: a WebSocket that takes frames with action and state and answers each with the frames to
-/// come. Sub-protocols `foreframe.v1.json` and `foreframe.v1.msgpack`; `openapi/asyncapi.yaml` has the messages. A stream
+/// come. Sub-protocols `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` has the messages. A stream
 /// that is open already is closed: the newer one holds the session.
 #[utoipa::path(
     get, path = "/v1/sessions/{id}/stream", tag = "sessions",
     params(
         ("id" = String, Path, description = "The session's id"),
-        ("token" = String, Query, description = "The session's token; or as header `x-session-token`"),
+        ("token" = Option<String>, Query, description = "The session's token; or as header `x-session-token`"),
     ),
     responses(
         (status = 101, description = "The WebSocket is open"),

@@ -104,6 +104,68 @@ fn the_committed_contract_is_the_codes() {
 }
 
 #[tokio::test]
+async fn the_contract_of_the_streams_is_served_and_refusals_are_described_as_they_come() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    assert!(get(&app, "/asyncapi.yaml").await.body.starts_with(b"asyncapi: 3"));
+    let contract = get(&app, "/openapi.json").await.json();
+    let predict = &contract["paths"]["/v1/models/{model}/predict"]["post"]["responses"];
+    for status in ["401", "404", "422", "503"] {
+        let content = predict[status]["content"].as_object().unwrap();
+        assert_eq!(
+            content.keys().collect::<Vec<_>>(),
+            ["application/problem+json"],
+            "{status}"
+        );
+    }
+    assert_eq!(predict["503"]["headers"]["Retry-After"]["schema"]["type"], "integer");
+    let refused = get(&app, "/v1/models/none").await;
+    assert_eq!(refused.headers["content-type"], "application/problem+json");
+}
+
+#[tokio::test]
+async fn lists_come_in_pages() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let (mut seen, mut after) = (Vec::new(), String::new());
+    loop {
+        let page = get(&app, &format!("/v1/models?limit=1&after={after}")).await.json();
+        let models = page["models"].as_array().unwrap();
+        assert_eq!(models.len(), 1);
+        seen.push(models[0]["name"].as_str().unwrap().to_owned());
+        match page["next"].as_str() {
+            Some(next) => after = next.to_owned(),
+            None => break,
+        }
+    }
+    let all = get(&app, "/v1/models").await.json();
+    let all: Vec<&str> = all["models"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|model| model["name"].as_str().unwrap())
+        .collect();
+    assert!(all.len() > 1 && seen == all, "{seen:?} {all:?}");
+    for path in ["/v1/models", "/v1/sessions", "/v1/jobs"] {
+        let refused = get(&app, &format!("{path}?limit=0")).await;
+        assert!(refused.detail(422).contains("it must be 1 to 1000"), "{path}");
+    }
+}
+
+#[tokio::test]
+async fn what_is_no_object_or_no_number_is_refused_in_words() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let list = post(&app, "/v1/sessions", &json!(["plain"])).await.detail(422);
+    assert!(list.contains("expected an object"), "{list}");
+    let path = post(&app, "/v1/models/plain/versions/x/activate", &Value::Null).await;
+    assert_eq!(
+        path.detail(400),
+        "\"x\" in the path is no whole number, or too great a one"
+    );
+}
+
+#[tokio::test]
 async fn every_path_of_the_contract_is_answered() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

@@ -141,10 +141,13 @@ async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
     );
     state_becomes(&app, "job-1", "cancelled").await;
     let again = post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.detail(409);
-    assert_eq!(again, "job job-1 has been cancelled; it cannot be cancelled any more");
+    assert_eq!(
+        again,
+        "job job-1 has been cancelled; only one that waits or runs can be cancelled"
+    );
     assert_eq!(
         get(&app, "/v1/jobs/job-77").await.detail(404),
-        "there is no job \"job-77\""
+        "there is no job \"job-77\"; of those that ended only the latest are remembered"
     );
 }
 
@@ -182,7 +185,10 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
     post(&app, JOBS, &collect("a")).await;
     state_becomes(&app, "job-1", "running").await;
     let early = post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.detail(409);
-    assert_eq!(early, "job job-1 has started; it cannot be resumed any more");
+    assert_eq!(
+        early,
+        "job job-1 has started; only one that failed or was cancelled can be resumed"
+    );
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
     state_becomes(&app, "job-1", "cancelled").await;
     assert_eq!(

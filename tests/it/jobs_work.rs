@@ -81,7 +81,7 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
         (&json!("fresh"), &json!(1))
     );
     let description = serves(&app, "fresh", 1).await;
-    assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-0");
+    assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-1");
     let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
         .await
         .detail(422);
@@ -286,7 +286,7 @@ async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
     let list = get(&app, "/v1/datasets").await.json();
     let described = get(&app, "/v1/datasets/seen").await.json();
     assert_eq!(list, json!({"datasets": [described]}));
-    assert_eq!((&described["episodes"], &described["seed"]), (&json!(40), &json!(0)));
+    assert_eq!((&described["episodes"], &described["seed"]), (&json!(40), &json!(1)));
     assert_eq!(described["content_hash"].as_str().unwrap().len(), 64);
 
     let picture = async |path: &str| get(&app, &format!("/v1/datasets/seen/episodes/{path}")).await;

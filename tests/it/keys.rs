@@ -38,14 +38,15 @@ async fn models_with(app: &App, authorization: &str) -> Answer {
 }
 
 #[tokio::test]
-async fn without_keys_everybody_may_unless_one_is_required() {
+async fn everybody_may_until_the_first_key_is_made_unless_one_is_required() {
     let (_dir, store, keys, app) = guarded(false).await;
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
     keys.refresh().await.unwrap();
-    assert_eq!(get(&app, "/v1/models").await.status, 200);
+    // That a key was taken away opens the server to nobody.
+    assert_eq!(get(&app, "/v1/models").await.status, 401);
     let (_dir, _store, _keys, app) = guarded(true).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
 }

@@ -247,6 +247,7 @@ fn the_configuration_is_printed_with_where_it_comes_from() {
         .unwrap();
     let printed = text(&printed.stdout);
     for line in [
+        "# Streams at a time; more are answered 503.",
         "max_streams = 7  # foreframe.toml; 1 to 1000000",
         "max_batch = 9  # environment FOREFRAME_MAX_BATCH; 1 to 4096",
         "data_dir = \"here\"  # --data-dir",

@@ -18,7 +18,9 @@ pub(in crate::server) enum TableError {
     Unknown(String),
     #[error("session \"{id}\" was not used for {grace_ms} ms and has expired; open a new one by POST /v1/sessions")]
     Expired { id: String, grace_ms: u128 },
-    #[error("this is not the session's token; send it as header x-session-token or as query parameter token")]
+    #[error(
+        "what came, if anything, is not the session's token; send it as header x-session-token or as query parameter token"
+    )]
     Token,
     #[error("{0} sessions are open already; try again later")]
     Full(usize),

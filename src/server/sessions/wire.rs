@@ -101,18 +101,6 @@ pub(in crate::server) struct SessionList {
     pub(super) next: Option<String>,
 }
 
-/// Which part of a list.
-#[derive(Debug, Deserialize, utoipa::IntoParams)]
-#[serde(deny_unknown_fields)]
-pub(in crate::server) struct Page {
-    /// Only those after this id.
-    #[serde(default)]
-    pub(super) after: String,
-    /// How many at most, 1 to 1000.
-    #[serde(default)]
-    pub(super) limit: Option<usize>,
-}
-
 impl CreateSession {
     pub(super) fn resolve(self, app: &App) -> Result<(Arc<LoadedModel>, SessionState, Settings), ApiError> {
         let (on_gap, on_late, format) = (self.on_gap, self.on_late, self.format.map(ImageFormat::answer));
