@@ -140,7 +140,8 @@ impl Pipeline {
                 if let Some(Failure::Failed(reason)) = unsaved {
                     report.line(format!("the checkpoint is kept on this machine only: {reason}"));
                 }
-                report.progress(0, 0, "publishing");
+                let steps = (config.pretrain.steps + config.fit.steps) as u64;
+                report.progress(steps, steps, "publishing");
                 let written = self.versions.write(report.lease(), &spec.name, &model_dir);
                 let written = self.runtime.block_on(written).map_err(|error| failed(&error))?;
                 let (version, activates) = written.ok_or(Failure::Cancelled)?;

@@ -44,7 +44,7 @@ pub(super) struct ResetRequest {
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct StepRequest {
-    /// In the order and units of the environment's `action`.
+    /// In the order and units of the environment's `action`; cut to what the robot's base can do: ±0.7 m/s, ±1.92 rad/s.
     action: Vec<f32>,
 }
 

@@ -187,7 +187,10 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
     collected(&app).await;
     // "plain" was shipped as version 1 and goes on serving until told otherwise.
     for (name, steps, version) in [("plain", 2, 2), ("plain", 4, 3), ("plain", 6, 4)] {
-        assert_eq!(done(&app, &train(name, steps)).await["result"]["version"], version);
+        let job = done(&app, &train(name, steps)).await;
+        assert_eq!(job["result"]["version"], version);
+        let progress = &job["progress"];
+        assert!(progress["done"] == progress["total"] && progress["total"] != 0, "{progress}");
     }
     let description = get(&app, "/v1/models/plain").await.json();
     assert_eq!(
