@@ -1,9 +1,9 @@
 //! The data sets that jobs make and use: directories below `datasets`, here and where objects are kept.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::JobError;
-use crate::dataset;
+use crate::dataset::{self, DatasetInfo};
 use crate::registry::is_valid_name;
 use crate::store::Objects;
 
@@ -38,7 +38,27 @@ pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
             return Ok(dir);
         }
     }
-    Err(JobError::NotFound {
+    Err(unknown(objects, name).await?)
+}
+
+/// What a finished data set is, without fetching it. Errors: `NotFound` with the names there are, `Store`, `Dataset`.
+pub async fn describe(objects: &Objects, name: &str) -> Result<DatasetInfo, JobError> {
+    if is_valid_name(name) && is_kept(objects, name).await? {
+        let path = format!("{}/{}", key(name), dataset::STAMP);
+        if let Some(text) = objects.read(&path).await? {
+            return Ok(dataset::describe_stamp(Path::new(&path), &text)?);
+        }
+    }
+    Err(unknown(objects, name).await?)
+}
+
+/// Whether the data set lies, finished, where objects are kept.
+async fn is_kept(objects: &Objects, name: &str) -> Result<bool, JobError> {
+    Ok(objects.has(&format!("{}/{}", key(name), dataset::INFO)).await?)
+}
+
+async fn unknown(objects: &Objects, name: &str) -> Result<JobError, JobError> {
+    Ok(JobError::NotFound {
         field: "dataset",
         kind: "data set",
         name: name.to_owned(),

@@ -173,8 +173,7 @@ pub(super) async fn animation(
 }
 
 async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError> {
-    let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
-    let info = blocking(move || dataset::describe(&dir)).await??;
+    let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
     Ok(DatasetDescription::new(name.to_owned(), info))
 }
 
