@@ -1,5 +1,6 @@
 //! Files that are whole or absent, and their hashes.
 
+use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{self, Write as _};
@@ -10,6 +11,8 @@ use sha2::{Digest, Sha256};
 
 /// The ending of a file that is being written.
 const PARTIAL: &str = "partial";
+/// The beginning of a directory's name while it is deleted.
+const DELETING: &str = ".deleting-";
 /// After so long nobody writes a partial file any more.
 const ABANDONED_AFTER: Duration = Duration::from_hours(1);
 
@@ -82,6 +85,36 @@ pub(crate) fn files_below(root: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
+/// Deletes a directory, whose name is free at once; one that is not there is deleted already. What deletions that were
+/// killed left beside it goes too.
+pub(crate) fn remove_dir(dir: &Path) -> io::Result<()> {
+    let mut name = OsString::from(DELETING);
+    name.push(format!("{:016x}", getrandom::u64().map_err(io::Error::other)?));
+    let doomed = dir.with_file_name(name);
+    if_there(std::fs::rename(dir, &doomed))?;
+    // Another deletion may be at it too.
+    if_there(std::fs::remove_dir_all(&doomed))?;
+    for left in if_there(std::fs::read_dir(dir.parent().unwrap_or(dir)))?
+        .into_iter()
+        .flatten()
+    {
+        let left = left?;
+        if left.file_name().as_encoded_bytes().starts_with(DELETING.as_bytes()) {
+            let _ = std::fs::remove_dir_all(left.path());
+        }
+    }
+    Ok(())
+}
+
+/// What was found, or none where nothing is there.
+pub(crate) fn if_there<T>(found: io::Result<T>) -> io::Result<Option<T>> {
+    match found {
+        Ok(found) => Ok(Some(found)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
 /// SHA-256 in lower-case hexadecimal digits.
 #[must_use]
 pub fn sha256_hex(bytes: &[u8]) -> String {
@@ -134,6 +167,22 @@ mod tests {
         });
         assert!(contents.contains(&std::fs::read(&path).unwrap()));
         assert_eq!(files_below(dir.path()).unwrap(), [path]);
+    }
+
+    #[test]
+    fn a_directory_is_deleted_with_what_killed_deletions_left() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["a", "b", ".deleting-1"] {
+            std::fs::create_dir_all(root.path().join(name).join("deep")).unwrap();
+        }
+        for name in ["a", "a", "c/d"] {
+            remove_dir(&root.path().join(name)).unwrap();
+        }
+        let left: Vec<_> = std::fs::read_dir(root.path())
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name())
+            .collect();
+        assert_eq!(left, ["b"]);
     }
 
     #[test]

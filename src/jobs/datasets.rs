@@ -66,16 +66,16 @@ async fn unknown(objects: &Objects, name: &str) -> Result<JobError, JobError> {
     })
 }
 
-/// Deletes a data set. Errors: `NotFound`, `Store`, `Dataset`.
+/// Deletes a data set, finished or not. Errors: `NotFound` with the names there are, `Store`, `Dataset`.
 pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
-    let known = names(objects).await?;
-    if known.iter().any(|known| known == name) {
+    if is_valid_name(name) && is_begun(objects, name).await? {
         return Ok(objects.delete(&key(name)).await?);
     }
-    Err(JobError::NotFound {
-        field: "dataset",
-        kind: "data set",
-        name: name.to_owned(),
-        known,
-    })
+    Err(unknown(objects, name).await?)
+}
+
+/// Whether anything of the data set is there, here or where objects are kept.
+async fn is_begun(objects: &Objects, name: &str) -> Result<bool, JobError> {
+    let is_here = objects.data_dir().join(key(name)).is_dir();
+    Ok(is_here || objects.directories("datasets").await?.iter().any(|known| known == name))
 }

@@ -103,7 +103,7 @@ pub(super) async fn get(
     describe(&app, &name).await.map(axum::Json)
 }
 
-/// Deletes a data set that no job uses.
+/// Deletes a data set that no job uses, also an unfinished one, as a collection that was cancelled or failed leaves it.
 #[utoipa::path(
     delete, path = "/v1/datasets/{dataset}", tag = "datasets",
     params(("dataset" = String, Path, description = "The data set's name")),

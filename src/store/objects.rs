@@ -13,7 +13,7 @@ use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::{files_below, is_partial, remove_abandoned, write_atomically};
+use crate::files::{files_below, if_there, is_partial, remove_abandoned, remove_dir, write_atomically};
 
 /// The data directory, and where it is mirrored.
 #[derive(Clone)]
@@ -154,13 +154,7 @@ impl Objects {
     /// Deletes a directory, here and where objects are kept; one that is not there is deleted already.
     /// Errors: `Io`, `Object`.
     pub async fn delete(&self, dir: &str) -> Result<(), StoreError> {
-        let path = self.data_dir.join(dir);
-        match std::fs::remove_dir_all(&path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(StoreError::io("delete", &path)(error));
-            }
-            _ => {}
-        }
+        on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
         let Some(shared) = &self.shared else { return Ok(()) };
         for object in self.list(dir).await? {
             let key = object.location;
@@ -202,14 +196,6 @@ async fn on_disk<T: Send + 'static>(
     let done = tokio::task::spawn_blocking(move || work(&worked_on)).await;
     done.unwrap_or_else(|broken| Err(io::Error::other(broken)))
         .map_err(StoreError::io(action, path))
-}
-
-fn if_there<T>(found: io::Result<T>) -> io::Result<Option<T>> {
-    match found {
-        Ok(found) => Ok(Some(found)),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(error),
-    }
 }
 
 fn failed(action: &'static str, key: &Key) -> impl FnOnce(object_store::Error) -> StoreError {

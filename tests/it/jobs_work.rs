@@ -268,6 +268,27 @@ fn misshape(model_dir: &Path) {
 }
 
 #[tokio::test]
+async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_that_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let collect = |trials: u32| json!({"kind": "collect", "name": "d", "scenario": "crowded", "trials": trials});
+    post(&app, JOBS, &collect(100_000)).await;
+    let becomes = async |has_come: &dyn Fn(&Value) -> bool| {
+        until(async || has_come(&get(&app, "/v1/jobs/job-1").await.json()).then_some(())).await;
+    };
+    becomes(&|job| job["progress"]["done"].as_u64().is_some_and(|done| done > 0)).await;
+    assert_eq!(delete(&app, "/v1/datasets/d").await.status, 409);
+    post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
+    becomes(&|job| job["state"] == "cancelled").await;
+    let occupied = post(&app, JOBS, &collect(2)).await.detail(409);
+    assert!(occupied.contains("trials: 100000 there, 2 asked"), "{occupied}");
+    assert_eq!(delete(&app, "/v1/datasets/d").await.status, 204);
+    assert_eq!(std::fs::read_dir(dir.path().join("datasets")).unwrap().count(), 0);
+    done(&app, &collect(2)).await;
+    assert_eq!(get(&app, "/v1/datasets/d").await.json()["episodes"], 2);
+}
+
+#[tokio::test]
 async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
