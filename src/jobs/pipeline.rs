@@ -81,6 +81,8 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
+        let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
+        self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
         let on_progress = |progress: dataset::Progress| report.progress(progress.done, progress.total, "simulating");
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });

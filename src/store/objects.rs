@@ -78,8 +78,35 @@ impl Objects {
     /// there; says whether it is. The others are taken never to change: one that is here in its size is not copied again.
     /// Errors: `Io`, `Object`.
     pub async fn pull(&self, dir: &str, last: &str) -> Result<bool, StoreError> {
-        let Some(shared) = &self.shared else { return Ok(false) };
         let _turn = self.turn(dir).await;
+        self.copy(dir, last).await
+    }
+
+    /// As [`Self::pull`], of a directory that may have been replaced by another under the same name: unless its file
+    /// `identity` is the same here, what is here is deleted first. Errors: `Io`, `Object`.
+    pub async fn pull_same(&self, dir: &str, identity: &str, last: &str) -> Result<bool, StoreError> {
+        let _turn = self.turn(dir).await;
+        let identity = format!("{dir}/{identity}");
+        if self.shared.is_some() && !self.is_same(&identity).await? {
+            let Some(kept) = self.read(&identity).await? else {
+                return Ok(false);
+            };
+            on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
+            // First, so that a copy that breaks off is gone on with only as long as it is of the same directory.
+            write(&self.data_dir.join(identity), kept).await?;
+        }
+        self.copy(dir, last).await
+    }
+
+    /// Whether a file in the data directory is as the one where objects are kept. Errors: `Io`, `Object`.
+    pub async fn is_same(&self, path: &str) -> Result<bool, StoreError> {
+        let here = self.data_dir.join(path);
+        let found = if_there(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
+        Ok(found.is_some() && found == self.read(path).await?)
+    }
+
+    async fn copy(&self, dir: &str, last: &str) -> Result<bool, StoreError> {
+        let Some(shared) = &self.shared else { return Ok(false) };
         let mut found = self.list(dir).await?;
         let is_last = |object: &ObjectMeta| object.location.filename() == Some(last);
         if !found.iter().any(is_last) {
