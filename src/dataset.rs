@@ -27,7 +27,8 @@ use check::{check_description, check_episode};
 pub use collect::{CollectConfig, Progress, collect};
 pub use collection::Standing;
 pub use error::DatasetError;
-pub use preview::describe;
+pub use layout::{INFO, STAMP};
+pub use preview::{describe, describe_stamp};
 pub use sampler::{Split, Splits, WindowShape};
 
 use crate::files::hex;

@@ -3,6 +3,7 @@
 //! them what `notes` gathered, [`pipeline`] does the work. The jobs themselves lie in the store, so that they outlast the
 //! process and several processes can share them.
 
+mod checkpoints;
 pub mod datasets;
 mod instance;
 pub mod job;

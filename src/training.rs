@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use self::batches::FrameSource;
+pub use self::checkpoint::{CHECKPOINT_FILE, Reached};
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};

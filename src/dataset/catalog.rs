@@ -23,6 +23,8 @@ pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
         .into_iter()
         .filter(|entry| is_finished(&entry.path()))
         .filter_map(|entry| entry.file_name().into_string().ok())
+        // One that is being deleted has a hidden name.
+        .filter(|name| !name.starts_with('.'))
         .collect();
     names.sort();
     Ok(names)

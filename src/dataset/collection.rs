@@ -13,7 +13,7 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
-use crate::files::{partial_path, sha256_hex};
+use crate::files::{is_partial_of, remove_abandoned, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -123,7 +123,7 @@ fn is_unused(out: &Path) -> Result<bool, DatasetError> {
         let only_half = is_meta
             && names(&path)?
                 .iter()
-                .all(|inner| *inner == partial_path(&out.join(ARGUMENTS)));
+                .all(|inner| is_partial_of(&out.join(ARGUMENTS), inner));
         if !only_half {
             return Ok(false);
         }
@@ -168,6 +168,7 @@ impl<'a> Collection<'a> {
             },
             TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
         })?;
+        remove_abandoned(&config.out);
         let mut collection = Self {
             info: description(config),
             config,

@@ -10,9 +10,9 @@ use crate::files::sha256_hex;
 use crate::types::{Channel, Seed};
 
 /// LeRobot's description; written last, so a directory without it is unfinished.
-pub(super) const INFO: &str = "meta/info.json";
+pub const INFO: &str = "meta/info.json";
 /// Ours: hashes and exact values.
-pub(super) const STAMP: &str = "meta/foreframe.json";
+pub const STAMP: &str = "meta/foreframe.json";
 /// The arguments of the collection; written first.
 pub(super) const ARGUMENTS: &str = "meta/collect.json";
 /// Figures of every column.
@@ -90,12 +90,17 @@ impl Stamp {
             });
         }
         let path = directory.join(STAMP);
-        let text = std::fs::read_to_string(&path).map_err(DatasetError::io("read", &path))?;
+        let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+        Self::parse(&path, &text)
+    }
+
+    /// Checks what a file of that path says. Errors: `Corrupt`.
+    pub(super) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
         let corrupt = |reason| DatasetError::Corrupt {
-            path: path.clone(),
+            path: path.to_owned(),
             reason,
         };
-        let stamp: Self = serde_json::from_str(&text).map_err(|error| corrupt(error.to_string()))?;
+        let stamp: Self = serde_json::from_slice(text).map_err(|error| corrupt(error.to_string()))?;
         if stamp.content_hash != content_hash(&stamp.shards) {
             return Err(corrupt(
                 "its content hash is not that of the shards it lists".to_owned(),

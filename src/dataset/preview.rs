@@ -15,6 +15,11 @@ pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
     Ok(Stamp::read(directory)?.info())
 }
 
+/// What the data set is whose [`super::STAMP`] of that path holds the text. Errors: `Corrupt`.
+pub fn describe_stamp(path: &Path, text: &[u8]) -> Result<DatasetInfo, DatasetError> {
+    Ok(Stamp::parse(path, text)?.info())
+}
+
 impl Dataset {
     /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
     pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {

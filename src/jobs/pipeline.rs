@@ -9,26 +9,27 @@ use futures_util::future::BoxFuture;
 use serde_json::json;
 use tokio::runtime::Handle;
 
+use super::checkpoints::{self, Keeping};
 use super::runner::{Execute, Failure, Outcome, Report};
 use super::spec::Ground;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
-use crate::store::{LossRow, Store, StoreError};
-use crate::training::{self, Event, Stage, Training};
+use crate::store::{LossRow, Store};
+use crate::training::{self, CHECKPOINT_FILE, Event, Stage, TrainError, Training};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
 use crate::wording;
 
 /// The file of a report that is written last.
 const REPORT_FILE: &str = "report.json";
-/// The file of a run that says how far it is.
-const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// Points of a stage's training loss, besides those of its validations.
 const CURVE_POINTS: usize = 500;
-/// How long a collection waits for a process that was taken for dead to let go of the directory.
+/// How long a job waits for a process that was taken for dead to let go of the directory.
 const BUSY_PATIENCE: Duration = Duration::from_mins(1);
+/// How often it looks whether that has.
+const BUSY_POLL: Duration = Duration::from_millis(200);
 
 /// What works on jobs.
 pub struct Pipeline {
@@ -89,16 +90,12 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
+        let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
+        self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
         let on_progress = |progress: dataset::Progress| report.progress(progress.done, progress.total, "simulating");
-        let began = Instant::now();
-        let info = loop {
-            match dataset::collect(&config, &on_progress, cancelled) {
-                Err(DatasetError::Busy { .. }) if began.elapsed() < BUSY_PATIENCE => {
-                    std::thread::sleep(Duration::from_millis(200));
-                }
-                other => break other.map_err(|error| failed(&error))?,
-            }
-        };
+        let collect = || dataset::collect(&config, &on_progress, cancelled);
+        let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
+        let info = once_free(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
         self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
         Ok(Outcome {
             result: json!({
@@ -127,19 +124,21 @@ impl Pipeline {
             steps: [config.pretrain.steps, config.fit.steps],
             train_loss: None,
         };
-        let mut unsaved = None;
+        let mut keeping = Keeping::default();
         let mut observer = |event: Event| {
             watch.on_event(event);
             if matches!(event, Event::Checkpointed { .. }) {
-                unsaved = self.push(&run, CHECKPOINT_FILE).err();
+                let pushing = self.store.objects().push(&run, CHECKPOINT_FILE);
+                if let Some(line) = keeping.note(self.runtime.block_on(pushing)) {
+                    report.line(line);
+                }
             }
         };
-        match training::run(&training, &mut observer, cancelled).map_err(|error| failed(&error))? {
+        let train = || training::run(&training, &mut observer, cancelled);
+        let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
+        match once_free(train, is_busy, cancelled).map_err(|error| failed(&error))? {
             training::Outcome::Interrupted { .. } => Err(Failure::Cancelled),
             training::Outcome::Finished { model_dir, manifest } => {
-                if let Some(Failure::Failed(reason)) = unsaved {
-                    report.line(format!("the checkpoint is kept on this machine only: {reason}"));
-                }
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "publishing");
                 let written = self.versions.write(report.lease(), &spec.name, &model_dir);
@@ -161,9 +160,9 @@ impl Pipeline {
             if report.lease().token == 1 {
                 return objects.delete(run).await;
             }
-            objects.pull(run, CHECKPOINT_FILE).await.map(drop)
+            checkpoints::recall(objects, run).await
         });
-        prepared.map_err(|error: StoreError| failed(&error))
+        prepared.map_err(|error| failed(&error))
     }
 
     fn evaluate(&self, spec: &EvaluateSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
@@ -229,6 +228,23 @@ impl Pipeline {
     fn push(&self, dir: &str, last: &str) -> Result<(), Failure> {
         let pushed = self.runtime.block_on(self.store.objects().push(dir, last));
         pushed.map_err(|error| failed(&error))
+    }
+}
+
+/// Tries until nobody else works in the directory, for so long at most, or until it is cancelled.
+fn once_free<T, E>(
+    mut work: impl FnMut() -> Result<T, E>,
+    is_busy: impl Fn(&E) -> bool,
+    cancelled: &AtomicBool,
+) -> Result<T, E> {
+    let began = Instant::now();
+    loop {
+        let done = work();
+        let may_wait = began.elapsed() < BUSY_PATIENCE && !cancelled.load(Ordering::Acquire);
+        match done {
+            Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
+            done => return done,
+        }
     }
 }
 
@@ -333,4 +349,37 @@ fn posted(spec: &JobSpec) -> String {
 
 fn failed(error: &dyn Error) -> Failure {
     Failure::Failed(wording::sentence(error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Tries work that is busy that often; says what came of it and how often it was tried.
+    fn tried(busy: u32, cancelled: bool) -> (Result<(), bool>, u32) {
+        let mut tries = 0;
+        let work = || {
+            tries += 1;
+            if tries > busy { Ok(()) } else { Err(true) }
+        };
+        let done = once_free(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
+        (done, tries)
+    }
+
+    #[test]
+    fn work_begins_once_the_directory_is_free_or_never_if_it_is_cancelled() {
+        assert_eq!(tried(2, false), (Ok(()), 3));
+        assert_eq!(tried(2, true), (Err(true), 1));
+    }
+
+    #[test]
+    fn other_errors_are_told_at_once() {
+        let mut tries = 0;
+        let work = || -> Result<(), bool> {
+            tries += 1;
+            Err(false)
+        };
+        assert_eq!(once_free(work, |is_busy| *is_busy, &AtomicBool::new(false)), Err(false));
+        assert_eq!(tries, 1);
+    }
 }

@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
-use crate::dataset::{CollectConfig, DatasetError, Standing};
+use crate::dataset::{self, CollectConfig, DatasetError, Standing};
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
@@ -159,7 +159,7 @@ impl JobSpec {
     /// `Occupied`, `Dataset`.
     pub fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
         match self {
-            Self::Collect(spec) => spec.check(ground.data_dir),
+            Self::Collect(spec) => spec.check(ground),
             Self::Train(spec) => spec.check(ground.datasets),
             Self::Evaluate(spec) => spec.check(ground),
         }
@@ -188,7 +188,7 @@ impl EvaluateSpec {
 }
 
 impl CollectSpec {
-    fn check(&self, data_dir: &Path) -> Result<(), JobError> {
+    fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
         check_name("name", &self.name)?;
         if !(1..=MAX_TRIALS).contains(&self.trials) {
             return Err(JobError::Invalid {
@@ -199,9 +199,15 @@ impl CollectSpec {
                 ),
             });
         }
-        match Standing::of(&self.config(&data_dir.join("datasets"))?) {
-            Ok(Standing::New | Standing::Begun { .. }) => Ok(()),
-            Ok(Standing::Finished(_)) => Err(JobError::Taken {
+        let config = self.config(&ground.data_dir.join("datasets"))?;
+        let is_there = ground.datasets.contains(&self.name);
+        // Where objects are shared, a set that is finished here alone was deleted elsewhere, or could not be pushed.
+        if !is_there && dataset::is_finished(&config.out) {
+            return Ok(());
+        }
+        match Standing::of(&config) {
+            Ok(Standing::New | Standing::Begun { .. }) if !is_there => Ok(()),
+            Ok(_) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),
                 why: "exists",

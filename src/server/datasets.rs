@@ -6,7 +6,8 @@ use axum::response::IntoResponse;
 use serde::Serialize;
 
 use super::error::{ApiError, Problem};
-use super::extract::Path;
+use super::extract::{Path, Query};
+use super::page::Page;
 use super::predict::PredictError;
 use super::{App, blocking};
 use crate::dataset::{self, Dataset, DatasetInfo};
@@ -26,6 +27,9 @@ const ROW_FRAMES: usize = 8;
 pub(super) struct DatasetList {
     /// In the order of their names.
     datasets: Vec<DatasetDescription>,
+    /// What to give as `after` for those that follow; absent at the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next: Option<String>,
 }
 
 /// What a data set is.
@@ -80,14 +84,22 @@ impl DatasetDescription {
 }
 
 /// Lists the finished data sets.
-#[utoipa::path(get, path = "/v1/datasets", tag = "datasets", responses((status = 200, body = DatasetList)))]
-pub(super) async fn list(State(app): State<App>) -> Result<axum::Json<DatasetList>, ApiError> {
-    let mut list = Vec::new();
-    for name in datasets::names(app.store().objects()).await? {
+#[utoipa::path(
+    get, path = "/v1/datasets", tag = "datasets", params(Page),
+    responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
+)]
+pub(super) async fn list(
+    State(app): State<App>,
+    Query(page): Query<Page>,
+) -> Result<axum::Json<DatasetList>, ApiError> {
+    let names = datasets::names(app.store().objects()).await?;
+    let (names, next) = page.of(names, |name| name)?;
+    let mut datasets = Vec::new();
+    for name in names {
         // One that is being deleted, or damaged, must not hide the others.
-        list.extend(describe(&app, &name).await.ok());
+        datasets.extend(describe(&app, &name).await.ok());
     }
-    Ok(axum::Json(DatasetList { datasets: list }))
+    Ok(axum::Json(DatasetList { datasets, next }))
 }
 
 /// Describes a data set.
@@ -103,7 +115,7 @@ pub(super) async fn get(
     describe(&app, &name).await.map(axum::Json)
 }
 
-/// Deletes a data set that no job uses.
+/// Deletes a data set that no job uses, also an unfinished one, as a collection that was cancelled or failed leaves it.
 #[utoipa::path(
     delete, path = "/v1/datasets/{dataset}", tag = "datasets",
     params(("dataset" = String, Path, description = "The data set's name")),
@@ -173,8 +185,7 @@ pub(super) async fn animation(
 }
 
 async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError> {
-    let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
-    let info = blocking(move || dataset::describe(&dir)).await??;
+    let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
     Ok(DatasetDescription::new(name.to_owned(), info))
 }
 

@@ -1,22 +1,27 @@
 //! Files that several machines may share: models, runs' checkpoints, data sets, reports. Work always happens in the data
 //! directory; where objects are kept elsewhere, directories are pushed there and pulled from there, under the same names.
 
+use std::collections::HashMap;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use futures_util::{StreamExt as _, TryStreamExt as _};
+use futures_util::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
+use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::write_atomically;
+use crate::files::{files_below, if_there, is_partial, remove_abandoned, remove_dir, write_atomically};
 
 /// The data directory, and where it is mirrored.
 #[derive(Clone)]
 pub struct Objects {
     data_dir: PathBuf,
     shared: Option<Arc<dyn ObjectStore>>,
+    /// The directories that are being pulled.
+    pulls: Arc<Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>>,
 }
 
 impl Objects {
@@ -36,6 +41,7 @@ impl Objects {
         Ok(Self {
             data_dir: data_dir.to_owned(),
             shared,
+            pulls: Arc::default(),
         })
     }
 
@@ -56,7 +62,8 @@ impl Objects {
     pub async fn push(&self, dir: &str, last: &str) -> Result<(), StoreError> {
         let Some(shared) = &self.shared else { return Ok(()) };
         let root = self.data_dir.join(dir);
-        let mut paths = files_below(&root).map_err(StoreError::io("list", &root))?;
+        let mut paths = on_disk("list", &root, files_below).await?;
+        paths.retain(|path| !is_partial(path) && path.extension().is_none_or(|ending| ending != "tmp"));
         paths.sort_by_key(|path| path.file_name().is_some_and(|name| name == last));
         for path in paths {
             let bytes = tokio::fs::read(&path).await.map_err(StoreError::io("read", &path))?;
@@ -67,21 +74,97 @@ impl Objects {
         Ok(())
     }
 
-    /// Copies a directory from where objects are kept into the data directory, the file `last` last; says whether there
-    /// was any. Errors: `Io`, `Object`.
+    /// Copies a directory from where objects are kept into the data directory, the file `last` last, unless that is not
+    /// there; says whether it is. The others are taken never to change: one that is here in its size is not copied again.
+    /// Errors: `Io`, `Object`.
     pub async fn pull(&self, dir: &str, last: &str) -> Result<bool, StoreError> {
-        let Some(shared) = &self.shared else { return Ok(false) };
-        let mut keys = self.keys(dir).await?;
-        keys.sort_by_key(|key| key.filename() == Some(last));
-        for key in &keys {
-            let content = shared.get(key).await.map_err(failed("read", key))?;
-            let bytes = content.bytes().await.map_err(failed("read", key))?;
-            let path = self.data_dir.join(key.as_ref());
-            let parent = path.parent().unwrap_or(&self.data_dir);
-            std::fs::create_dir_all(parent).map_err(StoreError::io("make", parent))?;
-            write_atomically(&path, &bytes).map_err(StoreError::io("write", &path))?;
+        let _turn = self.turn(dir).await;
+        self.copy(dir, last).await
+    }
+
+    /// As [`Self::pull`], of a directory that may have been replaced by another under the same name: unless its file
+    /// `identity` is the same here, what is here is deleted first. Errors: `Io`, `Object`.
+    pub async fn pull_same(&self, dir: &str, identity: &str, last: &str) -> Result<bool, StoreError> {
+        let _turn = self.turn(dir).await;
+        let identity = format!("{dir}/{identity}");
+        if self.shared.is_some() && !self.is_same(&identity).await? {
+            let Some(kept) = self.read(&identity).await? else {
+                return Ok(false);
+            };
+            on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
+            // First, so that a copy that breaks off is gone on with only as long as it is of the same directory.
+            write(&self.data_dir.join(identity), kept).await?;
         }
-        Ok(!keys.is_empty())
+        self.copy(dir, last).await
+    }
+
+    /// Whether a file in the data directory is as the one where objects are kept. Errors: `Io`, `Object`.
+    pub async fn is_same(&self, path: &str) -> Result<bool, StoreError> {
+        let here = self.data_dir.join(path);
+        let found = if_there(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
+        Ok(found.is_some() && found == self.read(path).await?)
+    }
+
+    async fn copy(&self, dir: &str, last: &str) -> Result<bool, StoreError> {
+        let Some(shared) = &self.shared else { return Ok(false) };
+        let mut found = self.list(dir).await?;
+        let is_last = |object: &ObjectMeta| object.location.filename() == Some(last);
+        if !found.iter().any(is_last) {
+            return Ok(false);
+        }
+        on_disk("list", &self.data_dir.join(dir), |dir| {
+            remove_abandoned(dir);
+            Ok(())
+        })
+        .await?;
+        found.sort_by_key(is_last);
+        for object in found {
+            let path = self.data_dir.join(object.location.as_ref());
+            let here = tokio::fs::metadata(&path).await;
+            if is_last(&object) || here.map(|here| here.len()).ok() != Some(object.size) {
+                write(&path, read(shared, &object.location).await?).await?;
+            }
+        }
+        Ok(true)
+    }
+
+    /// Waits until nobody else in this process pulls the directory, and keeps others from it.
+    async fn turn(&self, dir: &str) -> OwnedMutexGuard<()> {
+        let turn = {
+            let mut pulls = self.pulls.lock().unwrap_or_else(PoisonError::into_inner);
+            pulls.retain(|_, turn| Arc::strong_count(turn) > 1);
+            Arc::clone(pulls.entry(dir.to_owned()).or_default())
+        };
+        turn.lock_owned().await
+    }
+
+    /// What a file holds where objects are kept, if it is there. Errors: `Io`, `Object`.
+    pub async fn read(&self, path: &str) -> Result<Option<Vec<u8>>, StoreError> {
+        let Some(shared) = &self.shared else {
+            let path = self.data_dir.join(path);
+            return if_there(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
+        };
+        match read(shared, &Key::from(path)).await {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(StoreError::Object {
+                source: object_store::Error::NotFound { .. },
+                ..
+            }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Whether a file is where objects are kept. Errors: `Object`.
+    pub async fn has(&self, path: &str) -> Result<bool, StoreError> {
+        let Some(shared) = &self.shared else {
+            return Ok(self.data_dir.join(path).is_file());
+        };
+        let key = Key::from(path);
+        match shared.head(&key).await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::NotFound { .. }) => Ok(false),
+            Err(error) => Err(failed("look for", &key)(error)),
+        }
     }
 
     /// The directories right below one, where objects are kept. Errors: `Object`.
@@ -98,28 +181,48 @@ impl Objects {
     /// Deletes a directory, here and where objects are kept; one that is not there is deleted already.
     /// Errors: `Io`, `Object`.
     pub async fn delete(&self, dir: &str) -> Result<(), StoreError> {
-        let path = self.data_dir.join(dir);
-        match std::fs::remove_dir_all(&path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(StoreError::io("delete", &path)(error));
-            }
-            _ => {}
-        }
+        on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
         let Some(shared) = &self.shared else { return Ok(()) };
-        for key in self.keys(dir).await? {
+        for object in self.list(dir).await? {
+            let key = object.location;
             shared.delete(&key).await.map_err(failed("delete", &key))?;
         }
         Ok(())
     }
 
-    async fn keys(&self, dir: &str) -> Result<Vec<Key>, StoreError> {
+    async fn list(&self, dir: &str) -> Result<Vec<ObjectMeta>, StoreError> {
         let Some(shared) = &self.shared else {
             return Ok(Vec::new());
         };
         let prefix = Key::from(dir);
-        let listed = shared.list(Some(&prefix)).map(|found| found.map(|meta| meta.location));
-        listed.try_collect().await.map_err(failed("list", &prefix))
+        let listed = shared.list(Some(&prefix)).try_collect();
+        listed.await.map_err(failed("list", &prefix))
     }
+}
+
+async fn read(shared: &Arc<dyn ObjectStore>, key: &Key) -> Result<Vec<u8>, StoreError> {
+    let content = shared.get(key).await.map_err(failed("read", key))?;
+    Ok(content.bytes().await.map_err(failed("read", key))?.into())
+}
+
+async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
+    let written = on_disk("write", path, move |path| {
+        std::fs::create_dir_all(path.parent().unwrap_or(path))?;
+        write_atomically(path, &bytes)
+    });
+    written.await
+}
+
+/// Works on files off the runtime's threads.
+async fn on_disk<T: Send + 'static>(
+    action: &'static str,
+    path: &Path,
+    work: impl FnOnce(&Path) -> io::Result<T> + Send + 'static,
+) -> Result<T, StoreError> {
+    let worked_on = path.to_owned();
+    let done = tokio::task::spawn_blocking(move || work(&worked_on)).await;
+    done.unwrap_or_else(|broken| Err(io::Error::other(broken)))
+        .map_err(StoreError::io(action, path))
 }
 
 fn failed(action: &'static str, key: &Key) -> impl FnOnce(object_store::Error) -> StoreError {
@@ -158,21 +261,4 @@ fn bucket(_: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
         scheme: "s3".to_owned(),
         known: "a directory; this program was built without the feature cloud, which knows S3",
     })
-}
-
-/// Every file below a directory, but half-written ones.
-fn files_below(root: &Path) -> std::io::Result<Vec<PathBuf>> {
-    let (mut dirs, mut files) = (vec![root.to_owned()], Vec::new());
-    while let Some(dir) = dirs.pop() {
-        for entry in std::fs::read_dir(dir)? {
-            let path = entry?.path();
-            if path.is_dir() {
-                dirs.push(path);
-            } else if !path.extension().is_some_and(|end| end == "partial" || end == "tmp") {
-                files.push(path);
-            }
-        }
-    }
-    files.sort();
-    Ok(files)
 }

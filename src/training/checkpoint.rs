@@ -13,9 +13,11 @@ use super::config::{RunConfig, TrainConfig};
 use super::observer::Stage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{partial_path, sha256_hex, write_atomically};
+use crate::files::{is_partial_of, remove_abandoned, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
+/// The file of a run that says how far it is.
+pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// The key of the state's numbers in the file's metadata.
 const META_KEY: &str = "foreframe.training";
 /// Names the data that the run trains on.
@@ -54,9 +56,11 @@ impl RunFiles {
             }
             return Ok(files);
         }
-        let left_by_a_killed_start = [files.data(), partial_path(&files.data()), partial_path(&files.config())];
+        let (config, data) = (files.config(), files.data());
+        let left_by_a_killed_start =
+            |path: &Path| path == data || is_partial_of(&data, path) || is_partial_of(&config, path);
         let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
-            entries.any(|entry| entry.is_ok_and(|entry| !left_by_a_killed_start.contains(&entry.path())))
+            entries.any(|entry| entry.is_ok_and(|entry| !left_by_a_killed_start(&entry.path())))
         });
         if is_occupied || run_dir.is_file() {
             return Err(TrainError::NotARun(run_dir.to_owned()));
@@ -74,7 +78,10 @@ impl RunFiles {
         }
         let lock = File::open(&config).map_err(io_failed("read", &config))?;
         match lock.try_lock() {
-            Ok(()) => Ok(lock),
+            Ok(()) => {
+                remove_abandoned(&self.run_dir);
+                Ok(lock)
+            }
             Err(TryLockError::WouldBlock) => Err(TrainError::Busy(self.run_dir.clone())),
             Err(TryLockError::Error(source)) => Err(io_failed("lock", &config)(source)),
         }
@@ -104,7 +111,7 @@ impl RunFiles {
     }
 
     fn checkpoint(&self) -> PathBuf {
-        self.run_dir.join("checkpoint.safetensors")
+        self.run_dir.join(CHECKPOINT_FILE)
     }
 }
 
@@ -126,6 +133,24 @@ struct Meta {
     best_step: usize,
     best_loss: Option<f64>,
     history: Vec<HistoryPoint>,
+}
+
+/// How far a training is: the later, the greater.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+pub struct Reached {
+    /// In this stage.
+    pub stage: Stage,
+    /// Updates made in it.
+    pub step: usize,
+}
+
+impl Reached {
+    /// How far the training was whose checkpoint these bytes are; none if they are no checkpoint.
+    #[must_use]
+    pub fn of(checkpoint: &[u8]) -> Option<Self> {
+        let (_, header) = SafeTensors::read_metadata(checkpoint).ok()?;
+        serde_json::from_str(header.metadata().as_ref()?.get(META_KEY)?).ok()
+    }
 }
 
 /// A training's state as read from disk.

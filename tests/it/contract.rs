@@ -146,7 +146,7 @@ async fn lists_come_in_pages() {
         .map(|model| model["name"].as_str().unwrap())
         .collect();
     assert!(all.len() > 1 && seen == all, "{seen:?} {all:?}");
-    for path in ["/v1/models", "/v1/sessions", "/v1/jobs"] {
+    for path in ["/v1/models", "/v1/datasets", "/v1/sessions", "/v1/jobs"] {
         let refused = get(&app, &format!("{path}?limit=0")).await;
         assert!(refused.detail(422).contains("it must be 1 to 1000"), "{path}");
     }

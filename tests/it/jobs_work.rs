@@ -190,7 +190,10 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
         let job = done(&app, &train(name, steps)).await;
         assert_eq!(job["result"]["version"], version);
         let progress = &job["progress"];
-        assert!(progress["done"] == progress["total"] && progress["total"] != 0, "{progress}");
+        assert!(
+            progress["done"] == progress["total"] && progress["total"] != 0,
+            "{progress}"
+        );
     }
     let description = get(&app, "/v1/models/plain").await.json();
     assert_eq!(
@@ -278,6 +281,27 @@ fn misshape(model_dir: &Path) {
     let mut manifest: Value = serde_json::from_str(&text).unwrap();
     manifest["spec"]["hidden"] = json!(9);
     std::fs::write(path, manifest.to_string()).unwrap();
+}
+
+#[tokio::test]
+async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_that_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let collect = |trials: u32| json!({"kind": "collect", "name": "d", "scenario": "crowded", "trials": trials});
+    post(&app, JOBS, &collect(100_000)).await;
+    let becomes = async |has_come: &dyn Fn(&Value) -> bool| {
+        until(async || has_come(&get(&app, "/v1/jobs/job-1").await.json()).then_some(())).await;
+    };
+    becomes(&|job| job["progress"]["done"].as_u64().is_some_and(|done| done > 0)).await;
+    assert_eq!(delete(&app, "/v1/datasets/d").await.status, 409);
+    post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
+    becomes(&|job| job["state"] == "cancelled").await;
+    let occupied = post(&app, JOBS, &collect(2)).await.detail(409);
+    assert!(occupied.contains("trials: 100000 there, 2 asked"), "{occupied}");
+    assert_eq!(delete(&app, "/v1/datasets/d").await.status, 204);
+    assert_eq!(std::fs::read_dir(dir.path().join("datasets")).unwrap().count(), 0);
+    done(&app, &collect(2)).await;
+    assert_eq!(get(&app, "/v1/datasets/d").await.json()["episodes"], 2);
 }
 
 #[tokio::test]

@@ -39,6 +39,7 @@ mod server;
 mod service;
 mod session_restart;
 mod sessions;
+mod shared_datasets;
 mod sim;
 mod sim_refusals;
 mod store;

@@ -1,0 +1,131 @@
+//! Data sets of several machines that keep their objects in one place, each with a data directory and a database of its own.
+
+use std::path::Path;
+
+use axum::body::Body;
+use axum::http::Request;
+use foreframe::server::{App, ServerConfig};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::service::{Answer, get, post, send, until};
+
+const JOBS: &str = "/v1/jobs";
+const SET: &str = "/v1/datasets/d";
+
+/// A server with a data directory of its own and no shipped models.
+async fn machine(objects: &Path) -> (TempDir, App) {
+    let dir = tempfile::tempdir().unwrap();
+    let models_dir = dir.path().join("none-shipped");
+    std::fs::create_dir_all(&models_dir).unwrap();
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        models_dir,
+        objects_url: Some(objects.display().to_string()),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    (dir, app)
+}
+
+fn collect(trials: u32) -> Value {
+    json!({"kind": "collect", "name": "d", "scenario": "static-observer", "trials": trials})
+}
+
+/// Asks for a collection and waits until it has succeeded.
+async fn collected(app: &App, trials: u32) {
+    let taken = post(app, JOBS, &collect(trials)).await;
+    assert_eq!(taken.status, 202, "{}", taken.json());
+    let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
+    until(async || {
+        let job = get(app, &path).await.json();
+        assert!(job["state"] != "failed", "{job}");
+        (job["state"] == "succeeded").then_some(())
+    })
+    .await;
+}
+
+async fn delete(app: &App) -> Answer {
+    send(app, Request::delete(SET).body(Body::empty()).unwrap()).await
+}
+
+#[tokio::test]
+async fn a_data_set_is_described_without_being_fetched_and_shown_after_it_is() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, one) = machine(objects.path()).await;
+    let (there, other) = machine(objects.path()).await;
+    collected(&one, 3).await;
+    let described = get(&other, SET).await.json();
+    assert_eq!(described, get(&one, SET).await.json());
+    assert_eq!(
+        get(&other, "/v1/datasets").await.json(),
+        json!({"datasets": [described]})
+    );
+    assert!(!there.path().join("datasets/d").exists());
+    let picture = get(&other, &format!("{SET}/episodes/2/preview.png")).await;
+    assert!(picture.body.starts_with(b"\x89PNG"));
+    assert!(there.path().join("datasets/d/meta/info.json").is_file());
+}
+
+#[tokio::test]
+async fn a_name_that_another_machine_has_collected_is_taken() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, one) = machine(objects.path()).await;
+    let (_there, other) = machine(objects.path()).await;
+    collected(&one, 3).await;
+    for trials in [3, 4] {
+        let taken = post(&other, JOBS, &collect(trials)).await.detail(409);
+        assert_eq!(taken, "name: data set \"d\" exists; choose another name");
+    }
+}
+
+#[tokio::test]
+async fn a_data_set_that_was_deleted_and_collected_anew_elsewhere_is_fetched_anew() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, one) = machine(objects.path()).await;
+    let (there, other) = machine(objects.path()).await;
+    let picture = async |episode: u32| {
+        get(&other, &format!("{SET}/episodes/{episode}/preview.png"))
+            .await
+            .status
+    };
+    collected(&one, 3).await;
+    assert_eq!(picture(2).await, 200);
+    assert_eq!(delete(&one).await.status, 204);
+    assert!(there.path().join("datasets/d/meta/info.json").is_file());
+    assert_eq!(get(&other, SET).await.status, 404);
+    assert_eq!(picture(2).await, 404);
+    assert_eq!(get(&other, "/v1/datasets").await.json(), json!({"datasets": []}));
+    collected(&one, 4).await;
+    assert_eq!(get(&other, SET).await.json()["episodes"], 4);
+    assert_eq!(picture(3).await, 200);
+}
+
+#[tokio::test]
+async fn what_is_left_here_of_a_set_that_was_deleted_elsewhere_is_in_no_ones_way() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, one) = machine(objects.path()).await;
+    let (_there, other) = machine(objects.path()).await;
+    collected(&one, 3).await;
+    assert_eq!(delete(&other).await.status, 204);
+    assert!(!objects.path().join("datasets/d/meta/info.json").exists());
+    collected(&one, 5).await;
+    assert_eq!(get(&other, SET).await.json()["episodes"], 5);
+    assert_eq!(delete(&other).await.status, 204);
+    // With the same arguments it is the same set.
+    collected(&one, 5).await;
+    assert_eq!(get(&other, SET).await.json()["episodes"], 5);
+}
+
+#[tokio::test]
+async fn a_data_set_that_is_not_whole_where_objects_are_kept_is_not_told_of_but_can_be_deleted() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, app) = machine(objects.path()).await;
+    let half = objects.path().join("datasets/d/data");
+    std::fs::create_dir_all(&half).unwrap();
+    std::fs::write(half.join("shard"), "x").unwrap();
+    assert_eq!(get(&app, "/v1/datasets").await.json(), json!({"datasets": []}));
+    assert_eq!(get(&app, SET).await.status, 404);
+    assert_eq!(delete(&app).await.status, 204);
+    assert_eq!(delete(&app).await.status, 404);
+}
