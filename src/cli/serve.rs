@@ -76,7 +76,7 @@ async fn keys(config: &Config) -> Result<Keys, CliError> {
     }
     match keys.count() {
         0 if keys.are_asked_for() => {
-            warn!("all keys are revoked: nobody may call until foreframe keys create makes one")
+            warn!("all keys are revoked: nobody may call until foreframe keys create makes one");
         }
         0 => info!("no key was ever made: everybody may call"),
         count => info!(keys = count, "whoever has a key may call"),

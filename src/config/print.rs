@@ -30,12 +30,9 @@ pub(super) fn meanings() -> HashMap<String, String> {
 /// What it means, and `field = value  # where it came from; its range`. What hides a password is a remark, not to be taken
 /// for a value.
 pub(super) fn entry(values: &Figment, field: &str, meanings: &HashMap<String, String>) -> String {
-    let meaning: String = meanings
+    let meaning = meanings
         .get(field)
-        .into_iter()
-        .flat_map(|meaning| meaning.lines())
-        .map(|line| format!("# {line}\n"))
-        .collect();
+        .map_or_else(String::new, |meaning| format!("# {}\n", meaning.replace('\n', "\n# ")));
     let range = range(field).map_or_else(String::new, |range| format!("; {range}"));
     let origin = origin(values, field);
     let line = match values.find_value(field) {
