@@ -273,6 +273,7 @@ impl Predictor {
             session,
             accepted: Instant::now(),
             deadline,
+            limit: self.shared.deadline,
             reply,
         })?;
         match tokio::time::timeout_at(deadline.into(), answer).await {

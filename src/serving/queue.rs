@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
@@ -22,6 +22,8 @@ pub(super) struct Waiting {
     pub(super) session: Option<u64>,
     pub(super) accepted: Instant,
     pub(super) deadline: Instant,
+    /// How long it may take in all, as whoever waits is told.
+    pub(super) limit: Duration,
     pub(super) reply: oneshot::Sender<Result<Computed, ServingError>>,
 }
 
@@ -146,7 +148,7 @@ impl State {
             if plan.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
             } else if plan.discard.binary_search(&position).is_ok() {
-                let limit_ms = waiting.deadline.saturating_duration_since(waiting.accepted).as_millis();
+                let limit_ms = waiting.limit.as_millis();
                 meter::refused(if waiting.reply.is_closed() {
                     "abandoned"
                 } else {
@@ -166,8 +168,6 @@ impl State {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
     use crate::serving::test_model;
 
@@ -182,6 +182,7 @@ mod tests {
             session: None,
             accepted,
             deadline: accepted + Duration::from_mins(1),
+            limit: Duration::from_mins(1),
             reply,
         };
         (waiting, answer)
