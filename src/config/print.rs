@@ -5,7 +5,6 @@ use std::collections::HashMap;
 use figment::Figment;
 use figment::error::Kind;
 use figment::value::Value;
-
 use utoipa::PartialSchema as _;
 use utoipa::openapi::{RefOr, Schema};
 

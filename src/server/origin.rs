@@ -1,5 +1,5 @@
 //! Which pages' scripts may call: those of this server, and those of `cors_origins`. A page elsewhere could otherwise use
-//! the service of whoever looks at it.
+//! the service of whoever looks at it; nor may it give this server a name of its own to count as one of its pages.
 
 use std::net::Ipv4Addr;
 
@@ -15,7 +15,7 @@ const METHODS: HeaderValue = HeaderValue::from_static("GET, POST, DELETE");
 const HEADERS: HeaderValue =
     HeaderValue::from_static("authorization, content-type, idempotency-key, x-request-id, x-session-token");
 
-/// Refuses what a foreign page asks, unless its origin is configured; answers a browser's question whether it is.
+/// Refuses what is asked of a foreign host, and what a foreign page asks, unless its origin is configured; answers a browser's question whether it is.
 pub(super) async fn check(State(app): State<App>, request: Request, next: Next) -> Response {
     let allowed = &app.config().cors_origins;
     if !app.keys().are_asked_for()

@@ -37,6 +37,13 @@ enum Item {
     Refused(ErrorCode, String),
 }
 
+impl Item {
+    /// What waits to be told is bounded as what is told.
+    fn refused(code: ErrorCode, detail: String) -> Self {
+        Self::Refused(code, bounded(detail))
+    }
+}
+
 /// What came over the socket.
 enum Received {
     Message(Message),
@@ -145,8 +152,10 @@ impl Connection {
                 Received::Message(message) => message,
                 Received::Nothing => return Ok(ClosingReason::Idle),
                 Received::Unreadable(reason, detail) => {
-                    let refused = Item::Refused(ErrorCode::Malformed, bounded(detail));
-                    inbox.send(refused).await.map_err(|_| Gone)?;
+                    inbox
+                        .send(Item::refused(ErrorCode::Malformed, detail))
+                        .await
+                        .map_err(|_| Gone)?;
                     return Ok(reason);
                 }
             };
@@ -154,10 +163,8 @@ impl Connection {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
-                    self.checked(frame).map_or_else(
-                        |error| Item::Refused(error.code(), bounded(error.to_string())),
-                        Item::Frame,
-                    )
+                    self.checked(frame)
+                        .map_or_else(|error| Item::refused(error.code(), error.to_string()), Item::Frame)
                 }
                 Ok(ClientMessage::Configure(message)) => Item::Configure(message),
                 Ok(ClientMessage::Ping(ping)) => {
@@ -166,7 +173,7 @@ impl Connection {
                     continue;
                 }
                 Ok(ClientMessage::Close(_)) => return Ok(ClosingReason::Asked),
-                Err(error) => Item::Refused(ErrorCode::Malformed, bounded(error.to_string())),
+                Err(error) => Item::refused(ErrorCode::Malformed, error.to_string()),
             };
             inbox.send(item).await.map_err(|_| Gone)?;
         }
@@ -237,12 +244,10 @@ impl Connection {
         let (mut following, mut overtaken_in_a_row) = (None, 0);
         loop {
             let item = match following.take() {
-                Some(item) => item,
-                None => match items.recv().await {
-                    Some(item) => item,
-                    None => return,
-                },
+                Some(item) => Some(item),
+                None => items.recv().await,
             };
+            let Some(item) = item else { return };
             following = items.try_recv().ok();
             let answer = match item {
                 Item::Frame(mut step) => {
@@ -252,7 +257,7 @@ impl Connection {
                         Ok(answer) => answer,
                         // The reader has been told as well, and says why.
                         Err(StepError::NotHeld) => return,
-                        Err(error) => self.error(error.code(), error.to_string()),
+                        Err(error) => self.error(error.code(), bounded(error.to_string())),
                     }
                 }
                 Item::Configure(message) => self.hold.session().configure(message),
@@ -269,7 +274,7 @@ impl Connection {
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
-        let (detail, next_seq) = (bounded(detail), self.hold.session().next_seq());
+        let next_seq = self.hold.session().next_seq();
         ServerMessage::Error { code, detail, next_seq }
     }
 
