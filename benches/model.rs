@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
-use foreframe::nn::{Condition, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
 use foreframe::training::optimizer::{Adam, AdamConfig, Gradients};
 use foreframe::types::Seed;
 
@@ -26,7 +26,7 @@ fn prediction(c: &mut Criterion) {
     for windows in [1, WINDOWS] {
         let frames = values((windows, spec.context, spec.pixels()));
         c.bench_function(&format!("prediction of {windows} windows"), |b| {
-            b.iter(|| model.predict_frames(&frames, &Condition::none()).unwrap());
+            b.iter(|| model.predict_frames(&frames, &ConditioningTensors::none()).unwrap());
         });
     }
 }
@@ -45,7 +45,7 @@ fn training(c: &mut Criterion) {
     };
     c.bench_function("training step of 64 windows", |b| {
         b.iter(|| {
-            let predicted = model.predict_frames(&seen, &Condition::none()).unwrap();
+            let predicted = model.predict_frames(&seen, &ConditioningTensors::none()).unwrap();
             update(&Loss::Mse.between(&predicted, &ahead).unwrap())
         });
     });
@@ -56,13 +56,13 @@ fn training(c: &mut Criterion) {
     );
     c.bench_function("training step of 64 windows, features only", |b| {
         b.iter(|| {
-            let predicted = frozen.predict(&seen, &Condition::none(), Feedback::Prediction).unwrap();
+            let predicted = frozen.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
             update(&Loss::Mse.between(&predicted, &ahead).unwrap())
         });
     });
     c.bench_function("training step of 64 windows, features only, both decoders", |b| {
         b.iter(|| {
-            let predicted = frozen.predict(&seen, &Condition::none(), Feedback::Prediction).unwrap();
+            let predicted = frozen.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
             let again = frozen.reconstruct(&seen).unwrap();
             let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
             update(&(loss + Loss::Mse.between(&again, &seen).unwrap()).unwrap())

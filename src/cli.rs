@@ -44,27 +44,27 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Simulate trials and store their frames, actions and states
-    Collect(collect::Args),
+    Collect(collect::CollectArgs),
     /// Train a model on a data set
-    Train(train::Args),
+    Train(train::TrainArgs),
     /// Measure a model on held-out trials: report, figures, GIF
-    Evaluate(evaluate::Args),
+    Evaluate(evaluate::EvaluateArgs),
     /// Predict the frames that follow those in a directory
-    Predict(predict::Args),
+    Predict(predict::PredictArgs),
     /// Serve models over HTTP and WebSocket (the default)
-    Serve(serve::Args),
+    Serve(serve::ServeArgs),
     /// Make, list and revoke API keys
-    Keys(keys::Args),
+    Keys(keys::KeysArgs),
     /// Print every setting with where it comes from
-    Config(config::Args),
+    Config(config::ConfigArgs),
     /// Ask a running server whether it is ready
-    Healthcheck(healthcheck::Args),
+    Healthcheck(healthcheck::HealthcheckArgs),
     /// Work on jobs without serving
-    Worker(worker::Args),
+    Worker(worker::WorkerArgs),
     /// Describe a model or a data set
-    Inspect(inspect::Args),
+    Inspect(inspect::InspectArgs),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
-    Export(export::Args),
+    Export(export::ExportArgs),
 }
 
 /// Runs the program with the process's arguments and says how it ended.
@@ -80,7 +80,7 @@ pub fn main() -> ExitCode {
 }
 
 fn run(command: Option<Command>) -> Result<(), CliError> {
-    let command = command.unwrap_or_else(|| Command::Serve(serve::Args::default()));
+    let command = command.unwrap_or_else(|| Command::Serve(serve::ServeArgs::default()));
     // The logs of those that run long have settings.
     let _telemetry = match &command {
         Command::Serve(_) | Command::Worker(_) => None,

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::server::ServerConfig;
 use crate::telemetry::LogFormat;
 
-pub use layer::Layer;
+pub use layer::ConfigLayer;
 
 /// The file that is read where none is named and it is there.
 pub const DEFAULT_FILE: &str = "foreframe.toml";
@@ -134,28 +134,28 @@ impl Config {
 
 /// A configuration and where each of its values came from.
 #[derive(Debug)]
-pub struct Loaded {
+pub struct LoadedConfig {
     /// The settings.
     pub config: Config,
     values: Figment,
 }
 
-impl Loaded {
+impl LoadedConfig {
     /// Reads the file (`file`, else [`DEFAULT_FILE`] if it is there) and the environment, and puts the flags over them.
     /// Errors: every [`ConfigError`].
-    pub fn read(file: Option<&Path>, flags: Vec<Layer>) -> Result<Self, ConfigError> {
+    pub fn read(file: Option<&Path>, flags: Vec<ConfigLayer>) -> Result<Self, ConfigError> {
         let default = Path::new(DEFAULT_FILE);
         let file = file.or_else(|| default.is_file().then_some(default));
-        let file = file.map(Layer::file).transpose()?;
+        let file = file.map(ConfigLayer::file).transpose()?;
         // A variable that is no text is none of ours.
         let variables = std::env::vars_os();
         let texts = variables.filter_map(|(name, text)| Some((name.into_string().ok()?, text.into_string().ok()?)));
-        Self::from_layers(file.into_iter().chain(Layer::environment(texts)).chain(flags))
+        Self::from_layers(file.into_iter().chain(ConfigLayer::environment(texts)).chain(flags))
     }
 
     /// The defaults under the layers, later ones over earlier ones. Errors: `Unknown`, `Type`, `Range`.
-    pub fn from_layers(layers: impl IntoIterator<Item = Layer>) -> Result<Self, ConfigError> {
-        let defaults = Layer::defaults();
+    pub fn from_layers(layers: impl IntoIterator<Item = ConfigLayer>) -> Result<Self, ConfigError> {
+        let defaults = ConfigLayer::defaults();
         let known: Vec<String> = defaults.keys().cloned().collect();
         let values = layers.into_iter().fold(Figment::from(defaults), Figment::merge);
         let given: Dict = extract(&values)?;
@@ -193,7 +193,7 @@ impl Loaded {
         let ServerConfig {
             data_dir, models_dir, ..
         } = &self.config.server;
-        let is_asked_for = origin(&self.values, "models_dir") != Layer::DEFAULT;
+        let is_asked_for = origin(&self.values, "models_dir") != ConfigLayer::DEFAULT;
         let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
             let right = "name a directory, which is made if it is not there";
             ("data_dir", data_dir, right)
@@ -219,7 +219,7 @@ impl Loaded {
     /// The settings as a TOML text, each with what it means and where it came from; passwords in URLs are not shown.
     #[must_use]
     pub fn to_toml(&self) -> String {
-        let (fields, meanings) = (Layer::defaults(), print::meanings());
+        let (fields, meanings) = (ConfigLayer::defaults(), print::meanings());
         let entry = |field| print::entry(&self.values, field, &meanings);
         fields.keys().map(|field| entry(field)).collect::<Vec<_>>().join("\n")
     }

@@ -24,8 +24,8 @@ use sha2::{Digest, Sha256};
 
 pub use catalog::{find, is_finished, list};
 use check::{check_description, check_episode};
-pub use collect::{CollectConfig, Progress, collect};
-pub use collection::Standing;
+pub use collect::{CollectConfig, CollectProgress, collect};
+pub use collection::CollectionStatus;
 pub use error::DatasetError;
 pub use layout::{INFO, STAMP};
 pub use preview::{describe, describe_stamp};

@@ -24,11 +24,11 @@ use std::time::Instant;
 
 pub use self::error::EvaluationError;
 pub use self::output::{prepare, write};
-pub use self::report::Report;
+pub use self::report::EvaluationReport;
 pub use self::samples::figure_inputs;
 
 use self::bootstrap::Bootstrap;
-use self::report::{ModelSummary, Outcome, SetReport, SetScores, Stamp};
+use self::report::{ModelSummary, SetOutcome, SetReport, SetScores, ReportStamp};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
 use crate::registry::LoadedModel;
@@ -92,7 +92,7 @@ impl EvaluateConfig<'_> {
 
 /// What is being computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
+pub enum EvaluationStage {
     /// Model and baselines, frame by frame.
     Scores,
     /// The action table.
@@ -101,11 +101,11 @@ pub enum Stage {
 
 /// How far the evaluation is.
 #[derive(Clone, Copy, Debug)]
-pub struct Progress {
+pub struct EvaluationProgress {
     /// The test set.
     pub split: Split,
     /// What is being computed.
-    pub stage: Stage,
+    pub stage: EvaluationStage,
     /// Windows done.
     pub done: usize,
     /// Windows in all.
@@ -113,18 +113,18 @@ pub struct Progress {
 }
 
 /// What every pass over a test set needs besides its windows.
-pub struct Watched<'a> {
+pub struct EvaluationContext<'a> {
     split: Split,
     batch: usize,
     bootstrap: Bootstrap,
-    on_progress: &'a (dyn Fn(Progress) + Sync),
+    on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
     cancelled: Option<&'a AtomicBool>,
 }
 
-impl Watched<'_> {
+impl EvaluationContext<'_> {
     /// Errors: `Cancelled` if it is to stop.
-    fn tell(&self, stage: Stage, done: usize, total: usize) -> Result<(), EvaluationError> {
-        (self.on_progress)(Progress {
+    fn tell(&self, stage: EvaluationStage, done: usize, total: usize) -> Result<(), EvaluationError> {
+        (self.on_progress)(EvaluationProgress {
             split: self.split,
             stage,
             done,
@@ -144,8 +144,8 @@ pub fn run(
     loaded: &LoadedModel,
     dataset: &Dataset,
     config: &EvaluateConfig,
-    on_progress: &(dyn Fn(Progress) + Sync),
-) -> Result<Report, EvaluationError> {
+    on_progress: &(dyn Fn(EvaluationProgress) + Sync),
+) -> Result<EvaluationReport, EvaluationError> {
     let started = Instant::now();
     config.validate()?;
     compatible::check(loaded, dataset)?;
@@ -166,7 +166,7 @@ pub fn run(
     let training_mean = score::training_mean(dataset, &splits)?;
     let mut sets = Vec::new();
     for split in tests {
-        let watched = Watched {
+        let watched = EvaluationContext {
             split,
             batch: config.batch,
             bootstrap: Bootstrap {
@@ -182,8 +182,8 @@ pub fn run(
             outcome,
         });
     }
-    Ok(Report {
-        stamp: Stamp::new(loaded, dataset, split_seed, config, started.elapsed()),
+    Ok(EvaluationReport {
+        stamp: ReportStamp::new(loaded, dataset, split_seed, config, started.elapsed()),
         model: ModelSummary::of(loaded),
         sets,
         figures: Vec::new(),
@@ -195,8 +195,8 @@ fn score_split(
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
     training_mean: &[f32],
-    watched: &Watched,
-) -> Result<Outcome, EvaluationError> {
+    watched: &EvaluationContext,
+) -> Result<SetOutcome, EvaluationError> {
     let spec = loaded.model.spec();
     let shape = WindowShape {
         context: spec.context,
@@ -208,7 +208,7 @@ fn score_split(
             Split::TestUnseen => "the data set holds no trials of start/goal pairs or gains kept apart",
             _ => "the split leaves it without trials; collect more",
         };
-        return Ok(Outcome::Skipped {
+        return Ok(SetOutcome::Skipped {
             reason: reason.to_owned(),
         });
     }
@@ -222,5 +222,5 @@ fn score_split(
         None
     };
     let scores = SetScores::new(&scores, available.len(), actions, &watched.bootstrap);
-    Ok(Outcome::Scored(Box::new(scores)))
+    Ok(SetOutcome::Scored(Box::new(scores)))
 }

@@ -20,11 +20,11 @@ use crate::store::{StoreError, unix_s};
 use crate::versions::VersionError;
 
 pub use job::{Job, JobFilter};
-pub use notes::{Losses, Progress};
+pub use notes::{Losses, JobProgress};
 pub use queue::{JobLimits, Jobs};
-pub use runner::{Execute, Failure, Outcome, Report};
+pub use runner::{JobExecutor, JobFailure, JobResult, JobReporter};
 pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
-pub use state::{Event, JobState};
+pub use state::{JobTransition, JobState};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]
@@ -43,7 +43,7 @@ pub enum JobError {
         /// Its state.
         state: JobState,
         /// What was asked of it.
-        event: Event,
+        event: JobTransition,
     },
     /// As many jobs wait as may.
     #[error("{limit} jobs wait already; cancel one or try again later")]

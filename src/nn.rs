@@ -25,7 +25,7 @@ pub mod spec;
 pub(crate) mod tensors;
 
 pub use autoencoder::{Feedback, Model};
-pub use conditioned::Condition;
+pub use conditioned::ConditioningTensors;
 pub use loss::Loss;
 pub use parameters::Parameters;
 pub use spec::{ChannelScale, Conditioning, ModelSpec, Reconstruction};

@@ -55,7 +55,7 @@ pub use images::{ImageBytes, ImageFormat};
 use keys::Keys;
 use listener::BoundedListener;
 use middleware::RequestIds;
-use sessions::table::Table;
+use sessions::table::SessionTable;
 use streams::Streams;
 
 use crate::jobs::pipeline::Pipeline;
@@ -108,11 +108,11 @@ const FOLLOW_EVERY: Duration = Duration::from_secs(1);
 /// What the handlers share; clones are the same.
 #[derive(Clone)]
 pub struct App {
-    shared: Arc<Shared>,
+    shared: Arc<AppState>,
     keys: Keys,
 }
 
-struct Shared {
+struct AppState {
     config: ServerConfig,
     predictor: Predictor,
     jobs: Jobs,
@@ -122,7 +122,7 @@ struct Shared {
     admission: Admission,
     environments: Environments,
     draining: AtomicBool,
-    sessions: Table,
+    sessions: SessionTable,
     request_ids: RequestIds,
     contract: String,
 }
@@ -157,10 +157,10 @@ impl App {
         let admission = Admission::new(&config);
         let idle = Duration::from_millis(config.environment_idle_ms);
         let environments = Environments::new(config.max_environments, idle);
-        let sessions = Table::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
+        let sessions = SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms));
         let versions = Versions::new(store.clone(), &config.models_dir);
         Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(AppState {
                 config,
                 predictor,
                 jobs,
@@ -239,7 +239,7 @@ impl App {
         self.shared.draining.store(true, Ordering::Release);
     }
 
-    fn sessions(&self) -> &Table {
+    fn sessions(&self) -> &SessionTable {
         &self.shared.sessions
     }
 

@@ -27,10 +27,10 @@ use catalog::Catalog;
 pub use compute::{Features, predict};
 pub(crate) use input::check_size;
 pub use input::{InputError, PredictionInput};
-use queue::{Load, Queue, Waiting};
+use queue::{ModelLoad, Queue, QueuedTask};
 pub use session::{SessionMemory, SessionState};
-pub use task::{Premise, Task};
-pub(crate) use task::{STEP, Told};
+pub use task::{ConditioningInput, Task};
+pub(crate) use task::{STEP, RawConditioning};
 
 /// A task of many futures takes that share of a batch, so that those who come meanwhile wait for less than a whole one.
 const PARTS_IN_A_BATCH: usize = 4;
@@ -130,7 +130,7 @@ pub struct Prediction {
 
 /// What came of a [`Task`] and how long it took.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Computed {
+pub struct TaskOutput {
     /// Of the task's frames, in order.
     pub features: Vec<Features>,
     /// One for each of the task's premises, in order.
@@ -141,7 +141,7 @@ pub struct Computed {
     pub compute_us: u64,
 }
 
-impl Computed {
+impl TaskOutput {
     /// Adds what came of the next part.
     fn append(&mut self, mut part: Self) {
         self.features.append(&mut part.features);
@@ -154,10 +154,10 @@ impl Computed {
 /// The handle to the thread that owns the models; clones share it. The thread ends with the last of them.
 #[derive(Clone)]
 pub struct Predictor {
-    shared: Arc<Shared>,
+    shared: Arc<PredictorInner>,
 }
 
-struct Shared {
+struct PredictorInner {
     queue: Arc<Queue>,
     catalog: Arc<Catalog>,
     deadline: Duration,
@@ -165,7 +165,7 @@ struct Shared {
     worker: Mutex<Option<JoinHandle<()>>>,
 }
 
-impl Drop for Shared {
+impl Drop for PredictorInner {
     fn drop(&mut self) {
         self.queue.close();
     }
@@ -179,7 +179,7 @@ impl Predictor {
         let catalog = Arc::new(Catalog::of(models));
         let worker = worker::spawn(Arc::clone(&queue), Arc::clone(&catalog))?;
         Ok(Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(PredictorInner {
                 queue,
                 catalog,
                 deadline: config.deadline,
@@ -245,9 +245,9 @@ impl Predictor {
         model: &Arc<LoadedModel>,
         mut task: Task,
         session: Option<u64>,
-    ) -> Result<Computed, ServingError> {
+    ) -> Result<TaskOutput, ServingError> {
         let deadline = Instant::now() + self.shared.deadline;
-        let mut whole = Computed::default();
+        let mut whole = TaskOutput::default();
         loop {
             let part = task.next_part(self.shared.part_limit);
             let computed = self.compute_part(model, part, session, deadline).await?;
@@ -265,9 +265,9 @@ impl Predictor {
         task: Task,
         session: Option<u64>,
         deadline: Instant,
-    ) -> Result<Computed, ServingError> {
+    ) -> Result<TaskOutput, ServingError> {
         let (reply, answer) = oneshot::channel();
-        self.shared.queue.push(Waiting {
+        self.shared.queue.push(QueuedTask {
             model: Arc::clone(model),
             task,
             session,
@@ -289,7 +289,7 @@ impl Predictor {
     /// Errors: `Stopped`, or what that prediction fails with, and then the old one goes on serving.
     pub fn load(&self, model: LoadedModel) -> Result<(), ServingError> {
         let (reply, answer) = std::sync::mpsc::sync_channel(1);
-        self.shared.queue.load(Load { model, reply })?;
+        self.shared.queue.load(ModelLoad { model, reply })?;
         answer.recv().map_err(|_| ServingError::Stopped)?
     }
 

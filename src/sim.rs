@@ -31,10 +31,10 @@ pub use scenario::{PidGains, Scenario, TrialParameters};
 
 use camera::Camera;
 use driver::Driver;
-use look::Look;
+use look::RobotAppearance;
 use mover::Mover;
 use navigator::Navigator;
-use physics::Stage;
+use physics::PhysicsScene;
 
 /// Longest physics step, in seconds; a frame period is cut into equal steps no longer than this.
 const PHYSICS_STEP_S: f32 = 0.02;
@@ -68,7 +68,7 @@ pub struct Observation {
 
 /// What a step brought.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Step {
+pub struct StepResult {
     /// Taken at the end of the step.
     pub observation: Observation,
     /// How well Tb1 watches: 1 with Tb2 in the middle of the view, falling to 0 where it leaves it on either side or is
@@ -101,7 +101,7 @@ pub fn state_channels() -> Vec<Channel> {
 
 /// Another robot that is seen, and how it is driven.
 struct Actor {
-    look: &'static Look,
+    look: &'static RobotAppearance,
     navigator: Navigator,
     blocked_s: f32,
 }
@@ -110,7 +110,7 @@ struct Actor {
 pub struct World {
     config: WorldConfig,
     parameters: TrialParameters,
-    stage: Stage,
+    stage: PhysicsScene,
     actors: Vec<Actor>,
     driver: Driver,
     frame_index: u64,
@@ -130,7 +130,7 @@ impl World {
     pub fn from_parameters(parameters: TrialParameters, config: &WorldConfig) -> Result<Self, SimError> {
         config.validate()?;
         parameters.validate()?;
-        let mut stage = Stage::new();
+        let mut stage = PhysicsScene::new();
         stage.add_robot(parameters.observer, look::TURTLEBOT.radius_m);
         let mut actors = Vec::new();
         for (index, route) in parameters.routes().into_iter().enumerate() {
@@ -216,7 +216,7 @@ impl World {
     /// Acts for one frame period. Commands beyond Tb1's limits are clamped to [`robot::MAX_LINEAR_M_S`] and
     /// [`robot::MAX_ANGULAR_RAD_S`]; in `static-observer` Tb1's brakes are on and the action moves nothing.
     /// Errors: `ActionLength`, and `Ended` after the trial's last frame.
-    pub fn step(&mut self, action: &Action) -> Result<Step, SimError> {
+    pub fn step(&mut self, action: &Action) -> Result<StepResult, SimError> {
         let &[linear, angular] = action.as_slice() else {
             return Err(SimError::ActionLength {
                 found: action.as_slice().len(),
@@ -234,7 +234,7 @@ impl World {
         let terminated = !self.parameters.scenario.observer_drives() && self.has_arrived(0);
         let truncated = self.frame_index + 1 >= self.config.frame_limit();
         self.ended = terminated || truncated;
-        Ok(Step {
+        Ok(StepResult {
             observation: self.observe(),
             reward: self.watching() - if touched { 1.0 } else { 0.0 },
             terminated,

@@ -10,9 +10,9 @@ pub mod objects;
 
 use std::path::{Path, PathBuf};
 
-pub use self::accounts::{Account, LogRow, LossRow};
+pub use self::accounts::{JobUpdate, LogRow, LossRow};
 use self::database::Database;
-pub use self::jobs::{Ending, Enqueued, JobPage, JobRow, Lease, NewJob};
+pub use self::jobs::{JobOutcome, EnqueueResult, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
 pub use self::models::VersionRow;
 pub use self::objects::Objects;

@@ -17,12 +17,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use self::batches::FrameSource;
-pub use self::checkpoint::{CHECKPOINT_FILE, Reached};
+pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
-pub use self::observer::{Event, Observer, Stage};
-use self::stage::{Flow, StageRunner, TrainState};
+pub use self::observer::{TrainingEvent, Observer, TrainingStage};
+use self::stage::{StageEnd, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
 use crate::files::write_atomically;
@@ -72,7 +72,7 @@ pub enum TrainError {
     )]
     Diverged {
         /// Where.
-        stage: Stage,
+        stage: TrainingStage,
         /// The update that would have been made.
         step: usize,
         /// What the loss or the gradient is.
@@ -123,7 +123,7 @@ impl From<candle_core::Error> for TrainError {
 
 /// How a training ended.
 #[derive(Debug)]
-pub enum Outcome {
+pub enum TrainingOutcome {
     /// The model stands in `model_dir`.
     Finished {
         /// Where.
@@ -134,7 +134,7 @@ pub enum Outcome {
     /// It was asked to stop; the same call goes on from there.
     Interrupted {
         /// Where it stopped.
-        stage: Stage,
+        stage: TrainingStage,
         /// Updates made in that stage.
         step: usize,
     },
@@ -158,31 +158,31 @@ pub fn run(
     training: &Training<'_>,
     observer: &mut dyn Observer,
     cancelled: &AtomicBool,
-) -> Result<Outcome, TrainError> {
+) -> Result<TrainingOutcome, TrainError> {
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
     let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
     // Before the directory is made, so that what is refused here leaves nothing in the way of the next try.
-    let plan = Plan::new(config, dataset)?;
+    let plan = TrainingPlan::new(config, dataset)?;
     let _lock = files.claim()?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
-        return Ok(Outcome::Finished { model_dir, manifest });
+        return Ok(TrainingOutcome::Finished { model_dir, manifest });
     }
     let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
         Some(checkpoint) => checkpoint.into_state(),
         None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
     };
     for point in &state.history {
-        observer.on_event(Event::Recalled {
+        observer.on_event(TrainingEvent::Recalled {
             stage: point.stage,
             step: point.step,
             train_loss: point.train_loss,
             validation_loss: point.validation_loss,
         });
     }
-    observer.on_event(Event::Started {
+    observer.on_event(TrainingEvent::Started {
         stage: state.stage,
         step: state.step,
         windows: plan.train.len(),
@@ -192,21 +192,21 @@ pub fn run(
         run: &config.run,
         cancelled,
     };
-    if state.stage == Stage::Pretrain {
+    if state.stage == TrainingStage::Pretrain {
         let codec = pretrain::CodecObjective::new(&plan, config)?;
-        if runner.run(&codec, &mut state, observer)? == Flow::Interrupted {
-            return Ok(Outcome::Interrupted {
-                stage: Stage::Pretrain,
+        if runner.run(&codec, &mut state, observer)? == StageEnd::Interrupted {
+            return Ok(TrainingOutcome::Interrupted {
+                stage: TrainingStage::Pretrain,
                 step: state.step,
             });
         }
-        state.enter(Stage::Fit, &config.run)?;
+        state.enter(TrainingStage::Fit, &config.run)?;
         runner.save(&state, observer)?;
     }
     let sequence = fit::SequenceObjective::new(&plan, config);
-    if runner.run(&sequence, &mut state, observer)? == Flow::Interrupted {
-        return Ok(Outcome::Interrupted {
-            stage: Stage::Fit,
+    if runner.run(&sequence, &mut state, observer)? == StageEnd::Interrupted {
+        return Ok(TrainingOutcome::Interrupted {
+            stage: TrainingStage::Fit,
             step: state.step,
         });
     }
@@ -214,10 +214,10 @@ pub fn run(
     let manifest = plan.manifest(training, &state)?;
     write_history(&files, &state)?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
-    Ok(Outcome::Finished { model_dir, manifest })
+    Ok(TrainingOutcome::Finished { model_dir, manifest })
 }
 
-fn initial_parameters(plan: &Plan<'_>, config: &TrainConfig) -> Result<Parameters, TrainError> {
+fn initial_parameters(plan: &TrainingPlan<'_>, config: &TrainConfig) -> Result<Parameters, TrainError> {
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if config.pretrain.start == CodecStart::Principal {
         let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
@@ -241,14 +241,14 @@ fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError>
 }
 
 /// What is decided before the first step: the windows and the model's description.
-struct Plan<'a> {
+struct TrainingPlan<'a> {
     source: FrameSource<'a>,
     spec: ModelSpec,
     train: Vec<Window>,
     validation: Vec<Window>,
 }
 
-impl<'a> Plan<'a> {
+impl<'a> TrainingPlan<'a> {
     fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
         let shape = config.window_shape();
         let splits = Splits::new(dataset, config.data.split_seed);

@@ -255,10 +255,10 @@ impl Versions {
     pub async fn activate(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         let before = predictor.model(model).map(|manifest| manifest.version);
-        counted(self.take_in(predictor, model, version).await)?;
+        counted(self.load_model(predictor, model, version).await)?;
         if let Err(error) = self.store.set_active(model, version, unix_s()).await {
             if let Ok(before) = before {
-                self.take_in(predictor, model, before).await?;
+                self.load_model(predictor, model, before).await?;
             }
             return Err(error.into());
         }
@@ -309,7 +309,7 @@ impl Versions {
             if serves || refused.contains(&(model.clone(), version)) {
                 continue;
             }
-            match counted(self.take_in(predictor, &model, version).await) {
+            match counted(self.load_model(predictor, &model, version).await) {
                 Ok(()) => info!(model, version, "version loaded"),
                 Err(error) => {
                     warn!(model, version, %error, "a version was not loaded");
@@ -323,7 +323,7 @@ impl Versions {
     }
 
     /// Has the predictor answer with a version.
-    async fn take_in(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+    async fn load_model(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let loaded = self.load(model, version).await?;
         let predictor = predictor.clone();
         let taken = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;

@@ -202,7 +202,7 @@ async fn session(http: &mut Http, address: SocketAddr, material: &Material, fram
         let is_full = seq + 1 >= material.context();
         match session::receive(&mut socket).await {
             Some(ServerMessage::Prediction { seq: of, .. }) if is_full && of == seq => {}
-            Some(ServerMessage::Warming { seq: of, .. }) if !is_full && of == seq => {}
+            Some(ServerMessage::Buffering { seq: of, .. }) if !is_full && of == seq => {}
             other => return Err(format!("frame {seq} was answered with {other:?}")),
         }
     }

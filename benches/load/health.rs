@@ -140,7 +140,7 @@ async fn measure(args: &Args, server: &Server, material: &Arc<Material>) -> (f64
     );
     println!("  the server takes {:.0} % of a core", flown.server_cpu);
     let mut faults = checks.faults;
-    let predicted = tally.answers.len() as u64 + tally.warming;
+    let predicted = tally.answers.len() as u64 + tally.buffering;
     faults.extend((predicted != tally.sent).then(|| format!("{predicted} of {} frames predicted", tally.sent)));
     (
         fresh.at_ms(0.99).max(kept.at_ms(0.99)),

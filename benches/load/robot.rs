@@ -15,7 +15,7 @@ use crate::session::{self, Socket};
 pub(crate) struct Tally {
     pub(crate) sent: u64,
     /// Frames that only filled the context.
-    pub(crate) warming: u64,
+    pub(crate) buffering: u64,
     /// Taken in without a prediction, since a newer one waited.
     pub(crate) overtaken: u64,
     /// Refused because the server is too busy.
@@ -45,13 +45,13 @@ impl Tally {
     /// Frames of which nothing was heard again.
     pub(crate) fn unanswered(&self) -> u64 {
         let heard =
-            self.answers.len() as u64 + self.warming + self.overtaken + self.overloaded + self.refused + self.dropped;
+            self.answers.len() as u64 + self.buffering + self.overtaken + self.overloaded + self.refused + self.dropped;
         self.sent.saturating_sub(heard)
     }
 
     pub(crate) fn add(&mut self, other: Self) {
         self.sent += other.sent;
-        self.warming += other.warming;
+        self.buffering += other.buffering;
         self.overtaken += other.overtaken;
         self.overloaded += other.overloaded;
         self.refused += other.refused;
@@ -101,7 +101,7 @@ pub(crate) async fn fly(
                     });
                     tally.dropped += dropped;
                 }
-                ServerMessage::Warming { .. } => tally.warming += 1,
+                ServerMessage::Buffering { .. } => tally.buffering += 1,
                 ServerMessage::Overtaken { .. } => tally.overtaken += 1,
                 ServerMessage::Error {
                     code: ErrorCode::Overloaded,

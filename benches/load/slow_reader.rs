@@ -110,7 +110,7 @@ async fn round(args: &Args, server: &Server, material: &Arc<Material>) -> Round 
     Round {
         p99_ms: flown.since_schedule().at_ms(0.99),
         rss_mb: Process::taken(&server.process).rss_mb,
-        unanswered: flown.tally.sent - flown.tally.warming - flown.tally.answers.len() as u64,
+        unanswered: flown.tally.sent - flown.tally.buffering - flown.tally.answers.len() as u64,
     }
 }
 

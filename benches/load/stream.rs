@@ -145,7 +145,7 @@ async fn keeps(args: &Args, sessions: usize, server: &Server, material: &Arc<Mat
     let latencies = flown.since_schedule();
     println!(
         "{sessions} sessions: {latencies}; {} of {} frames not predicted; the server takes {:.0} % of a core",
-        flown.tally.sent - flown.tally.warming - flown.tally.answers.len() as u64,
+        flown.tally.sent - flown.tally.buffering - flown.tally.answers.len() as u64,
         flown.tally.sent,
         flown.server_cpu
     );

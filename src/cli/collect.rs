@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::value_parser;
 
-use super::{CliError, DATASETS_DIR, interrupt, progress::Progress, say};
+use super::{CliError, DATASETS_DIR, interrupt, progress::ProgressLine, say};
 use crate::dataset::DatasetError;
 use crate::dataset::collect::{CollectConfig, collect};
 use crate::jobs::spec::MAX_TRIALS;
@@ -20,7 +20,7 @@ const MAX_THREADS: i64 = 256;
 /// it was, and the result is the same as if it had never stopped.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe collect --scenario moving-observer --trials 500")]
-pub(super) struct Args {
+pub(super) struct CollectArgs {
     /// static-observer (the paper's: a standing camera, one robot), moving-observer (the camera's robot drives too) or
     /// crowded (several robots)
     #[arg(long, default_value = "static-observer")]
@@ -45,7 +45,7 @@ pub(super) struct Args {
     noise: f64,
 }
 
-pub(super) fn run(args: Args) -> Result<(), CliError> {
+pub(super) fn run(args: CollectArgs) -> Result<(), CliError> {
     let out = args
         .out
         .unwrap_or_else(|| Path::new(DATASETS_DIR).join(args.scenario.to_string()));
@@ -55,7 +55,7 @@ pub(super) fn run(args: Args) -> Result<(), CliError> {
     config.world.camera.noise_std = args.noise;
     config.threads = args.threads.unwrap_or_default().into();
     config.validate()?;
-    let (cancelled, progress) = (interrupt::flag()?, Progress::new("trials"));
+    let (cancelled, progress) = (interrupt::flag()?, CollectProgress::new("trials"));
     progress.start(&format!("collecting {}", config.scenario), 0, config.trials);
     let collected = collect(
         &config,

@@ -9,11 +9,11 @@ use super::{CliError, say};
 /// `FOREFRAME_MAX_STREAMS`, …), that over the file, that over the defaults. Passwords in URLs are not shown.
 #[derive(clap::Args)]
 #[command(after_help = "Example: FOREFRAME_MAX_STREAMS=8 foreframe config --set drain_ms=2000 > mine.toml")]
-pub(super) struct Args {
+pub(super) struct ConfigArgs {
     #[command(flatten)]
     settings: Settings,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &ConfigArgs) -> Result<(), CliError> {
     say(args.settings.load()?.to_toml().trim_end())
 }

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use super::{CliError, command_line, load_model, open_dataset, progress::Progress, say};
-use crate::evaluation::{self, EvaluateConfig, Stage};
+use super::{CliError, command_line, load_model, open_dataset, progress::ProgressLine, say};
+use crate::evaluation::{self, EvaluateConfig, EvaluationStage};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
@@ -13,7 +13,7 @@ use crate::types::Seed;
 /// the share of the best trivial baseline's error that the model takes away.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe evaluate --model paper --dataset static-observer --out reports/paper")]
-pub(super) struct Args {
+pub(super) struct EvaluateArgs {
     /// A model's name or directory
     #[arg(long)]
     model: String,
@@ -43,7 +43,7 @@ pub(super) struct Args {
     models: PathBuf,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let (model_dir, loaded) = load_model(&args.model, &args.models)?;
     let twin = args
         .twin
@@ -64,11 +64,11 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
         command: command_line(),
         ..EvaluateConfig::default()
     };
-    let progress = Progress::new("windows");
+    let progress = EvaluationProgress::new("windows");
     let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
         let what = match now.stage {
-            Stage::Scores => "scores",
-            Stage::Actions => "actions",
+            EvaluationStage::Scores => "scores",
+            EvaluationStage::Actions => "actions",
         };
         progress.update(now.done as u64, now.total as u64, || format!("{} {what}", now.split));
     })?;

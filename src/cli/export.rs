@@ -15,7 +15,7 @@ use crate::frame::{Frame, codec};
 /// The directory then serves `foreframe predict`: frames in order, and the actions that were taken from each on.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe export --dataset moving-observer --episode 3 --out look")]
-pub(super) struct Args {
+pub(super) struct ExportArgs {
     /// The data set's directory, or its name in data/datasets
     #[arg(long, value_name = "DATASET")]
     dataset: PathBuf,
@@ -33,7 +33,7 @@ pub(super) struct Args {
     count: Option<u32>,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     let (dir, dataset) = open_dataset(&args.dataset)?;
     let episode = dataset
         .episodes()

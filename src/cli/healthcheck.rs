@@ -15,7 +15,7 @@ const PATIENCE: Duration = Duration::from_secs(3);
 /// For containers, which bring no curl. Without --url it asks the address that serve would listen on.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe healthcheck --url http://127.0.0.1:8642/livez")]
-pub(super) struct Args {
+pub(super) struct HealthcheckArgs {
     /// What to ask [default: /readyz at the address to listen on]
     #[arg(long, value_name = "URL")]
     url: Option<String>,
@@ -23,7 +23,7 @@ pub(super) struct Args {
     settings: Settings,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     let url = match &args.url {
         Some(url) => url.clone(),
         None => format!("http://{}/readyz", reachable(args.settings.load()?.config.bind)),

@@ -13,7 +13,7 @@ use crate::wording::{listed, those};
 #[command(after_help = "Examples:
   foreframe inspect paper
   foreframe inspect static-observer")]
-pub(super) struct Args {
+pub(super) struct InspectArgs {
     /// A model's name or directory, or a data set's name or directory
     what: String,
     /// Where models are looked for by name
@@ -21,7 +21,7 @@ pub(super) struct Args {
     models: PathBuf,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
     let (models, datasets) = (args.models.as_path(), Path::new(DATASETS_DIR));
     if let Ok(dir) = registry::locate(models, &args.what) {
         return describe_model(&dir, &registry::load(&dir)?.manifest);

@@ -13,15 +13,15 @@ use crate::store::{KeyRow, Store};
 /// takes a change within seconds.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe keys create robot-7")]
-pub(super) struct Args {
+pub(super) struct KeysArgs {
     #[command(subcommand)]
-    action: Action,
+    action: KeysCommand,
     #[command(flatten)]
     settings: StoreSettings,
 }
 
 #[derive(clap::Subcommand)]
-enum Action {
+enum KeysCommand {
     /// Make a key and print it: only its hash is kept, so it is never seen again
     Create {
         /// Whose it is, for the list
@@ -36,7 +36,7 @@ enum Action {
     },
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
     let config = args.settings.load()?.config;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -45,9 +45,9 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     runtime.block_on(async {
         let store = open_store(&config).await?;
         match &args.action {
-            Action::Create { name } => create(&store, name).await,
-            Action::List => list(&store).await,
-            Action::Revoke { id } => revoke(&store, id).await,
+            KeysCommand::Create { name } => create(&store, name).await,
+            KeysCommand::List => list(&store).await,
+            KeysCommand::Revoke { id } => revoke(&store, id).await,
         }
     })
 }

@@ -28,7 +28,7 @@ The action of a frame acts from it to the next. A model that is told the state t
 Example: foreframe export --dataset moving-observer --episode 3 --out look
          foreframe predict --model moving --frames look --actions look/actions.json --out seen"
 )]
-pub(super) struct Args {
+pub(super) struct PredictArgs {
     /// A model's name or directory
     #[arg(long)]
     model: String,
@@ -49,13 +49,13 @@ pub(super) struct Args {
 /// The actions file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Trace {
+struct ActionsFile {
     #[serde(default)]
     states: Vec<RobotState>,
     actions: Vec<Action>,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     let (_, loaded) = load_model(&args.model, &args.models)?;
     let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
     let frames = read_frames(&args.frames, name, spec)?;
@@ -90,7 +90,7 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
     ))
 }
 
-impl Trace {
+impl ActionsFile {
     /// Takes what the model is told: the state of the last frame seen, and the actions from there on.
     fn enter(self, input: &mut PredictionInput, path: &Path, model: &str, spec: &ModelSpec) -> Result<(), CliError> {
         let last = spec.context - 1;
@@ -119,7 +119,7 @@ impl Trace {
     }
 }
 
-fn read_trace(path: &Path) -> Result<Trace, CliError> {
+fn read_trace(path: &Path) -> Result<ActionsFile, CliError> {
     let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
     serde_json::from_slice(&bytes).map_err(|error| {
         CliError::Usage(format!(

@@ -10,13 +10,13 @@ use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
 /// A count towards a total.
-pub(super) struct Progress {
+pub(super) struct ProgressLine {
     bar: ProgressBar,
     unit: &'static str,
     last_line: Option<Mutex<Instant>>,
 }
 
-impl Progress {
+impl ProgressLine {
     /// Counts `unit`s, of which the total is not known yet.
     pub(super) fn new(unit: &'static str) -> Self {
         let bar = ProgressBar::new(0);

@@ -17,12 +17,12 @@ use crate::telemetry;
 #[derive(clap::Args, Default)]
 #[command(after_help = "Then look at http://127.0.0.1:8642/ or ask it:
   curl http://127.0.0.1:8642/v1/models")]
-pub(super) struct Args {
+pub(super) struct ServeArgs {
     #[command(flatten)]
     settings: Settings,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let config = checked(args.settings.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     telemetry::record();

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::CliError;
-use crate::config::{Config, ConfigError, Layer, Loaded};
+use crate::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
 use crate::store::{Store, StoreError};
 
 /// Where state is kept.
@@ -31,11 +31,11 @@ pub(super) struct StoreSettings {
 
 impl StoreSettings {
     /// The configuration with these flags over everything else.
-    pub(super) fn load(&self) -> Result<Loaded, CliError> {
+    pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
         self.load_with(Vec::new())
     }
 
-    fn load_with(&self, mut flags: Vec<Layer>) -> Result<Loaded, CliError> {
+    fn load_with(&self, mut flags: Vec<ConfigLayer>) -> Result<LoadedConfig, CliError> {
         let data_dir = self.data_dir.as_ref().map(|dir| dir.to_string_lossy().into_owned());
         flags.extend(given([
             ("--data-dir", "data_dir", data_dir),
@@ -44,9 +44,9 @@ impl StoreSettings {
             ("--log-format", "log_format", self.log_format.clone()),
         ]));
         for setting in &self.settings {
-            flags.push(Layer::setting(setting)?);
+            flags.push(ConfigLayer::setting(setting)?);
         }
-        Ok(Loaded::read(self.config.as_deref(), flags)?)
+        Ok(LoadedConfig::read(self.config.as_deref(), flags)?)
     }
 }
 
@@ -71,25 +71,25 @@ pub(super) struct Settings {
 
 impl Settings {
     /// The configuration with these flags over everything else.
-    pub(super) fn load(&self) -> Result<Loaded, CliError> {
+    pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
         let models = self.models.as_ref().map(|dir| dir.to_string_lossy().into_owned());
         let mut flags = given([
             ("--bind", "bind", self.bind.clone()),
             ("--models", "models_dir", models),
         ]);
-        flags.extend(self.no_jobs.then(|| Layer::one("--no-jobs", "no_jobs", true)));
-        flags.extend(self.insecure.then(|| Layer::one("--insecure", "insecure", true)));
+        flags.extend(self.no_jobs.then(|| ConfigLayer::one("--no-jobs", "no_jobs", true)));
+        flags.extend(self.insecure.then(|| ConfigLayer::one("--insecure", "insecure", true)));
         self.store.load_with(flags)
     }
 }
 
-fn given<const N: usize>(flags: [(&str, &str, Option<String>); N]) -> Vec<Layer> {
-    let given = |(flag, field, text): (&str, &str, Option<String>)| Some(Layer::one(flag, field, text?));
+fn given<const N: usize>(flags: [(&str, &str, Option<String>); N]) -> Vec<ConfigLayer> {
+    let given = |(flag, field, text): (&str, &str, Option<String>)| Some(ConfigLayer::one(flag, field, text?));
     flags.into_iter().filter_map(given).collect()
 }
 
 /// The configuration of a command that is about to begin its work in its directories.
-pub(super) fn checked(loaded: Loaded) -> Result<Config, CliError> {
+pub(super) fn checked(loaded: LoadedConfig) -> Result<Config, CliError> {
     loaded.check_directories()?;
     Ok(loaded.config)
 }

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{CliError, command_line, interrupt, open_dataset, progress::Progress, say};
-use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
+use super::{CliError, command_line, interrupt, open_dataset, progress::ProgressLine, say};
+use crate::training::{self, TrainingEvent, TrainingOutcome, TrainingStage, TrainConfig, Training};
 
 /// Train a model on a data set.
 ///
@@ -15,7 +15,7 @@ use crate::training::{self, Event, Outcome, Stage, TrainConfig, Training};
   foreframe train --preset paper --dataset static-observer
   foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
   foreframe train --preset paper --print-config > mine.toml   # every field, to edit and pass with --config")]
-pub(super) struct Args {
+pub(super) struct TrainArgs {
     /// paper (1000 windows), static (all windows) or moving (told the robot's state and actions)
     #[arg(long, default_value = "paper")]
     preset: String,
@@ -36,7 +36,7 @@ pub(super) struct Args {
     print_config: bool,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     let file = args.config.as_deref().map(read_config).transpose()?;
     let config = TrainConfig::layered(&args.preset, file.as_deref(), &args.settings)?;
     if args.print_config {
@@ -56,12 +56,12 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
         command: &command,
     };
     let cancelled = interrupt::flag()?;
-    let progress = Progress::new("steps");
-    let mut watch = Watch::new(&progress, &config);
-    let outcome = training::run(&job, &mut |event: Event| watch.on_event(event), &cancelled);
+    let progress = ProgressLine::new("steps");
+    let mut watch = TrainingDisplay::new(&progress, &config);
+    let outcome = training::run(&job, &mut |event: TrainingEvent| watch.on_event(event), &cancelled);
     progress.finish();
     match outcome? {
-        Outcome::Finished { model_dir, manifest } => say(format!(
+        TrainingOutcome::Finished { model_dir, manifest } => say(format!(
             "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}",
             model_dir.display(),
             manifest.parameters,
@@ -69,7 +69,7 @@ pub(super) fn run(args: &Args) -> Result<(), CliError> {
             model_dir.display(),
             dataset_dir.display(),
         )),
-        Outcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
+        TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
             "stopped in {stage} after step {step}; the checkpoint is in {}, the same command goes on from it",
             run_dir.display()
         ))),
@@ -89,15 +89,15 @@ fn default_dataset(preset: &str) -> PathBuf {
 }
 
 /// Shows a training's events.
-struct Watch<'a> {
-    progress: &'a Progress,
+struct TrainingDisplay<'a> {
+    progress: &'a ProgressLine,
     steps: [usize; 2],
-    stage: Option<Stage>,
+    stage: Option<TrainingStage>,
     validation: Option<f64>,
 }
 
-impl<'a> Watch<'a> {
-    fn new(progress: &'a Progress, config: &TrainConfig) -> Self {
+impl<'a> TrainingDisplay<'a> {
+    fn new(progress: &'a ProgressLine, config: &TrainConfig) -> Self {
         Self {
             progress,
             steps: [config.pretrain.steps, config.fit.steps],
@@ -106,13 +106,13 @@ impl<'a> Watch<'a> {
         }
     }
 
-    fn on_event(&mut self, event: Event) {
+    fn on_event(&mut self, event: TrainingEvent) {
         match event {
-            Event::Started { stage, step, windows } => {
+            TrainingEvent::Started { stage, step, windows } => {
                 self.start(stage, step);
                 self.progress.line(&format!("from step {step}, on {windows} windows"));
             }
-            Event::Step {
+            TrainingEvent::Step {
                 stage,
                 step,
                 steps,
@@ -127,7 +127,7 @@ impl<'a> Watch<'a> {
                     None => format!("loss {loss:.6}"),
                 });
             }
-            Event::Validated {
+            TrainingEvent::Validated {
                 step, loss, is_best, ..
             } => {
                 self.validation = Some(loss);
@@ -135,12 +135,12 @@ impl<'a> Watch<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
             }
-            Event::Recalled { .. } | Event::Checkpointed { .. } => {}
+            TrainingEvent::Recalled { .. } | TrainingEvent::Checkpointed { .. } => {}
         }
     }
 
-    fn start(&mut self, stage: Stage, step: usize) {
-        let total = self.steps[usize::from(stage == Stage::Fit)];
+    fn start(&mut self, stage: TrainingStage, step: usize) {
+        let total = self.steps[usize::from(stage == TrainingStage::Fit)];
         self.progress.start(&stage.to_string(), step as u64, total as u64);
         self.stage = Some(stage);
     }

@@ -21,12 +21,12 @@ use crate::versions::Versions;
 #[derive(clap::Args)]
 #[command(after_help = "Example, beside `foreframe serve --no-jobs` in the same directory:
   foreframe worker")]
-pub(super) struct Args {
+pub(super) struct WorkerArgs {
     #[command(flatten)]
     store: StoreSettings,
 }
 
-pub(super) fn run(args: &Args) -> Result<(), CliError> {
+pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
     let config = checked(args.store.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -15,12 +15,12 @@ const TEST_PREFIX: &str = "FOREFRAME_TEST_";
 
 /// Values from one place, which errors and `foreframe config` name.
 #[derive(Clone, Debug)]
-pub struct Layer {
+pub struct ConfigLayer {
     origin: String,
     values: Dict,
 }
 
-impl Layer {
+impl ConfigLayer {
     /// Where a value comes from that nobody gave.
     pub(super) const DEFAULT: &'static str = "default";
 
@@ -96,7 +96,7 @@ fn dict(fields: &impl Serialize) -> Dict {
         .unwrap_or_default()
 }
 
-impl Provider for Layer {
+impl Provider for ConfigLayer {
     fn metadata(&self) -> Metadata {
         Metadata::named(self.origin.clone())
     }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use super::collection::{Collection, Standing};
+use super::collection::{Collection, CollectionStatus};
 use super::shard::EncodedEpisode;
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::sim::{Observation, Scenario, SimError, World, WorldConfig, action_channels};
@@ -86,7 +86,7 @@ impl CollectConfig {
 
 /// How far a collection is, in trials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
+pub struct CollectProgress {
     /// Trials simulated, with those found when it was taken up again.
     pub done: u64,
     /// Trials asked for.
@@ -94,19 +94,19 @@ pub struct Progress {
 }
 
 /// Collects a data set, or goes on with one that was begun with the same arguments; returns at once where it is
-/// finished already ([`Standing::of`] tells). Progress is told from several threads.
+/// finished already ([`CollectionStatus::of`] tells). Progress is told from several threads.
 /// Errors: `Zero`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect(
     config: &CollectConfig,
-    on_progress: &(dyn Fn(Progress) + Sync),
+    on_progress: &(dyn Fn(CollectProgress) + Sync),
     cancelled: &AtomicBool,
 ) -> Result<DatasetInfo, DatasetError> {
     config.validate()?;
-    if let Standing::Finished(info) = Standing::of(config)? {
+    if let CollectionStatus::Finished(info) = CollectionStatus::of(config)? {
         return Ok(*info);
     }
     let mut collection = Collection::begin(config)?;
-    let crew = Crew {
+    let crew = CollectWorkers {
         config,
         info: collection.info().clone(),
         next_shard: AtomicUsize::new(collection.shard_count()),
@@ -139,10 +139,10 @@ pub fn collect(
 }
 
 /// A shard's number and what became of it.
-type Delivery = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
+type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
 
 /// Writes shards as they come, each once those before it are written.
-fn write_in_order(collection: &mut Collection<'_>, deliveries: Receiver<Delivery>) -> Result<(), DatasetError> {
+fn write_in_order(collection: &mut Collection<'_>, deliveries: Receiver<ShardResult>) -> Result<(), DatasetError> {
     let mut early = BTreeMap::new();
     for (shard, episodes) in deliveries {
         early.insert(shard, episodes?);
@@ -154,19 +154,19 @@ fn write_in_order(collection: &mut Collection<'_>, deliveries: Receiver<Delivery
 }
 
 /// What the simulating threads share.
-struct Crew<'a> {
+struct CollectWorkers<'a> {
     config: &'a CollectConfig,
     info: DatasetInfo,
     next_shard: AtomicUsize,
     done: AtomicU64,
-    on_progress: &'a (dyn Fn(Progress) + Sync),
+    on_progress: &'a (dyn Fn(CollectProgress) + Sync),
     cancelled: &'a AtomicBool,
     failed: AtomicBool,
 }
 
-impl Crew<'_> {
+impl CollectWorkers<'_> {
     fn report(&self, trials: u64) {
-        (self.on_progress)(Progress {
+        (self.on_progress)(CollectProgress {
             done: self.done.fetch_add(trials, Ordering::Relaxed) + trials,
             total: self.config.trials,
         });
@@ -177,7 +177,7 @@ impl Crew<'_> {
     }
 
     /// Takes shard after shard until none is left, the collection is stopped or nobody takes the results.
-    fn work(&self, sender: &SyncSender<Delivery>) {
+    fn work(&self, sender: &SyncSender<ShardResult>) {
         loop {
             let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
             if shard >= self.config.shard_count() {

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
 use super::files::{sha256_of_file, write_atomically};
-use super::layout::{ARGUMENTS, INFO, Stamp, shard_path};
+use super::layout::{ARGUMENTS, INFO, CollectionStamp, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
@@ -46,11 +46,11 @@ impl Arguments<'_> {
 
 /// How far the collection in a directory is.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Standing {
+pub enum CollectionStatus {
     /// Nothing is there yet.
     New,
     /// So many trials are there already.
-    Begun {
+    PendingStep {
         /// Trials in finished shards.
         trials: u64,
     },
@@ -58,7 +58,7 @@ pub enum Standing {
     Finished(Box<DatasetInfo>),
 }
 
-impl Standing {
+impl CollectionStatus {
     /// How far the collection of that configuration is; changes nothing.
     /// Errors: `OutExists`, `OtherArguments`, as [`super::collect()`].
     pub fn of(config: &CollectConfig) -> Result<Self, DatasetError> {
@@ -78,11 +78,11 @@ impl Standing {
             });
         }
         if out.join(INFO).exists() {
-            return Ok(Self::Finished(Box::new(Stamp::read(out)?.info())));
+            return Ok(Self::Finished(Box::new(CollectionStamp::read(out)?.info())));
         }
         let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
         let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
-        Ok(Self::Begun { trials })
+        Ok(Self::PendingStep { trials })
     }
 }
 

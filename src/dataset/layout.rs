@@ -58,7 +58,7 @@ pub(super) struct ShardEntry {
 /// What `meta/foreframe.json` holds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Stamp {
+pub(super) struct CollectionStamp {
     pub(super) program_version: String,
     pub(super) name: String,
     pub(super) scenario: Option<String>,
@@ -74,7 +74,7 @@ pub(super) struct Stamp {
     pub(super) shards: Vec<ShardEntry>,
 }
 
-impl Stamp {
+impl CollectionStamp {
     /// Reads and checks the stamp of a finished data set. Errors: `Unfinished`, `NotADataset`, `Corrupt`.
     pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);

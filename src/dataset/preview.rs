@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::files::verify;
-use super::layout::{EPISODES, Stamp};
+use super::layout::{EPISODES, CollectionStamp};
 use super::shard_reader::{ShardSlot, read};
 use super::store::read_episodes;
 use super::{Dataset, DatasetError, DatasetInfo};
@@ -12,18 +12,18 @@ use crate::frame::Frame;
 /// What the finished data set in a directory is, from its description alone.
 /// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
 pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
-    Ok(Stamp::read(directory)?.info())
+    Ok(CollectionStamp::read(directory)?.info())
 }
 
 /// What the data set is whose [`super::STAMP`] of that path holds the text. Errors: `Corrupt`.
 pub fn describe_stamp(path: &Path, text: &[u8]) -> Result<DatasetInfo, DatasetError> {
-    Ok(Stamp::parse(path, text)?.info())
+    Ok(CollectionStamp::parse(path, text)?.info())
 }
 
 impl Dataset {
     /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
     pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {
-        let stamp = Stamp::read(directory)?;
+        let stamp = CollectionStamp::read(directory)?;
         let info = stamp.info();
         let missing = || DatasetError::NoEpisode {
             name: info.name.clone(),

@@ -70,7 +70,7 @@ impl WindowShape {
 
 /// A stretch of one episode that belongs to one split and has no gap in it.
 #[derive(Clone, Debug, PartialEq)]
-struct Run {
+struct EpisodeSegment {
     episode: usize,
     frames: Range<usize>,
 }
@@ -80,7 +80,7 @@ struct Run {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
     episodes: [Vec<usize>; 4],
-    runs: [Vec<Run>; 4],
+    runs: [Vec<EpisodeSegment>; 4],
     /// Timestamps further apart are a gap.
     max_step_s: f64,
 }
@@ -134,7 +134,7 @@ impl Splits {
         let mut start = frames.start;
         for frame in frames.start + 1..=frames.end {
             if frame == frames.end || self.is_gap(dataset, frame) {
-                self.runs[split as usize].push(Run {
+                self.runs[split as usize].push(EpisodeSegment {
                     episode,
                     frames: start..frame,
                 });
@@ -149,7 +149,7 @@ impl Splits {
     }
 
     /// Frames at the start of a run to leave out, because those just before belong to another split.
-    fn guard(&self, dataset: &Dataset, run: &Run, shape: WindowShape) -> usize {
+    fn guard(&self, dataset: &Dataset, run: &EpisodeSegment, shape: WindowShape) -> usize {
         let start = run.frames.start;
         let opens = dataset.episodes()[run.episode].first_frame == start || self.is_gap(dataset, start);
         if opens { 0 } else { shape.frames() }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use arrow_array::{
     ArrayRef, BinaryArray, FixedSizeListArray, Float32Array, Int64Array, RecordBatch, StringArray, StructArray,
 };
-use arrow_schema::{ArrowError, DataType, Field, Fields, Schema, SchemaRef};
+use arrow_schema::{ArrowError, DataType, Field, FieldNames, Schema, SchemaRef};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
 use parquet::errors::ParquetError;
@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use super::check::check_episode;
 use super::layout::{ACTION, COUNTERS, IMAGE, MASK, STATE, TIMESTAMP, huggingface_features};
-use super::stats::FeatureStats;
+use super::stats::ChannelStats;
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::frame::{Frame, codec};
 
@@ -32,7 +32,7 @@ pub(super) struct EpisodeRecord {
     /// The trial's parameters as JSON, where it was simulated.
     pub(super) trial: Option<String>,
     /// Figures of the columns that differ from episode to episode in more than their place.
-    pub(super) stats: BTreeMap<String, FeatureStats>,
+    pub(super) stats: BTreeMap<String, ChannelStats>,
 }
 
 /// An episode ready to be written.
@@ -52,11 +52,11 @@ impl EncodedEpisode {
         let frames = data.timestamps_s.len();
         let timestamps_s: Vec<f32> = data.timestamps_s.iter().map(|&time| time as f32).collect();
         let mut stats = BTreeMap::from([
-            (IMAGE.to_owned(), FeatureStats::of_pixels(&data.pixels, frames)),
+            (IMAGE.to_owned(), ChannelStats::of_pixels(&data.pixels, frames)),
             (TIMESTAMP.to_owned(), rows_stats(&timestamps_s, 1)),
         ]);
         if let Some(masks) = &data.masks {
-            stats.insert(MASK.to_owned(), FeatureStats::of_pixels(masks, frames));
+            stats.insert(MASK.to_owned(), ChannelStats::of_pixels(masks, frames));
         }
         for (key, values, size) in [
             (STATE, &data.states, info.state_channels.len()),
@@ -86,9 +86,9 @@ impl EncodedEpisode {
     }
 }
 
-fn rows_stats(values: &[f32], size: usize) -> FeatureStats {
+fn rows_stats(values: &[f32], size: usize) -> ChannelStats {
     let values: Vec<f64> = values.iter().map(|&value| f64::from(value)).collect();
-    FeatureStats::of_rows(&values, size)
+    ChannelStats::of_rows(&values, size)
 }
 
 fn encode_frames(info: &DatasetInfo, pixels: &[u8]) -> Result<Vec<Vec<u8>>, DatasetError> {
@@ -163,8 +163,8 @@ fn properties() -> WriterProperties {
         .build()
 }
 
-fn image_fields() -> Fields {
-    Fields::from(vec![
+fn image_fields() -> FieldNames {
+    FieldNames::from(vec![
         Field::new("bytes", DataType::Binary, true),
         Field::new("path", DataType::Utf8, true),
     ])

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// One column's figures; one value for each of its components.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct FeatureStats {
+pub(super) struct ChannelStats {
     pub(super) min: Vec<f64>,
     pub(super) max: Vec<f64>,
     pub(super) mean: Vec<f64>,
@@ -13,7 +13,7 @@ pub(super) struct FeatureStats {
     pub(super) count: u64,
 }
 
-impl FeatureStats {
+impl ChannelStats {
     /// Of rows of `size` numbers each, one row a frame.
     pub(super) fn of_rows(rows: &[f64], size: usize) -> Self {
         let count = rows.len() / size.max(1);
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn figures_of_two_components_are_those_of_their_columns() {
-        let stats = FeatureStats::of_rows(&[1.0, 10.0, 3.0, 10.0], 2);
+        let stats = ChannelStats::of_rows(&[1.0, 10.0, 3.0, 10.0], 2);
         assert_eq!(
             (stats.min, stats.max, stats.mean, stats.std, stats.count),
             (vec![1.0, 10.0], vec![3.0, 10.0], vec![2.0, 10.0], vec![1.0, 0.0], 2)
@@ -101,9 +101,9 @@ mod tests {
     #[test]
     fn merged_figures_are_those_of_all_frames() {
         let all: Vec<f64> = (0..30).map(|i| f64::from(i * i % 17)).collect();
-        let parts = [FeatureStats::of_rows(&all[..9], 1), FeatureStats::of_rows(&all[9..], 1)];
-        let merged = FeatureStats::merged(&[&parts[0], &parts[1]]);
-        let whole = FeatureStats::of_rows(&all, 1);
+        let parts = [ChannelStats::of_rows(&all[..9], 1), ChannelStats::of_rows(&all[9..], 1)];
+        let merged = ChannelStats::merged(&[&parts[0], &parts[1]]);
+        let whole = ChannelStats::of_rows(&all, 1);
         assert_eq!(
             (&merged.min, &merged.max, merged.count),
             (&whole.min, &whole.max, whole.count)
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn half_black_and_half_white_pixels_have_mean_and_deviation_one_half() {
-        let stats = FeatureStats::of_pixels(&[0, 255, 255, 0], 1);
+        let stats = ChannelStats::of_pixels(&[0, 255, 255, 0], 1);
         assert_eq!((stats.mean[0], stats.std[0]), (0.5, 0.5));
     }
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::check::{Numbers, check_numbers};
 use super::files::{verify, write_atomically};
-use super::layout::{self, EPISODES, INFO, STAMP, STATS, ShardEntry, Stamp, TASKS};
+use super::layout::{self, EPISODES, INFO, STAMP, STATS, ShardEntry, CollectionStamp, TASKS};
 use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};
@@ -18,7 +18,7 @@ impl Dataset {
     /// Reads a data set whole, after checking that every file is the one that was written.
     /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, numbers that aren't finite.
     pub fn open(directory: &Path) -> Result<Self, DatasetError> {
-        let stamp = Stamp::read(directory)?;
+        let stamp = CollectionStamp::read(directory)?;
         let info = stamp.info();
         let path = directory.join(EPISODES);
         verify(&path, &stamp.episodes_sha256)?;
@@ -171,7 +171,7 @@ pub(super) fn complete(
     Ok(info)
 }
 
-fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> Stamp {
+fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> CollectionStamp {
     let entries: Vec<_> = shards
         .iter()
         .enumerate()
@@ -182,7 +182,7 @@ fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -
             frames: finished.frames(),
         })
         .collect();
-    Stamp {
+    CollectionStamp {
         program_version: env!("CARGO_PKG_VERSION").to_owned(),
         name: info.name,
         scenario: info.scenario,

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 
 use super::layout::{COUNTERS, IMAGE, MASK, shard_place};
 use super::shard::EpisodeRecord;
-use super::stats::FeatureStats;
+use super::stats::ChannelStats;
 
 /// An episode in its place: its record and where its frames lie.
 pub(super) struct EpisodeRow<'a> {
@@ -25,12 +25,12 @@ pub(super) struct EpisodeRow<'a> {
 
 impl EpisodeRow<'_> {
     /// The figures of every column; those of the counters follow from the place.
-    fn stats(&self, episode: usize) -> BTreeMap<String, FeatureStats> {
+    fn stats(&self, episode: usize) -> BTreeMap<String, ChannelStats> {
         let mut stats = self.record.stats.clone();
         let starts = [(0, 1), (episode, 0), (self.first_frame, 1), (0, 0)];
         for (key, (first, step)) in COUNTERS.iter().zip(starts) {
             let values: Vec<f64> = (0..self.record.frames).map(|i| (first + step * i) as f64).collect();
-            stats.insert((*key).to_owned(), FeatureStats::of_rows(&values, 1));
+            stats.insert((*key).to_owned(), ChannelStats::of_rows(&values, 1));
         }
         stats
     }
@@ -115,9 +115,9 @@ fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {
 }
 
 /// A figure's name and where it is found.
-type Figure = (&'static str, fn(&FeatureStats) -> &Vec<f64>);
+type StatColumn = (&'static str, fn(&ChannelStats) -> &Vec<f64>);
 
-const FIGURES: [Figure; 4] = [
+const FIGURES: [StatColumn; 4] = [
     ("min", |stats| &stats.min),
     ("max", |stats| &stats.max),
     ("mean", |stats| &stats.mean),
@@ -157,7 +157,7 @@ pub(super) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
     let mut features = serde_json::Map::new();
     for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
         let parts: Vec<_> = all.iter().filter_map(|stats| stats.get(key)).collect();
-        let merged = FeatureStats::merged(&parts);
+        let merged = ChannelStats::merged(&parts);
         let mut figures = serde_json::Map::new();
         for (figure, values) in FIGURES {
             let values = values(&merged);

@@ -4,10 +4,10 @@ use rand::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::bootstrap::{Bootstrap, Interval, Trials};
-use super::inference::{self, Told};
-use super::metrics::Curve;
-use super::{EvaluationError, Stage, Watched};
+use super::bootstrap::{Bootstrap, Interval, TrialSums};
+use super::inference::{self, ActionSource};
+use super::metrics::StepCurve;
+use super::{EvaluationError, EvaluationStage, EvaluationContext};
 use crate::dataset::{Dataset, Window};
 use crate::frame::preprocess::scale;
 use crate::frame::quality;
@@ -47,7 +47,7 @@ pub struct ActionRow {
     /// What the model was told.
     pub variant: Variant,
     /// Mean squared error per pixel.
-    pub mse: Curve,
+    pub mse: StepCurve,
     /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
     pub interval: Option<Interval>,
     /// 1 − MSE(true) / MSE(this): by how much the true actions lower the error.
@@ -88,7 +88,7 @@ pub fn compare(
     twin: Option<&LoadedModel>,
     dataset: &Dataset,
     windows: &[Window],
-    watched: &Watched,
+    watched: &EvaluationContext,
 ) -> Result<Vec<VariantErrors>, EvaluationError> {
     let donors: Vec<Window> = shuffle(windows.len(), watched.bootstrap.seed)
         .into_iter()
@@ -106,12 +106,12 @@ pub fn compare(
         let mut errors = Vec::with_capacity(windows.len());
         for (batch, donors) in windows.chunks(watched.batch).zip(donors.chunks(watched.batch)) {
             let told = match variant {
-                Variant::Shuffled => Told::Instead(donors),
-                Variant::Zeroed => Told::Zero,
-                Variant::True | Variant::UnconditionedTwin => Told::Truth,
+                Variant::Shuffled => ActionSource::Instead(donors),
+                Variant::Zeroed => ActionSource::Zero,
+                Variant::True | Variant::UnconditionedTwin => ActionSource::TargetFrame,
             };
             errors.extend(errors_of(model, dataset, batch, told)?);
-            watched.tell(Stage::Actions, all.len() * windows.len() + errors.len(), total)?;
+            watched.tell(EvaluationStage::Actions, all.len() * windows.len() + errors.len(), total)?;
         }
         all.push((variant, errors));
     }
@@ -122,7 +122,7 @@ fn errors_of(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
-    told: Told,
+    told: ActionSource,
 ) -> Result<Vec<Vec<f64>>, EvaluationError> {
     let spec = loaded.model.spec();
     let predicted = inference::predict(loaded, dataset, windows, told)?;
@@ -141,12 +141,12 @@ fn errors_of(
 /// The table of these errors per variant, window and step; the true actions come first.
 #[must_use]
 pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
-    let curves: Vec<Curve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
+    let curves: Vec<StepCurve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
     let of_window = |window: usize| -> Vec<f64> {
-        let mean = |(_, windows): &VariantErrors| Curve::new(windows[window].clone()).mean;
+        let mean = |(_, windows): &VariantErrors| StepCurve::new(windows[window].clone()).mean;
         errors.iter().map(mean).collect()
     };
-    let trials = Trials::group(trial_of, (0..trial_of.len()).map(of_window));
+    let trials = TrialSums::group(trial_of, (0..trial_of.len()).map(of_window));
     let reduction = |means: &[f64], row: usize| {
         if means[row] > 0.0 {
             1.0 - means[0] / means[row]
@@ -179,14 +179,14 @@ pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap
     }
 }
 
-fn mean_over(windows: &[Vec<f64>]) -> Curve {
+fn mean_over(windows: &[Vec<f64>]) -> StepCurve {
     let mut sums = vec![0.0; windows.first().map_or(0, Vec::len)];
     for window in windows {
         for (sum, value) in sums.iter_mut().zip(window) {
             *sum += value;
         }
     }
-    Curve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
+    StepCurve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
 }
 
 /// "Works" only where true beats shuffled, zeroed and twin with intervals apart.

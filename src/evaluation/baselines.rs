@@ -63,7 +63,7 @@ impl Method {
 
 /// What a baseline may look at: intensities 0…1 in the camera's space.
 #[derive(Clone, Copy, Debug)]
-pub struct Seen<'a> {
+pub struct BaselineInput<'a> {
     /// The input frames, oldest first; at least one.
     pub inputs: &'a [Vec<f32>],
     /// The mean frame of the training split.
@@ -75,7 +75,7 @@ pub struct Seen<'a> {
 /// The frames 1…`horizon` steps ahead as a baseline predicts them; none for [`Method::Model`] and
 /// [`Method::CodecOnly`], which need a model.
 #[must_use]
-pub fn predict(method: Method, seen: &Seen, horizon: usize) -> Vec<Vec<f32>> {
+pub fn predict(method: Method, seen: &BaselineInput, horizon: usize) -> Vec<Vec<f32>> {
     let Some(last) = seen.inputs.last() else {
         return Vec::new();
     };
@@ -127,7 +127,7 @@ fn extrapolate(frames: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
         .collect()
 }
 
-fn move_on(seen: &Seen, last: &[f32], horizon: usize) -> Vec<Vec<f32>> {
+fn move_on(seen: &BaselineInput, last: &[f32], horizon: usize) -> Vec<Vec<f32>> {
     let before = seen.inputs.iter().rev().nth(1);
     let shift = before.map(|before| phase_correlation(before, last, seen.width));
     (1..=horizon)
@@ -153,8 +153,8 @@ mod tests {
     use crate::frame::quality::mse;
     use crate::types::Seed;
 
-    fn seen<'a>(inputs: &'a [Vec<f32>], training_mean: &'a [f32], width: usize) -> Seen<'a> {
-        Seen {
+    fn seen<'a>(inputs: &'a [Vec<f32>], training_mean: &'a [f32], width: usize) -> BaselineInput<'a> {
+        BaselineInput {
             inputs,
             training_mean,
             width,

@@ -36,12 +36,12 @@ pub struct Bootstrap {
 
 /// Values per window, summed up by trial: all that resampling of trials needs.
 #[derive(Clone, Debug)]
-pub struct Trials {
+pub struct TrialSums {
     windows: Vec<f64>,
     sums: Vec<Vec<f64>>,
 }
 
-impl Trials {
+impl TrialSums {
     /// Groups windows by their trial. `values` holds one row of equal length for every window, in the order of `trial_of`.
     pub fn group<R: AsRef<[f64]>>(trial_of: &[usize], values: impl Iterator<Item = R>) -> Self {
         let mut known: Vec<usize> = trial_of.to_vec();
@@ -144,7 +144,7 @@ mod tests {
                     samples: 300,
                     seed: Seed(round),
                 };
-                let trials = Trials::group(&trial_of, rows.iter());
+                let trials = TrialSums::group(&trial_of, rows.iter());
                 let interval = trials.intervals(&bootstrap, means_only).unwrap()[0];
                 (interval.low..=interval.high).contains(&2.0)
             })
@@ -159,9 +159,9 @@ mod tests {
             samples: 500,
             seed: Seed(1),
         };
-        let once = Trials::group(&[0, 1, 2, 3], values.iter().map(|&v| [v]));
+        let once = TrialSums::group(&[0, 1, 2, 3], values.iter().map(|&v| [v]));
         let trial_of: Vec<usize> = (0..400).map(|i| i / 100).collect();
-        let often = Trials::group(&trial_of, trial_of.iter().map(|&trial| [values[trial]]));
+        let often = TrialSums::group(&trial_of, trial_of.iter().map(|&trial| [values[trial]]));
         assert_eq!(
             once.intervals(&bootstrap, means_only),
             often.intervals(&bootstrap, means_only)
@@ -171,13 +171,13 @@ mod tests {
     #[test]
     fn the_seed_decides_and_one_trial_has_no_interval() {
         let trial_of: Vec<usize> = (0..60).map(|i| i / 2).collect();
-        let trials = Trials::group(&trial_of, (0..60).map(|i| [f64::from(i).sin()]));
+        let trials = TrialSums::group(&trial_of, (0..60).map(|i| [f64::from(i).sin()]));
         let with = |seed| trials.intervals(&Bootstrap { samples: 50, seed }, means_only);
         assert_eq!(with(Seed(1)), with(Seed(1)));
         assert_ne!(with(Seed(1)), with(Seed(2)));
-        let uneven = Trials::group(&[4, 9, 9, 2], [[1.0], [2.0], [4.0], [8.0]].iter());
+        let uneven = TrialSums::group(&[4, 9, 9, 2], [[1.0], [2.0], [4.0], [8.0]].iter());
         assert_eq!(uneven.means(), [3.75]);
-        let alone = Trials::group(&[4, 4], [[1.0], [2.0]].iter());
+        let alone = TrialSums::group(&[4, 4], [[1.0], [2.0]].iter());
         let bootstrap = Bootstrap {
             samples: 50,
             seed: Seed(1),

@@ -10,7 +10,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use self::animation::Animation;
-use self::montage::{Row, Style};
+use self::montage::{MontageRow, Style};
 use super::EvaluationError;
 use super::baselines::Method;
 use super::output::save;
@@ -27,7 +27,7 @@ pub struct FigureFile {
 
 /// One window in pictures, as the camera would see them.
 #[derive(Clone, Debug, Default)]
-pub struct Sample {
+pub struct SampleFigure {
     /// Goes into the files' names.
     pub name: String,
     /// What window it is; empty for none.
@@ -57,7 +57,7 @@ pub struct Chart {
 #[derive(Clone, Debug, Default)]
 pub struct FigureInputs {
     /// Windows; each gives a panel of reconstruction and one of prediction.
-    pub samples: Vec<Sample>,
+    pub samples: Vec<SampleFigure>,
     /// Charts.
     pub charts: Vec<Chart>,
     /// The animation, if any.
@@ -106,16 +106,16 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
 }
 
 /// The paper's figure 8: predicted frames above the true ones (where known), the inputs below.
-pub fn prediction_panel(sample: &Sample) -> Result<Frame, FrameError> {
+pub fn prediction_panel(sample: &SampleFigure) -> Result<Frame, FrameError> {
     montage::prediction_panel(&sample.note, &sample.inputs, &sample.predicted, &sample.truth)
 }
 
 /// The paper's figures 6 and 7: the frames seen above their reconstruction.
-pub fn reconstruction_panel(sample: &Sample) -> Result<Frame, FrameError> {
+pub fn reconstruction_panel(sample: &SampleFigure) -> Result<Frame, FrameError> {
     let first = 1 - sample.inputs.len() as i64;
     let rows = [
-        Row::in_time("ground truth of the inputs", &sample.inputs, first),
-        Row::in_time("reconstructed by the LSTM", &sample.reconstructed, first),
+        MontageRow::in_time("ground truth of the inputs", &sample.inputs, first),
+        MontageRow::in_time("reconstructed by the LSTM", &sample.reconstructed, first),
     ];
     let width = sample.inputs.first().map_or(1, Frame::width);
     montage::montage(&sample.note, &rows, &Style::for_frames_of(width))

@@ -7,14 +7,14 @@ use super::EvaluationError;
 use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
 use crate::frame::preprocess::Preprocess;
-use crate::nn::{Condition, ModelSpec};
+use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
 
 /// Which actions the model is told.
 #[derive(Clone, Copy, Debug)]
-pub enum Told<'a> {
+pub enum ActionSource<'a> {
     /// Those that were taken.
-    Truth,
+    TargetFrame,
     /// For each window, in the order of the batch, those taken in another one.
     Instead(&'a [Window]),
     /// Zero in every component, in the channels' own units.
@@ -40,7 +40,7 @@ pub fn predict(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
-    told: Told,
+    told: ActionSource,
 ) -> Result<Vec<f32>, EvaluationError> {
     let spec = loaded.model.spec();
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
@@ -67,7 +67,7 @@ pub fn predict_with_ceiling(
     windows: &[Window],
 ) -> Result<Predicted, EvaluationError> {
     let spec = loaded.model.spec();
-    let frames = predict(loaded, dataset, windows, Told::Truth)?;
+    let frames = predict(loaded, dataset, windows, ActionSource::TargetFrame)?;
     let truth = model_space(
         dataset,
         spec.preprocess,
@@ -131,10 +131,10 @@ fn condition(
     spec: &ModelSpec,
     dataset: &Dataset,
     windows: &[Window],
-    told: Told,
-) -> Result<Condition, EvaluationError> {
+    told: ActionSource,
+) -> Result<ConditioningTensors, EvaluationError> {
     let batch = windows.len();
-    let mut condition = Condition::none();
+    let mut condition = ConditioningTensors::none();
     if let Some(count) = spec.action_inputs() {
         let taken = |windows: &[Window]| -> Vec<f32> {
             let frames = windows.iter().flat_map(|window| {
@@ -144,9 +144,9 @@ fn condition(
             frames.flat_map(|frame| dataset.action(frame).iter().copied()).collect()
         };
         let actions = match told {
-            Told::Truth => taken(windows),
-            Told::Instead(others) => taken(others),
-            Told::Zero => vec![0.0; batch * spec.horizon * count],
+            ActionSource::TargetFrame => taken(windows),
+            ActionSource::Instead(others) => taken(others),
+            ActionSource::Zero => vec![0.0; batch * spec.horizon * count],
         };
         condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);
     }

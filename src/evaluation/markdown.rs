@@ -5,20 +5,20 @@ use std::fmt::Write;
 use super::actions::ActionTable;
 use super::baselines::Method;
 use super::bootstrap::{CONFIDENCE, Interval};
-use super::metrics::{Curve, MethodScores, PSNR_CAP_DB};
-use super::report::{ModelSummary, Outcome, Report, SetReport, SetScores, Stamp};
+use super::metrics::{StepCurve, MethodScores, PSNR_CAP_DB};
+use super::report::{ModelSummary, SetOutcome, EvaluationReport, SetReport, SetScores, ReportStamp};
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
 
-pub(super) fn render(report: &Report) -> String {
+pub(super) fn render(report: &EvaluationReport) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
     let _ = write_report(&mut text, report);
     text
 }
 
-fn write_report(out: &mut String, report: &Report) -> std::fmt::Result {
+fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     writeln!(
         out,
         "# Model `{}` on data set `{}`\n",
@@ -44,7 +44,7 @@ fn title(split: &str) -> &'static str {
     }
 }
 
-fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
+fn headline(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     writeln!(
         out,
         "Skill is 1 − MSE / MSE of the best trivial baseline at each step: 1 is perfect, 0 no better than the best of them.\n"
@@ -58,12 +58,12 @@ fn headline(out: &mut String, report: &Report) -> std::fmt::Result {
     for SetReport { split, outcome } in &report.sets {
         write!(out, "| {} (`{split}`) | ", title(split))?;
         match outcome {
-            Outcome::Scored(scores) => {
+            SetOutcome::Scored(scores) => {
                 let interval = interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}"));
                 let (windows, trials, skill) = (scores.windows, scores.trials, scores.skill.skill.mean);
                 writeln!(out, "{windows} | {trials} | **{skill:.3}** | {interval} |")?;
             }
-            Outcome::Skipped { reason } => writeln!(out, "– | – | skipped: {reason} | – |")?,
+            SetOutcome::Skipped { reason } => writeln!(out, "– | – | skipped: {reason} | – |")?,
         }
     }
     Ok(())
@@ -167,7 +167,7 @@ fn table<'a>(
     out: &mut String,
     name: &str,
     methods: &'a [MethodScores],
-    curve: impl Fn(&'a MethodScores) -> Option<&'a Curve>,
+    curve: impl Fn(&'a MethodScores) -> Option<&'a StepCurve>,
     format: impl Fn(f64) -> String,
 ) -> std::fmt::Result {
     let steps = methods.first().map_or(0, |method| method.mse.per_step.len());
@@ -183,7 +183,7 @@ fn table<'a>(
     writeln!(out)
 }
 
-fn row(out: &mut String, label: &str, curve: &Curve, format: impl Fn(f64) -> String) -> std::fmt::Result {
+fn row(out: &mut String, label: &str, curve: &StepCurve, format: impl Fn(f64) -> String) -> std::fmt::Result {
     write!(out, "| {label} |")?;
     for &value in curve.per_step.iter().chain([&curve.mean]) {
         write!(out, " {} |", format(value))?;
@@ -220,7 +220,7 @@ fn action_table(out: &mut String, table: &ActionTable) -> std::fmt::Result {
     Ok(())
 }
 
-fn figures(out: &mut String, report: &Report) -> std::fmt::Result {
+fn figures(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     if report.figures.is_empty() {
         return Ok(());
     }
@@ -289,7 +289,7 @@ fn grouped(number: u64) -> String {
     text
 }
 
-fn stamp(out: &mut String, stamp: &Stamp) -> std::fmt::Result {
+fn stamp(out: &mut String, stamp: &ReportStamp) -> std::fmt::Result {
     let commit = stamp.program.git_commit.as_deref().unwrap_or("unknown");
     writeln!(out, "\n## Stamp\n")?;
     writeln!(out, "| | |\n| --- | --- |")?;

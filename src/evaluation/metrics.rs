@@ -26,7 +26,7 @@ pub struct FrameScore {
 
 /// A true frame and whose its pixels are.
 #[derive(Clone, Copy, Debug)]
-pub struct Truth<'a> {
+pub struct TargetFrame<'a> {
     /// Intensities 0…1.
     pub pixels: &'a [f32],
     /// 0 where the scene is, other values where a mover is; absent for recordings.
@@ -38,7 +38,7 @@ pub struct Truth<'a> {
 impl FrameScore {
     /// Compares a predicted frame with the true one.
     #[must_use]
-    pub fn of(predicted: &[f32], truth: &Truth) -> Self {
+    pub fn of(predicted: &[f32], truth: &TargetFrame) -> Self {
         let mse = quality::mse(predicted, truth.pixels);
         let mut score = Self {
             mse,
@@ -58,14 +58,14 @@ impl FrameScore {
 
 /// A value for each step ahead and their mean.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Curve {
+pub struct StepCurve {
     /// At t+1, t+2, …
     pub per_step: Vec<f64>,
     /// Mean over the steps.
     pub mean: f64,
 }
 
-impl Curve {
+impl StepCurve {
     /// A curve of these values.
     #[must_use]
     pub fn new(per_step: Vec<f64>) -> Self {
@@ -104,13 +104,13 @@ pub struct MethodScores {
     /// Who predicted.
     pub method: Method,
     /// Mean squared error per pixel.
-    pub mse: Curve,
+    pub mse: StepCurve,
     /// Peak signal-to-noise ratio in dB: mean over frames of each frame's own.
-    pub psnr_db: Curve,
+    pub psnr_db: StepCurve,
     /// Structural similarity: mean over frames.
-    pub ssim: Curve,
+    pub ssim: StepCurve,
     /// Mean squared error over all pixels of movers; absent where the data has no masks or nobody moved in view.
-    pub mover_mse: Option<Curve>,
+    pub mover_mse: Option<StepCurve>,
 }
 
 /// The tables' rows from the windows' scores.
@@ -133,12 +133,12 @@ fn steps(windows: &[WindowScores], row: usize) -> usize {
     windows.first().map_or(0, |window| window.frames[row].len())
 }
 
-fn mean_curve(windows: &[WindowScores], row: usize, value: impl Fn(&FrameScore) -> f64) -> Curve {
+fn mean_curve(windows: &[WindowScores], row: usize, value: impl Fn(&FrameScore) -> f64) -> StepCurve {
     let mean_at = |step: usize| windows.iter().map(|w| value(&w.frames[row][step])).sum::<f64>() / windows.len() as f64;
-    Curve::new((0..steps(windows, row)).map(mean_at).collect())
+    StepCurve::new((0..steps(windows, row)).map(mean_at).collect())
 }
 
-fn mover_curve(windows: &[WindowScores], row: usize) -> Option<Curve> {
+fn mover_curve(windows: &[WindowScores], row: usize) -> Option<StepCurve> {
     (0..steps(windows, row))
         .map(|step| {
             let scores = windows.iter().map(|window| &window.frames[row][step]);
@@ -147,7 +147,7 @@ fn mover_curve(windows: &[WindowScores], row: usize) -> Option<Curve> {
         })
         .collect::<Option<Vec<f64>>>()
         .filter(|values| !values.is_empty())
-        .map(Curve::new)
+        .map(StepCurve::new)
 }
 
 #[cfg(test)]
@@ -157,7 +157,7 @@ mod tests {
     #[test]
     fn a_frame_without_error_has_the_cap_and_full_similarity() {
         let pixels = vec![0.5; 64];
-        let truth = Truth {
+        let truth = TargetFrame {
             pixels: &pixels,
             mask: None,
             width: 8,
@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn only_the_movers_pixels_count_inside_the_mask() {
-        let truth = Truth {
+        let truth = TargetFrame {
             pixels: &[0.0, 0.0, 0.0, 0.0],
             mask: Some(&[0, 1, 2, 0]),
             width: 2,

@@ -1,4 +1,4 @@
-//! What an evaluation found: `report.json` as it is, `report.md` by [`Report::to_markdown`].
+//! What an evaluation found: `report.json` as it is, `report.md` by [`EvaluationReport::to_markdown`].
 
 use std::time::Duration;
 
@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
-use super::bootstrap::{Bootstrap, Trials};
+use super::bootstrap::{Bootstrap, TrialSums};
 use super::figures::FigureFile;
-use super::metrics::{Curve, MethodScores, WindowScores, summarize};
+use super::metrics::{StepCurve, MethodScores, WindowScores, summarize};
 use super::skill::{Skill, skill};
 use super::{EvaluateConfig, markdown};
 use crate::dataset::Dataset;
@@ -17,9 +17,9 @@ use crate::types::Seed;
 
 /// All that an evaluation found, and how to find it again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct EvaluationReport {
     /// What was tested, with what, where.
-    pub stamp: Stamp,
+    pub stamp: ReportStamp,
     /// The model's sizes.
     pub model: ModelSummary,
     /// Both test sets.
@@ -28,7 +28,7 @@ pub struct Report {
     pub figures: Vec<FigureFile>,
 }
 
-impl Report {
+impl EvaluationReport {
     /// The report as Markdown, with its figures in the same directory.
     #[must_use]
     pub fn to_markdown(&self) -> String {
@@ -67,7 +67,7 @@ impl Report {
 
 /// What was tested, with what, where.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Stamp {
+pub struct ReportStamp {
     /// The data set's name.
     pub dataset: String,
     /// SHA-256 of its content.
@@ -98,7 +98,7 @@ pub struct Stamp {
     pub threads: usize,
 }
 
-impl Stamp {
+impl ReportStamp {
     pub(super) fn new(
         loaded: &LoadedModel,
         dataset: &Dataset,
@@ -186,13 +186,13 @@ pub struct SetReport {
     pub split: String,
     /// Its scores, or why there are none.
     #[serde(flatten)]
-    pub outcome: Outcome,
+    pub outcome: SetOutcome,
 }
 
 /// A test set's scores, or why there are none.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "status", rename_all = "kebab-case")]
-pub enum Outcome {
+pub enum SetOutcome {
     /// It was tested.
     Scored(Box<SetScores>),
     /// It is empty.
@@ -202,7 +202,7 @@ pub enum Outcome {
     },
 }
 
-impl Outcome {
+impl SetOutcome {
     /// The scores, unless it was skipped.
     #[must_use]
     pub fn scores(&self) -> Option<&SetScores> {
@@ -228,9 +228,9 @@ pub struct SetScores {
     pub methods: Vec<MethodScores>,
     /// Mean squared error of the model in its own space (smoothed, inverted where it inverts): not comparable between
     /// models that preprocess differently.
-    pub model_space_mse: Curve,
+    pub model_space_mse: StepCurve,
     /// Mean squared error of the reconstruction of the frames seen, the oldest first.
-    pub reconstruction_mse: Curve,
+    pub reconstruction_mse: StepCurve,
     /// Does the action matter? Absent for a model that takes none.
     pub actions: Option<ActionTable>,
     /// The windows that the figures show.
@@ -245,7 +245,7 @@ impl SetScores {
         bootstrap: &Bootstrap,
     ) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
-        let by_trial = |of: fn(&WindowScores) -> &[f64]| Trials::group(&trial_of, windows.iter().map(of));
+        let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
         let own_space = by_trial(|window| &window.model_space_mse);
         Self {
             windows: windows.len(),
@@ -253,8 +253,8 @@ impl SetScores {
             trials: own_space.count(),
             skill: skill(windows, bootstrap),
             methods: summarize(windows),
-            model_space_mse: Curve::new(own_space.means()),
-            reconstruction_mse: Curve::new(by_trial(|window| &window.reconstruction_mse).means()),
+            model_space_mse: StepCurve::new(own_space.means()),
+            reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
             actions,
             samples: SampleWindow::choose(windows),
         }

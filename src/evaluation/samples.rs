@@ -2,10 +2,10 @@
 
 use super::EvaluationError;
 use super::baselines::Method;
-use super::figures::animation::{Animation, Moment};
-use super::figures::{Chart, FigureInputs, Sample};
-use super::inference::{Told, predict, reconstruct};
-use super::report::{Report, SampleWindow, SetScores};
+use super::figures::animation::{Animation, AnimationFrame};
+use super::figures::{Chart, FigureInputs, SampleFigure};
+use super::inference::{ActionSource, predict, reconstruct};
+use super::report::{EvaluationReport, SampleWindow, SetScores};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
@@ -19,7 +19,7 @@ const MAX_MOMENTS: usize = 80;
 pub fn figure_inputs(
     loaded: &LoadedModel,
     dataset: &Dataset,
-    report: &Report,
+    report: &EvaluationReport,
 ) -> Result<FigureInputs, EvaluationError> {
     let mut inputs = FigureInputs::default();
     for split in [Split::Test, Split::TestUnseen] {
@@ -37,14 +37,14 @@ pub fn figure_inputs(
     Ok(inputs)
 }
 
-fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Result<Sample, EvaluationError> {
+fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Result<SampleFigure, EvaluationError> {
     let spec = loaded.model.spec();
     let window = [Window {
         episode: sample.episode,
         first_frame: sample.first_frame,
     }];
     let seen = sample.first_frame..sample.first_frame + spec.context;
-    Ok(Sample {
+    Ok(SampleFigure {
         name: sample.rank.clone(),
         note: format!(
             "{} window of {} by error: MSE {:.1}e-4",
@@ -53,7 +53,7 @@ fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Resul
             sample.mse * 1e4
         ),
         reconstructed: frames(loaded, &reconstruct(loaded, dataset, &window)?)?,
-        predicted: frames(loaded, &predict(loaded, dataset, &window, Told::Truth)?)?,
+        predicted: frames(loaded, &predict(loaded, dataset, &window, ActionSource::TargetFrame)?)?,
         truth: camera_frames(dataset, seen.end..seen.end + spec.horizon)?,
         inputs: camera_frames(dataset, seen)?,
     })
@@ -98,7 +98,7 @@ fn chart(split: Split, scores: &SetScores) -> Chart {
 fn animate(
     loaded: &LoadedModel,
     dataset: &Dataset,
-    (report, split): (&Report, Split),
+    (report, split): (&EvaluationReport, Split),
     scores: &SetScores,
 ) -> Result<Option<Animation>, EvaluationError> {
     let spec = loaded.model.spec();
@@ -113,7 +113,7 @@ fn animate(
     let mut windows = splits.windows(dataset, split, shape, 1)?;
     windows.retain(|window| window.episode == median.episode);
     windows.truncate(MAX_MOMENTS);
-    let predicted = frames(loaded, &predict(loaded, dataset, &windows, Told::Truth)?)?;
+    let predicted = frames(loaded, &predict(loaded, dataset, &windows, ActionSource::TargetFrame)?)?;
     let last_steps = predicted.into_iter().skip(spec.horizon - 1).step_by(spec.horizon);
     let moments = windows.iter().zip(last_steps).map(|(window, predicted)| {
         let now = window.first_frame + spec.context - 1;
@@ -124,7 +124,7 @@ fn animate(
             value: 0,
             least: 1,
         })?;
-        Ok(Moment {
+        Ok(AnimationFrame {
             truth,
             predicted,
             copied,

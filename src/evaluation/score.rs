@@ -2,10 +2,10 @@
 
 use rayon::prelude::*;
 
-use super::baselines::{self, Method, Seen};
+use super::baselines::{self, Method, BaselineInput};
 use super::inference::{Predicted, predict_with_ceiling};
-use super::metrics::{FrameScore, Truth, WindowScores};
-use super::{EvaluationError, Stage, Watched};
+use super::metrics::{FrameScore, TargetFrame, WindowScores};
+use super::{EvaluationError, EvaluationStage, EvaluationContext};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
 use crate::frame::preprocess::scale;
@@ -43,7 +43,7 @@ pub fn score(
     dataset: &Dataset,
     windows: &[Window],
     training_mean: &[f32],
-    watched: &Watched,
+    watched: &EvaluationContext,
 ) -> Result<Vec<WindowScores>, EvaluationError> {
     let spec = loaded.model.spec();
     let mut scores = Vec::with_capacity(windows.len());
@@ -54,7 +54,7 @@ pub fn score(
             .enumerate()
             .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, training_mean));
         scores.par_extend(scored);
-        watched.tell(Stage::Scores, scores.len(), windows.len())?;
+        watched.tell(EvaluationStage::Scores, scores.len(), windows.len())?;
     }
     Ok(scores)
 }
@@ -76,7 +76,7 @@ fn score_window(
     let frame = |step: usize| scale(dataset.pixels(window.first_frame + step));
     let inputs: Vec<Vec<f32>> = (0..spec.context).map(frame).collect();
     let truth: Vec<Vec<f32>> = (spec.context..spec.context + horizon).map(frame).collect();
-    let seen = Seen {
+    let seen = BaselineInput {
         inputs: &inputs,
         training_mean,
         width,
@@ -92,7 +92,7 @@ fn score_window(
             let compared = guesses.iter().zip(&truth).enumerate();
             let score = compared.map(|(step, (guess, pixels))| {
                 let mask = dataset.mask(window.first_frame + spec.context + step);
-                FrameScore::of(guess, &Truth { pixels, mask, width })
+                FrameScore::of(guess, &TargetFrame { pixels, mask, width })
             });
             score.collect()
         })

@@ -3,15 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use super::baselines::Method;
-use super::bootstrap::{Bootstrap, Interval, Trials};
-use super::metrics::{Curve, WindowScores};
+use super::bootstrap::{Bootstrap, Interval, TrialSums};
+use super::metrics::{StepCurve, WindowScores};
 
 /// skill = 1 − MSE / MSE(best trivial baseline): 1 is perfect, 0 is no better than the best of them, and below 0 is worse.
 /// The best baseline is chosen anew at each step ahead (and in each resample), so the model meets the hardest there is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Skill {
     /// At each step ahead, and their mean.
-    pub skill: Curve,
+    pub skill: StepCurve,
     /// 95 % bootstrap interval at each step; empty with fewer than two trials.
     pub per_step_interval: Vec<Interval>,
     /// 95 % bootstrap interval of the mean; absent with fewer than two trials.
@@ -24,18 +24,18 @@ pub struct Skill {
 #[must_use]
 pub fn skill(windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
     let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
-    let trials = Trials::group(&trial_of, windows.iter().map(errors_by_row));
+    let trials = TrialSums::group(&trial_of, windows.iter().map(errors_by_row));
     let means = trials.means();
     let mut intervals = trials
         .intervals(bootstrap, |means| {
             let per_step = skills(means);
-            let mean = Curve::new(per_step.clone()).mean;
+            let mean = StepCurve::new(per_step.clone()).mean;
             per_step.into_iter().chain([mean]).collect()
         })
         .unwrap_or_default();
     let mean_interval = intervals.pop();
     Skill {
-        skill: Curve::new(skills(&means)),
+        skill: StepCurve::new(skills(&means)),
         per_step_interval: intervals,
         mean_interval,
         best_baseline: (0..step_count(&means)).map(|step| best(&means, step).0).collect(),
@@ -118,7 +118,7 @@ mod tests {
     #[test]
     fn a_perfect_model_has_skill_1() {
         let skill = skill(&windows(|_| 0.0), &BOOTSTRAP);
-        assert_eq!(skill.skill, Curve::new(vec![1.0; 2]));
+        assert_eq!(skill.skill, StepCurve::new(vec![1.0; 2]));
         assert_eq!(skill.mean_interval, Some(Interval { low: 1.0, high: 1.0 }));
         assert_eq!(skill.best_baseline, [Method::CopyLast; 2]);
     }

@@ -3,7 +3,7 @@
 use tracing::warn;
 
 use crate::store::{Objects, StoreError};
-use crate::training::{CHECKPOINT_FILE, Reached};
+use crate::training::{CHECKPOINT_FILE, CheckpointPosition};
 use crate::wording;
 
 /// Fetches the run's last checkpoint, unless the data directory has it or a later one: pushing that may have failed.
@@ -13,9 +13,9 @@ pub(super) async fn recall(objects: &Objects, run: &str) -> Result<(), StoreErro
         return Ok(());
     }
     let path = format!("{run}/{CHECKPOINT_FILE}");
-    let kept = objects.read(&path).await?.and_then(|bytes| Reached::of(&bytes));
+    let kept = objects.read(&path).await?.and_then(|bytes| CheckpointPosition::of(&bytes));
     let here = std::fs::read(objects.data_dir().join(path)).ok();
-    if kept > here.and_then(|bytes| Reached::of(&bytes)) {
+    if kept > here.and_then(|bytes| CheckpointPosition::of(&bytes)) {
         objects.pull(run, CHECKPOINT_FILE).await?;
     }
     Ok(())
@@ -23,11 +23,11 @@ pub(super) async fn recall(objects: &Objects, run: &str) -> Result<(), StoreErro
 
 /// Whether a run's checkpoints are kept where the other objects are.
 #[derive(Default)]
-pub(super) struct Keeping {
+pub(super) struct CheckpointSync {
     has_failed: bool,
 }
 
-impl Keeping {
+impl CheckpointSync {
     /// Notes how keeping one went; gives a line for the job's log when that is not as it was.
     pub(super) fn note(&mut self, kept: Result<(), StoreError>) -> Option<String> {
         let reason = kept.err().map(|error| wording::sentence(&error));
@@ -73,7 +73,7 @@ mod tests {
         let recalled = async || {
             recall(store.objects(), RUN).await.unwrap();
             let bytes = std::fs::read(dir.path().join(RUN).join(CHECKPOINT_FILE)).ok()?;
-            Reached::of(&bytes).map(|reached| (reached.stage.to_string(), reached.step))
+            CheckpointPosition::of(&bytes).map(|reached| (reached.stage.to_string(), reached.step))
         };
         assert_eq!(recalled().await, None);
         write(shared.path(), "pretrain", 4);
@@ -95,7 +95,7 @@ mod tests {
                 source: std::io::Error::other("full"),
             })
         };
-        let mut keeping = Keeping::default();
+        let mut keeping = CheckpointSync::default();
         assert_eq!(keeping.note(Ok(())), None);
         let line = keeping.note(failed()).unwrap();
         assert!(line.contains("on this machine only") && line.contains("full"), "{line}");

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use futures_util::{StreamExt as _, TryStreamExt as _, stream};
 
 use super::JobError;
-use crate::dataset::{self, CollectConfig, DatasetError, DatasetInfo, Standing};
+use crate::dataset::{self, CollectConfig, DatasetError, DatasetInfo, CollectionStatus};
 use crate::registry::is_valid_name;
 use crate::store::Objects;
 
@@ -73,7 +73,7 @@ pub(super) async fn make_way(objects: &Objects, name: &str, config: &CollectConf
         return fetch(objects, name).await.map(drop);
     }
     let is_of_a_deleted_set = config.out.join(dataset::STAMP).is_file();
-    match Standing::of(config) {
+    match CollectionStatus::of(config) {
         Err(DatasetError::OutExists { .. }) if is_of_a_deleted_set => Ok(objects.delete(&key(name)).await?),
         Err(DatasetError::OtherArguments { .. }) => Ok(objects.delete(&key(name)).await?),
         // What else is wrong comes to light when it is collected.

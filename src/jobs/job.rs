@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::notes::Standing;
-use super::{JobError, JobSpec, JobState, Losses, Progress};
+use super::notes::StoredProgress;
+use super::{JobError, JobSpec, JobState, Losses, JobProgress};
 use crate::store::{JobPage, JobRow};
 
 /// One job as it is now.
@@ -16,7 +16,7 @@ pub struct Job {
     /// What was asked for.
     pub spec: JobSpec,
     /// How far it is.
-    pub progress: Progress,
+    pub progress: JobProgress,
     /// The latest losses, of a training.
     pub losses: Losses,
     /// Why it failed.
@@ -44,7 +44,7 @@ impl Job {
             reason,
         };
         let state: JobState = row.state.parse().map_err(record)?;
-        let standing: Standing = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
+        let standing: StoredProgress = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
         let mut progress = standing.progress;
         if state != JobState::Running {
             progress.remaining_s = None;

@@ -11,7 +11,7 @@ const MAX_WAITING: usize = 1000;
 
 /// How far a job is.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-pub struct Progress {
+pub struct JobProgress {
     /// Units done: trials of a collection, steps of a training, windows of an evaluation.
     pub done: u64,
     /// Units in all; 0 until it is known.
@@ -35,26 +35,26 @@ pub struct Losses {
 
 /// What the store keeps of a job's progress.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Standing {
+pub(super) struct StoredProgress {
     /// How far it is.
-    pub progress: Progress,
+    pub progress: JobProgress,
     /// The latest losses.
     pub losses: Losses,
 }
 
 /// The notes of a job that runs.
 #[derive(Debug, Default)]
-pub(super) struct Notes {
-    standing: Standing,
+pub(super) struct JobProgressLog {
+    standing: StoredProgress,
     lines: VecDeque<(f64, String)>,
     points: VecDeque<LossRow>,
     /// When the rate's measurement began, and the units that were there then, for example from a checkpoint.
     measured_from: Option<(f64, u64)>,
 }
 
-impl Notes {
+impl JobProgressLog {
     /// Goes on from what the store kept.
-    pub(super) fn new(standing: Standing) -> Self {
+    pub(super) fn new(standing: StoredProgress) -> Self {
         Self {
             standing,
             ..Self::default()
@@ -66,7 +66,7 @@ impl Notes {
         let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
         let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
         let rate = (gained > 0.0 && elapsed_s > 0.0).then(|| gained / elapsed_s);
-        self.standing.progress = Progress {
+        self.standing.progress = JobProgress {
             done,
             total,
             rate_per_s: rate,
@@ -100,7 +100,7 @@ impl Notes {
     }
 
     /// How far it is.
-    pub(super) fn standing(&self) -> &Standing {
+    pub(super) fn standing(&self) -> &StoredProgress {
         &self.standing
     }
 
@@ -110,7 +110,7 @@ impl Notes {
     }
 
     /// Puts back what could not be written, before what came since.
-    pub(super) fn put_back(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
+    pub(super) fn restore_unwritten(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
         let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
         lines
             .into_iter()
@@ -136,7 +136,7 @@ mod tests {
 
     #[test]
     fn rate_and_time_left_count_only_what_this_run_did() {
-        let mut notes = Notes::default();
+        let mut notes = JobProgressLog::default();
         notes.progress((100, 200), "", 10.0);
         notes.progress((120, 200), "", 20.0);
         let progress = &notes.standing().progress;
@@ -145,18 +145,18 @@ mod tests {
 
     #[test]
     fn what_could_not_be_written_comes_before_what_came_since() {
-        let mut notes = Notes::default();
+        let mut notes = JobProgressLog::default();
         notes.line("one".to_owned(), 1.0);
         let (lines, points) = notes.take();
         notes.line("two".to_owned(), 2.0);
-        notes.put_back(lines, points);
+        notes.restore_unwritten(lines, points);
         let (lines, _) = notes.take();
         assert_eq!(lines, [(1.0, "one".to_owned()), (2.0, "two".to_owned())]);
     }
 
     #[test]
     fn a_store_that_cannot_be_reached_does_not_fill_the_memory() {
-        let mut notes = Notes::default();
+        let mut notes = JobProgressLog::default();
         (0..5000).for_each(|i| notes.line(i.to_string(), 0.0));
         let (lines, _) = notes.take();
         assert_eq!((lines.len(), lines[0].1.as_str()), (MAX_WAITING, "4000"));

@@ -9,15 +9,15 @@ use futures_util::future::BoxFuture;
 use serde_json::json;
 use tokio::runtime::Handle;
 
-use super::checkpoints::{self, Keeping};
-use super::runner::{Execute, Failure, Outcome, Report};
-use super::spec::Ground;
+use super::checkpoints::{self, CheckpointSync};
+use super::runner::{JobExecutor, JobFailure, JobResult, JobReporter};
+use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
 use crate::store::{LossRow, Store};
-use crate::training::{self, CHECKPOINT_FILE, Event, Stage, TrainError, Training};
+use crate::training::{self, CHECKPOINT_FILE, TrainingEvent, TrainingStage, TrainError, Training};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
 use crate::wording;
@@ -52,19 +52,19 @@ impl Pipeline {
     }
 }
 
-impl Execute for Pipeline {
+impl JobExecutor for Pipeline {
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
         Box::pin(self.look_over(spec.clone()))
     }
 
-    fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+    fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
             JobSpec::Evaluate(spec) => self.evaluate(spec, report, cancelled),
         };
         match result {
-            Err(Failure::Failed(_)) if cancelled.load(Ordering::Acquire) => Err(Failure::Cancelled),
+            Err(JobFailure::Failed(_)) if cancelled.load(Ordering::Acquire) => Err(JobFailure::Cancelled),
             other => other,
         }
     }
@@ -77,7 +77,7 @@ impl Pipeline {
         let data_dir = objects.data_dir().to_owned();
         // It looks at the disk, and must wait for nothing that needs a thread of the same kind: there are only so many.
         let checked = tokio::task::spawn_blocking(move || {
-            spec.check(Ground {
+            spec.check(AvailableInputs {
                 data_dir: &data_dir,
                 datasets: &datasets,
                 models: &models,
@@ -86,18 +86,18 @@ impl Pipeline {
         checked.await.unwrap_or(Err(JobError::Stopping))
     }
 
-    fn collect(&self, spec: &CollectSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+    fn collect(&self, spec: &CollectSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
         let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
         self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
-        let on_progress = |progress: dataset::Progress| report.progress(progress.done, progress.total, "simulating");
+        let on_progress = |progress: dataset::JobProgress| report.progress(progress.done, progress.total, "simulating");
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         let info = once_free(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
         self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
-        Ok(Outcome {
+        Ok(JobResult {
             result: json!({
                 "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
                 "content_hash": info.content_hash,
@@ -106,7 +106,7 @@ impl Pipeline {
         })
     }
 
-    fn train(&self, spec: &TrainSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+    fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let config = spec.config().map_err(|error| failed(&error))?;
         let run = format!("runs/{}", report.id());
         report.progress(0, 0, "reading the data set");
@@ -119,15 +119,15 @@ impl Pipeline {
             run_dir: &run_dir,
             command: &command(spec),
         };
-        let mut watch = Watch {
+        let mut watch = TrainingReporter {
             report,
             steps: [config.pretrain.steps, config.fit.steps],
             train_loss: None,
         };
-        let mut keeping = Keeping::default();
-        let mut observer = |event: Event| {
+        let mut keeping = CheckpointSync::default();
+        let mut observer = |event: TrainingEvent| {
             watch.on_event(event);
-            if matches!(event, Event::Checkpointed { .. }) {
+            if matches!(event, TrainingEvent::Checkpointed { .. }) {
                 let pushing = self.store.objects().push(&run, CHECKPOINT_FILE);
                 if let Some(line) = keeping.note(self.runtime.block_on(pushing)) {
                     report.line(line);
@@ -137,15 +137,15 @@ impl Pipeline {
         let train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
         match once_free(train, is_busy, cancelled).map_err(|error| failed(&error))? {
-            training::Outcome::Interrupted { .. } => Err(Failure::Cancelled),
-            training::Outcome::Finished { model_dir, manifest } => {
+            training::JobResult::Interrupted { .. } => Err(JobFailure::Cancelled),
+            training::JobResult::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "publishing");
                 let written = self.versions.write(report.lease(), &spec.name, &model_dir);
                 let written = self.runtime.block_on(written).map_err(|error| failed(&error))?;
-                let (version, activates) = written.ok_or(Failure::Cancelled)?;
+                let (version, activates) = written.ok_or(JobFailure::Cancelled)?;
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
-                Ok(Outcome {
+                Ok(JobResult {
                     result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
                     published: Some((spec.name.clone(), version, activates)),
                 })
@@ -154,7 +154,7 @@ impl Pipeline {
     }
 
     /// Has the run's directory hold its last checkpoint, and at its first taking up nothing.
-    fn prepare_run(&self, run: &str, report: &Report) -> Result<(), Failure> {
+    fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), JobFailure> {
         let objects = self.store.objects();
         let prepared = self.runtime.block_on(async {
             if report.lease().token == 1 {
@@ -165,7 +165,7 @@ impl Pipeline {
         prepared.map_err(|error| failed(&error))
     }
 
-    fn evaluate(&self, spec: &EvaluateSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+    fn evaluate(&self, spec: &EvaluateSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let loaded = self.model(&spec.model, spec.version)?;
         let twin = spec.twin.as_deref().map(|twin| self.model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
@@ -181,8 +181,8 @@ impl Pipeline {
         };
         let found = evaluation::run(&loaded, &dataset, &config, &|now| {
             let what = match now.stage {
-                evaluation::Stage::Scores => "scores",
-                evaluation::Stage::Actions => "actions",
+                evaluation::TrainingStage::Scores => "scores",
+                evaluation::TrainingStage::Actions => "actions",
             };
             report.progress(now.done as u64, now.total as u64, &format!("{} {what}", now.split));
         });
@@ -202,7 +202,7 @@ impl Pipeline {
             .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
             .collect();
         files.sort();
-        Ok(Outcome {
+        Ok(JobResult {
             result: json!({
                 "model": spec.model, "version": loaded.manifest.version, "scores": found.headline(), "files": files,
             }),
@@ -210,7 +210,7 @@ impl Pipeline {
         })
     }
 
-    fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, Failure> {
+    fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, JobFailure> {
         let loaded: Result<LoadedModel, VersionError> = self.runtime.block_on(async {
             match version {
                 Some(version) => self.versions.load(name, version).await,
@@ -220,12 +220,12 @@ impl Pipeline {
         loaded.map_err(|error| failed(&error))
     }
 
-    fn dataset(&self, name: &str) -> Result<Dataset, Failure> {
+    fn dataset(&self, name: &str) -> Result<Dataset, JobFailure> {
         let fetched = self.runtime.block_on(datasets::fetch(self.store.objects(), name));
         Dataset::open(&fetched.map_err(|error| failed(&error))?).map_err(|error| failed(&error))
     }
 
-    fn push(&self, dir: &str, last: &str) -> Result<(), Failure> {
+    fn push(&self, dir: &str, last: &str) -> Result<(), JobFailure> {
         let pushed = self.runtime.block_on(self.store.objects().push(dir, last));
         pushed.map_err(|error| failed(&error))
     }
@@ -255,23 +255,23 @@ pub fn report_key(id: &str) -> String {
 }
 
 /// Writes a training's events down.
-struct Watch<'a> {
-    report: &'a Report,
+struct TrainingReporter<'a> {
+    report: &'a JobReporter,
     /// Of each stage.
     steps: [usize; 2],
     train_loss: Option<f64>,
 }
 
-impl Watch<'_> {
-    fn on_event(&mut self, event: Event) {
+impl TrainingReporter<'_> {
+    fn on_event(&mut self, event: TrainingEvent) {
         match event {
-            Event::Started { stage, step, windows } => {
+            TrainingEvent::Started { stage, step, windows } => {
                 self.progress(stage, step);
                 self.report
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
             // What was not written before the process died must be in the curves all the same.
-            Event::Recalled {
+            TrainingEvent::Recalled {
                 stage,
                 step,
                 train_loss,
@@ -280,7 +280,7 @@ impl Watch<'_> {
                 self.train_loss = Some(train_loss);
                 self.point(stage, step, Some(validation_loss));
             }
-            Event::Step {
+            TrainingEvent::Step {
                 stage,
                 step,
                 steps,
@@ -299,7 +299,7 @@ impl Watch<'_> {
                     self.point(stage, step, None);
                 }
             }
-            Event::Validated {
+            TrainingEvent::Validated {
                 stage,
                 step,
                 loss,
@@ -314,21 +314,21 @@ impl Watch<'_> {
                 self.report
                     .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
             }
-            Event::Checkpointed { .. } => {}
+            TrainingEvent::Checkpointed { .. } => {}
         }
     }
 
-    fn progress(&self, stage: Stage, step: usize) {
+    fn progress(&self, stage: TrainingStage, step: usize) {
         let [pretrain, fit] = self.steps;
         let done = match stage {
-            Stage::Pretrain => step,
-            Stage::Fit => pretrain + step,
+            TrainingStage::Pretrain => step,
+            TrainingStage::Fit => pretrain + step,
         };
         self.report
             .progress(done as u64, (pretrain + fit) as u64, &stage.to_string());
     }
 
-    fn point(&self, stage: Stage, step: usize, validation: Option<f64>) {
+    fn point(&self, stage: TrainingStage, step: usize, validation: Option<f64>) {
         self.report.point(LossRow {
             stage: stage.to_string(),
             step: step as i64,
@@ -347,8 +347,8 @@ fn posted(spec: &JobSpec) -> String {
     format!("POST /v1/jobs {}", serde_json::to_string(spec).unwrap_or_default())
 }
 
-fn failed(error: &dyn Error) -> Failure {
-    Failure::Failed(wording::sentence(error))
+fn failed(error: &dyn Error) -> JobFailure {
+    JobFailure::Failed(wording::sentence(error))
 }
 
 #[cfg(test)]

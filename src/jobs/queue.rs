@@ -9,10 +9,10 @@ use tracing::{info, warn};
 
 use super::instance::Instance;
 use super::job::{id_of, number_of};
-use super::notes::Standing;
-use super::runner::{self, Execute};
-use super::{Event, Job, JobError, JobFilter, JobSpec, JobState, unix_s};
-use crate::store::{Enqueued, JobRow, LogRow, LossRow, NewJob, Store};
+use super::notes::StoredProgress;
+use super::runner::{self, JobExecutor};
+use super::{JobTransition, Job, JobError, JobFilter, JobSpec, JobState, unix_s};
+use crate::store::{EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// An idempotency key's characters at most.
 const MAX_KEY_LENGTH: usize = 128;
@@ -32,10 +32,10 @@ pub struct JobLimits {
     pub lease: Duration,
 }
 
-pub(super) struct Shared {
+pub(super) struct JobsInner {
     pub(super) store: Store,
     pub(super) limits: JobLimits,
-    pub(super) execute: Arc<dyn Execute>,
+    pub(super) execute: Arc<dyn JobExecutor>,
     /// A job may be there to be taken up.
     pub(super) wake: Notify,
     /// A job has ended here.
@@ -46,15 +46,15 @@ pub(super) struct Shared {
 /// The handle to the jobs; clones share them.
 #[derive(Clone)]
 pub struct Jobs {
-    shared: Arc<Shared>,
+    shared: Arc<JobsInner>,
     runner: Arc<Mutex<Option<JoinHandle<()>>>>,
 }
 
 impl Jobs {
     /// A handle to the store's jobs; with `runs`, also takes them up, one at a time. To be called within a tokio runtime.
     /// Errors: `Instance`, `Threads`.
-    pub fn start(store: Store, limits: JobLimits, execute: Arc<dyn Execute>, runs: bool) -> Result<Self, JobError> {
-        let shared = Arc::new(Shared {
+    pub fn start(store: Store, limits: JobLimits, execute: Arc<dyn JobExecutor>, runs: bool) -> Result<Self, JobError> {
+        let shared = Arc::new(JobsInner {
             store,
             limits,
             execute,
@@ -76,7 +76,7 @@ impl Jobs {
     }
 
     /// Takes a job; asked again with the same key, tells of the one it took then.
-    /// Errors: what [`Execute::check`] refuses, `QueueFull`, `Taken`, `Stopping`, `Invalid`, `Store`.
+    /// Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `Taken`, `Stopping`, `Invalid`, `Store`.
     pub async fn submit(&self, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
         if *shared.stop.borrow() {
@@ -93,24 +93,24 @@ impl Jobs {
             kind: spec.kind().to_owned(),
             makes: spec.makes().map(|(kind, name)| format!("{kind} {name}")),
             spec: json(&spec)?,
-            progress: json(&Standing::default())?,
+            progress: json(&StoredProgress::default())?,
             idempotency_key: key,
         };
         match shared.store.enqueue(new, shared.limits.queued as i64, unix_s()).await? {
-            Enqueued::New(row) => {
+            EnqueueResult::New(row) => {
                 shared.wake.notify_one();
                 let job = Job::of(&row)?;
                 info!(job.id = %job.id, job.kind = row.kind, "job queued");
                 Ok(job)
             }
-            Enqueued::Same(row) => same(&row, &spec),
+            EnqueueResult::Same(row) => same(&row, &spec),
             other => Err(self.refused(&other, &spec)),
         }
     }
 
-    fn refused(&self, enqueued: &Enqueued, spec: &JobSpec) -> JobError {
+    fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
         match (enqueued, spec.makes()) {
-            (Enqueued::Taken, Some((kind, name))) => JobError::Taken {
+            (EnqueueResult::Taken, Some((kind, name))) => JobError::Taken {
                 kind,
                 name: name.to_owned(),
                 why: "is being made by another job",
@@ -166,8 +166,8 @@ impl Jobs {
         loop {
             let row = self.row(id).await?;
             let state = Job::of(&row)?.state;
-            let asked = match state.after(Event::Cancel) {
-                None => return Err(illegal(id, state, Event::Cancel)),
+            let asked = match state.after(JobTransition::Cancel) {
+                None => return Err(illegal(id, state, JobTransition::Cancel)),
                 Some(_) if state == JobState::Running => store.ask_to_cancel(row.number).await?,
                 Some(_) => store.cancel_queued(row.number, unix_s()).await?,
             };
@@ -187,17 +187,17 @@ impl Jobs {
         }
         let row = self.row(id).await?;
         let job = Job::of(&row)?;
-        if job.state.after(Event::Resume).is_none() {
-            return Err(illegal(id, job.state, Event::Resume));
+        if job.state.after(JobTransition::Resume).is_none() {
+            return Err(illegal(id, job.state, JobTransition::Resume));
         }
         let limit = self.shared.limits.queued as i64;
         match self.shared.store.requeue(row.number, limit).await? {
-            Some(Enqueued::New(row)) => {
+            Some(EnqueueResult::New(row)) => {
                 self.shared.wake.notify_one();
                 Job::of(&row)
             }
             Some(other) => Err(self.refused(&other, &job.spec)),
-            None => Err(illegal(id, JobState::Queued, Event::Resume)),
+            None => Err(illegal(id, JobState::Queued, JobTransition::Resume)),
         }
     }
 
@@ -231,7 +231,7 @@ impl Jobs {
     }
 }
 
-impl Shared {
+impl JobsInner {
     /// What ended jobs leave is deleted with the last memory of them.
     pub(super) async fn forget_oldest(&self) {
         let forgotten = match self.store.forget_ended(self.limits.ended as i64).await {
@@ -248,7 +248,7 @@ impl Shared {
     }
 }
 
-fn illegal(id: &str, state: JobState, event: Event) -> JobError {
+fn illegal(id: &str, state: JobState, event: JobTransition) -> JobError {
     JobError::IllegalTransition {
         id: id.to_owned(),
         state,

@@ -13,10 +13,10 @@ use tracing::{info, warn};
 
 use super::instance::Instance;
 use super::job::id_of;
-use super::notes::{Notes, Standing};
-use super::queue::Shared;
-use super::{Event, Job, JobError, JobSpec, JobState, Losses, priority, unix_s};
-use crate::store::{Account, Ending, JobRow, Lease, LossRow};
+use super::notes::{JobProgressLog, StoredProgress};
+use super::queue::JobsInner;
+use super::{JobTransition, Job, JobError, JobSpec, JobState, Losses, priority, unix_s};
+use crate::store::{JobUpdate, JobOutcome, JobRow, Lease, LossRow};
 use crate::telemetry::names;
 
 /// How often a job's standing is written, unless the lease asks for more.
@@ -28,7 +28,7 @@ const END_ATTEMPTS: u32 = 5;
 
 /// How a job's work ended without what was asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Failure {
+pub enum JobFailure {
     /// It was asked to stop and did, or its lease was lost.
     Cancelled,
     /// What went wrong, in a sentence.
@@ -37,7 +37,7 @@ pub enum Failure {
 
 /// What came of a job.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Outcome {
+pub struct JobResult {
     /// What is told of it.
     pub result: serde_json::Value,
     /// A model's name and version, and whether that is to serve unless another does.
@@ -45,24 +45,24 @@ pub struct Outcome {
 }
 
 /// What does the work of a job.
-pub trait Execute: Send + Sync + 'static {
+pub trait JobExecutor: Send + Sync + 'static {
     /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and what keeps it
     /// from looking.
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 
     /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.
-    fn execute(&self, spec: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure>;
+    fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
 }
 
 /// Where a job's work says how far it is.
 #[derive(Clone)]
-pub struct Report {
-    notes: Arc<Mutex<Notes>>,
+pub struct JobReporter {
+    notes: Arc<Mutex<JobProgressLog>>,
     lease: Lease,
 }
 
-impl Report {
-    fn notes(&self) -> MutexGuard<'_, Notes> {
+impl JobReporter {
+    fn notes(&self) -> MutexGuard<'_, JobProgressLog> {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -119,7 +119,7 @@ pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
         .map_err(JobError::Threads)
 }
 
-pub(super) async fn run(shared: Arc<Shared>, instance: Instance, pool: ThreadPool) {
+pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: ThreadPool) {
     let pool = Arc::new(pool);
     let mut stop = shared.stop.subscribe();
     // Nobody else holds this identity, so what runs under it is what this process's predecessor left.
@@ -129,8 +129,8 @@ pub(super) async fn run(shared: Arc<Shared>, instance: Instance, pool: ThreadPoo
     while !*stop.borrow() {
         let now_s = unix_s();
         let until_s = now_s + shared.limits.lease.as_secs_f64();
-        match shared.store.take_up(&instance.id, now_s, until_s).await {
-            Ok(Some((row, lease))) => Work::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
+        match shared.store.claim(&instance.id, now_s, until_s).await {
+            Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
                 warn!(%error, "could not ask for jobs");
@@ -140,7 +140,7 @@ pub(super) async fn run(shared: Arc<Shared>, instance: Instance, pool: ThreadPoo
     }
 }
 
-async fn pause(shared: &Shared, stop: &mut watch::Receiver<bool>) {
+async fn pause(shared: &JobsInner, stop: &mut watch::Receiver<bool>) {
     tokio::select! {
         () = shared.wake.notified() => {}
         () = tokio::time::sleep(POLL_EVERY) => {}
@@ -154,9 +154,9 @@ async fn told(stop: &mut watch::Receiver<bool>) {
 }
 
 /// One taking up of a job.
-struct Work<'a> {
-    shared: &'a Shared,
-    report: Report,
+struct JobRun<'a> {
+    shared: &'a JobsInner,
+    report: JobReporter,
     cancelled: Arc<AtomicBool>,
     /// Whether the row says that someone asked it to stop.
     asked: bool,
@@ -164,19 +164,19 @@ struct Work<'a> {
 }
 
 /// Stops the work when the one who watches it goes, whatever the reason.
-impl Drop for Work<'_> {
+impl Drop for JobRun<'_> {
     fn drop(&mut self) {
         self.cancelled.store(true, Ordering::Release);
     }
 }
 
-impl<'a> Work<'a> {
-    fn new(shared: &'a Shared, row: &JobRow, lease: Lease) -> Self {
-        let standing: Standing = serde_json::from_str(&row.progress).unwrap_or_default();
+impl<'a> JobRun<'a> {
+    fn new(shared: &'a JobsInner, row: &JobRow, lease: Lease) -> Self {
+        let standing: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
         Self {
             shared,
-            report: Report {
-                notes: Arc::new(Mutex::new(Notes::new(standing))),
+            report: JobReporter {
+                notes: Arc::new(Mutex::new(JobProgressLog::new(standing))),
                 lease,
             },
             cancelled: Arc::new(AtomicBool::new(false)),
@@ -193,11 +193,11 @@ impl<'a> Work<'a> {
             attempt => format!("taken up again, for the {attempt}. time"),
         });
         let result = match Job::of(row) {
-            Ok(_) if self.asked => Err(Failure::Cancelled),
+            Ok(_) if self.asked => Err(JobFailure::Cancelled),
             Ok(job) => self.watch(job.spec, pool, stop).await,
-            Err(error) => Err(Failure::Failed(error.to_string())),
+            Err(error) => Err(JobFailure::Failed(error.to_string())),
         };
-        if result == Err(Failure::Cancelled) && !self.asked {
+        if result == Err(JobFailure::Cancelled) && !self.asked {
             // Someone may have asked since the last renewal, and must not be forgotten.
             self.renew().await;
         }
@@ -214,7 +214,7 @@ impl<'a> Work<'a> {
         spec: JobSpec,
         pool: &Arc<ThreadPool>,
         mut stop: watch::Receiver<bool>,
-    ) -> Result<Outcome, Failure> {
+    ) -> Result<JobResult, JobFailure> {
         let (sender, mut result) = oneshot::channel();
         let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
         let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
@@ -225,7 +225,7 @@ impl<'a> Work<'a> {
             let _ = sender.send(result);
         });
         if let Err(error) = thread {
-            return Err(Failure::Failed(format!("could not start a thread: {error}")));
+            return Err(JobFailure::Failed(format!("could not start a thread: {error}")));
         }
         let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -233,7 +233,7 @@ impl<'a> Work<'a> {
         loop {
             tokio::select! {
                 result = &mut result => {
-                    let panicked = || Failure::Failed("the work broke off; the server's log says why".to_owned());
+                    let panicked = || JobFailure::Failed("the work broke off; the server's log says why".to_owned());
                     return result.unwrap_or_else(|_| Err(panicked()));
                 }
                 () = told(&mut stop), if !is_told => {
@@ -255,7 +255,7 @@ impl<'a> Work<'a> {
             Ok(None) => self.lost = true,
             Err(error) => {
                 warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
-                self.report.notes().put_back(lines, losses);
+                self.report.notes().restore_unwritten(lines, losses);
             }
         }
         if self.asked || self.lost {
@@ -263,10 +263,10 @@ impl<'a> Work<'a> {
         }
     }
 
-    fn account(&self) -> Account {
+    fn account(&self) -> JobUpdate {
         let mut notes = self.report.notes();
         let (lines, losses) = notes.take();
-        Account {
+        JobUpdate {
             // A standing is two structs of numbers and texts: it is always writable.
             progress: serde_json::to_string(notes.standing()).unwrap_or_default(),
             lines,
@@ -275,13 +275,13 @@ impl<'a> Work<'a> {
         }
     }
 
-    async fn end(&self, kind: &str, result: Result<Outcome, Failure>) {
+    async fn end(&self, kind: &str, result: Result<JobResult, JobFailure>) {
         let id = self.report.id();
         let (event, error, outcome) = match result {
-            Ok(outcome) => (Event::Succeed, None, Some(outcome)),
-            Err(Failure::Cancelled) if self.asked => (Event::Cancel, None, None),
-            Err(Failure::Cancelled) => (Event::Leave, None, None),
-            Err(Failure::Failed(reason)) => (Event::Fail, Some(reason), None),
+            Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
+            Err(JobFailure::Cancelled) if self.asked => (JobTransition::Cancel, None, None),
+            Err(JobFailure::Cancelled) => (JobTransition::Leave, None, None),
+            Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
         };
         // A running job can do all of these.
         let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
@@ -296,7 +296,7 @@ impl<'a> Work<'a> {
             None => state.name().to_owned(),
             Some(reason) => format!("failed: {reason}"),
         });
-        let ending = Ending {
+        let ending = JobOutcome {
             state: state.name(),
             error,
             outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
@@ -307,7 +307,7 @@ impl<'a> Work<'a> {
         self.shared.ended.notify_one();
     }
 
-    async fn write_end(&self, id: &str, ending: Ending) {
+    async fn write_end(&self, id: &str, ending: JobOutcome) {
         let account = self.account();
         for attempt in 1..=END_ATTEMPTS {
             let written = self

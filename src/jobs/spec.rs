@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
-use crate::dataset::{self, CollectConfig, DatasetError, Standing};
+use crate::dataset::{self, CollectConfig, DatasetError, CollectionStatus};
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
@@ -113,7 +113,7 @@ fn default_resamples() -> usize {
 
 /// What there is that jobs can start from.
 #[derive(Clone, Copy, Debug)]
-pub struct Ground<'a> {
+pub struct AvailableInputs<'a> {
     /// The data directory.
     pub data_dir: &'a Path,
     /// The finished data sets.
@@ -157,7 +157,7 @@ impl JobSpec {
 
     /// Checks all that can be known before the work begins. Errors: `Invalid` and `NotFound`, which name the field; `Taken`,
     /// `Occupied`, `Dataset`.
-    pub fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
+    pub fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
         match self {
             Self::Collect(spec) => spec.check(ground),
             Self::Train(spec) => spec.check(ground.datasets),
@@ -167,7 +167,7 @@ impl JobSpec {
 }
 
 impl EvaluateSpec {
-    fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
+    fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
         check_dataset(&self.dataset, ground.datasets)?;
         check_model("model", &self.model, ground.models)?;
         if let Some(twin) = &self.twin {
@@ -188,7 +188,7 @@ impl EvaluateSpec {
 }
 
 impl CollectSpec {
-    fn check(&self, ground: Ground<'_>) -> Result<(), JobError> {
+    fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
         check_name("name", &self.name)?;
         if !(1..=MAX_TRIALS).contains(&self.trials) {
             return Err(JobError::Invalid {
@@ -205,8 +205,8 @@ impl CollectSpec {
         if !is_there && dataset::is_finished(&config.out) {
             return Ok(());
         }
-        match Standing::of(&config) {
-            Ok(Standing::New | Standing::Begun { .. }) if !is_there => Ok(()),
+        match CollectionStatus::of(&config) {
+            Ok(CollectionStatus::New | CollectionStatus::PendingStep { .. }) if !is_there => Ok(()),
             Ok(_) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),

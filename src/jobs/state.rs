@@ -23,7 +23,7 @@ pub enum JobState {
 
 /// What can happen to a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Event {
+pub enum JobTransition {
     /// A runner takes it up.
     Start,
     /// The work is done.
@@ -50,13 +50,13 @@ impl JobState {
 
     /// The state after the event, or `None` where the event cannot happen in this state.
     #[must_use]
-    pub fn after(self, event: Event) -> Option<Self> {
+    pub fn after(self, event: JobTransition) -> Option<Self> {
         match (self, event) {
-            (Self::Queued, Event::Start) => Some(Self::Running),
-            (Self::Running, Event::Succeed) => Some(Self::Succeeded),
-            (Self::Running, Event::Fail) => Some(Self::Failed),
-            (Self::Queued | Self::Running, Event::Cancel) => Some(Self::Cancelled),
-            (Self::Running, Event::Leave) | (Self::Failed | Self::Cancelled, Event::Resume) => Some(Self::Queued),
+            (Self::Queued, JobTransition::Start) => Some(Self::Running),
+            (Self::Running, JobTransition::Succeed) => Some(Self::Succeeded),
+            (Self::Running, JobTransition::Fail) => Some(Self::Failed),
+            (Self::Queued | Self::Running, JobTransition::Cancel) => Some(Self::Cancelled),
+            (Self::Running, JobTransition::Leave) | (Self::Failed | Self::Cancelled, JobTransition::Resume) => Some(Self::Queued),
             _ => None,
         }
     }
@@ -80,7 +80,7 @@ impl JobState {
     }
 }
 
-impl Event {
+impl JobTransition {
     /// Of which jobs it may be said.
     #[must_use]
     pub fn whose(self) -> &'static str {
@@ -116,7 +116,7 @@ impl fmt::Display for JobState {
     }
 }
 
-impl fmt::Display for Event {
+impl fmt::Display for JobTransition {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             Self::Start => "start",
@@ -135,13 +135,13 @@ mod tests {
 
     use super::*;
 
-    const EVENTS: [Event; 6] = [
-        Event::Start,
-        Event::Succeed,
-        Event::Fail,
-        Event::Cancel,
-        Event::Leave,
-        Event::Resume,
+    const EVENTS: [JobTransition; 6] = [
+        JobTransition::Start,
+        JobTransition::Succeed,
+        JobTransition::Fail,
+        JobTransition::Cancel,
+        JobTransition::Leave,
+        JobTransition::Resume,
     ];
 
     proptest! {
@@ -151,12 +151,12 @@ mod tests {
             for event in events.into_iter().map(|i| EVENTS[i]) {
                 if let Some(next) = state.after(event) {
                     prop_assert_ne!(state, JobState::Succeeded);
-                    prop_assert!(!state.is_final() || event == Event::Resume);
+                    prop_assert!(!state.is_final() || event == JobTransition::Resume);
                     prop_assert_ne!(next, state);
                     started |= next == JobState::Running;
                     state = next;
                 } else {
-                    prop_assert!(state.is_final() || event != Event::Cancel);
+                    prop_assert!(state.is_final() || event != JobTransition::Cancel);
                 }
                 if matches!(state, JobState::Succeeded | JobState::Failed) {
                     prop_assert!(started);

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::conditioned::Condition;
+use super::conditioned::ConditioningTensors;
 use super::dense::{Activation, Dense};
 use super::lstm::{Decoder, unroll};
 use super::lstm_cell::{LstmState, PeepholeCell};
@@ -14,7 +14,7 @@ pub enum Feedback<'a> {
     /// The features it predicted: how it is used.
     Prediction,
     /// The true features `[B, horizon, F]` of the frames to come ("teacher forcing"); the last of them is not used.
-    Truth(&'a Tensor),
+    TeacherForcing(&'a Tensor),
 }
 
 /// The network: a frame codec, an LSTM encoder and two LSTM decoders. Holds weights only, so one model serves many.
@@ -104,9 +104,9 @@ impl Model {
     /// Features `[B, horizon, F]` of the frames that follow those with `features` [B, context, F]. The predictor starts
     /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
     /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
-    pub fn predict(&self, features: &Tensor, condition: &Condition, feedback: Feedback) -> Result<Tensor, NnError> {
+    pub fn predict(&self, features: &Tensor, condition: &ConditioningTensors, feedback: Feedback) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
-        if let Feedback::Truth(truth) = feedback {
+        if let Feedback::TeacherForcing(truth) = feedback {
             self.check(
                 "true features",
                 truth,
@@ -114,7 +114,7 @@ impl Model {
             )?;
         }
         let truth = match feedback {
-            Feedback::Truth(truth) => truth,
+            Feedback::TeacherForcing(truth) => truth,
             Feedback::Prediction => return self.run_predictor(features, None, condition),
         };
         let conditions = condition.inputs(&self.spec, batch)?;
@@ -137,7 +137,7 @@ impl Model {
         &self,
         features: &Tensor,
         windows: &[u32],
-        condition: &Condition,
+        condition: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
         self.check_windows(features)?;
         self.run_predictor(features, Some(windows), condition)
@@ -147,7 +147,7 @@ impl Model {
         &self,
         features: &Tensor,
         windows: Option<&[u32]>,
-        condition: &Condition,
+        condition: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
         let (_, mut state) = self.encode(features)?;
         let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
@@ -163,7 +163,7 @@ impl Model {
         let decoder = Decoder {
             cell: &self.predictor,
             output: &self.predictor_output,
-            adds: true,
+            residual: true,
         };
         decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
     }
@@ -179,7 +179,7 @@ impl Model {
                 let decoder = Decoder {
                     cell: &self.reconstructor,
                     output: &self.reconstructor_output,
-                    adds: false,
+                    residual: false,
                 };
                 let first = features.get_on_dim(1, 0)?.zeros_like()?.contiguous()?;
                 decoder.run(self.spec.context, &first, None, &state)
@@ -193,7 +193,7 @@ impl Model {
     }
 
     /// Frames `[B, horizon, P]` that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
-    pub fn predict_frames(&self, frames: &Tensor, condition: &Condition) -> Result<Tensor, NnError> {
+    pub fn predict_frames(&self, frames: &Tensor, condition: &ConditioningTensors) -> Result<Tensor, NnError> {
         let (context, pixels) = (self.spec.context, self.spec.pixels());
         let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
         let features = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;

@@ -9,14 +9,14 @@ use super::{ChannelScale, ModelSpec, NnError};
 /// What a prediction is conditioned on, in the channels' own units. What the model's conditioning doesn't take is
 /// ignored; what it takes and isn't there is an error.
 #[derive(Clone, Debug, Default)]
-pub struct Condition {
+pub struct ConditioningTensors {
     /// Actions to come `[B, horizon, A]`; action k leads to predicted frame k.
     pub actions: Option<Tensor>,
     /// State at the last context frame `[B, S]`.
     pub state: Option<Tensor>,
 }
 
-impl Condition {
+impl ConditioningTensors {
     /// No actions and no state.
     #[must_use]
     pub fn none() -> Self {

@@ -29,7 +29,7 @@ fn conv_lstm_of(spec: &ModelSpec, hidden: &[u64]) -> Cost {
     const PATCH_SIDE_PX: u32 = 4;
     let patch = u64::from(PATCH_SIDE_PX * PATCH_SIDE_PX);
     let places = places(spec, PATCH_SIDE_PX);
-    let (mut encoder, mut forecaster) = (Step::default(), Step::default());
+    let (mut encoder, mut forecaster) = (LayerCosts::default(), LayerCosts::default());
     let mut inputs = patch;
     for &hidden in hidden {
         encoder.lstm(inputs, hidden, places);
@@ -60,7 +60,7 @@ pub fn cdna(spec: &ModelSpec) -> Cost {
     const MASKS: u64 = 11;
     let [full, half, quarter, eighth] = [1, 2, 4, 8].map(|stride| places(spec, stride));
     let told = (spec.predictor_inputs() - spec.features) as u64;
-    let mut step = Step::default();
+    let mut step = LayerCosts::default();
     step.convolution(5, (1, 32), half);
     step.lstm(32, 32, half);
     step.lstm(32, 32, half);
@@ -95,12 +95,12 @@ fn places(spec: &ModelSpec, stride_px: u32) -> u64 {
 
 /// One step of a network in time, counted layer by layer.
 #[derive(Default)]
-struct Step {
+struct LayerCosts {
     parameters: u64,
     products: u64,
 }
 
-impl Step {
+impl LayerCosts {
     fn convolution(&mut self, side: u64, (inputs, outputs): (u64, u64), places: u64) {
         let weights = side * side * inputs * outputs;
         self.parameters += weights + outputs;

@@ -41,7 +41,7 @@ impl Dense {
     /// The layer's output `[N, O]` for x `[N, D]`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
         if x.dtype() == DType::F32 {
-            let fused = Fused {
+            let fused = FusedDense {
                 activation: self.activation,
                 wants_input_gradient: x.track_op(),
             };
@@ -61,12 +61,12 @@ impl Dense {
 }
 
 /// The f32 layer with sum, bias and activation in one pass, and no gradient for an input that needs none.
-struct Fused {
+struct FusedDense {
     activation: Activation,
     wants_input_gradient: bool,
 }
 
-impl CustomOp3 for Fused {
+impl CustomOp3 for FusedDense {
     fn name(&self) -> &'static str {
         "dense"
     }

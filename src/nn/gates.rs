@@ -45,7 +45,7 @@ fn gate(sums: &mut [f32], peephole: &[f32], c: &[f32]) {
 
 /// What one row's step kept for the way back.
 #[derive(Clone, Copy)]
-pub(super) struct Kept<'a> {
+pub(super) struct StepActivations<'a> {
     /// i, f, tanh(·), o `[4H]`.
     pub(super) activations: &'a [f32],
     /// Memory before `[H]`.
@@ -57,8 +57,8 @@ pub(super) struct Kept<'a> {
 /// One row's way back. `d_h` `[H]` is the gradient of h; `d_c` `[H]` that of c from later steps, and becomes that of
 /// `c_before`; `d_sums` `[4H]` receives that of the sums.
 #[inline(always)]
-pub(super) fn backward(kept: Kept, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
-    let Kept {
+pub(super) fn backward(kept: StepActivations, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
+    let StepActivations {
         activations,
         c_before,
         c,

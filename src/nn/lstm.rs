@@ -6,13 +6,13 @@ use candle_core::{DType, Tensor};
 use super::NnError;
 use super::dense::{Activation, Dense};
 use super::lstm_cell::{LstmState, PeepholeCell};
-use super::recurrence::{driven, fed_back};
+use super::recurrence::{forward_sequence, decode_autoregressive};
 
 /// Runs the cell over a sequence x `[B, T, D]` from `state`: the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
     let (batch, steps, _) = x.dims3()?;
     if x.dtype() == DType::F32 {
-        let (outputs, c) = driven(cell, &drive(cell, x, 0)?, state)?;
+        let (outputs, c) = forward_sequence(cell, &drive(cell, x, 0)?, state)?;
         let h = outputs.get(steps - 1)?;
         return Ok((outputs.transpose(0, 1)?.contiguous()?, LstmState { h, c }));
     }
@@ -43,7 +43,7 @@ pub struct Decoder<'a> {
     /// From the cell's output to features.
     pub output: &'a Dense,
     /// Whether the output is a change of the features before, or the features themselves.
-    pub adds: bool,
+    pub residual: bool,
 }
 
 impl Decoder<'_> {
@@ -60,7 +60,7 @@ impl Decoder<'_> {
                 Some(conditions) => drive(self.cell, conditions, first.dim(1)?)?,
                 None => self.cell.bias.clone(),
             };
-            let features = fed_back(self, steps, &drive, first, state)?;
+            let features = decode_autoregressive(self, steps, &drive, first, state)?;
             return Ok(features.transpose(0, 1)?.contiguous()?);
         }
         let mut state = state.clone();
@@ -72,7 +72,7 @@ impl Decoder<'_> {
             };
             state = self.cell.step(&input, &state)?;
             let output = self.output.forward(&state.h)?;
-            features.push(if self.adds { (&features[k] + output)? } else { output });
+            features.push(if self.residual { (&features[k] + output)? } else { output });
         }
         Ok(Tensor::stack(&features[1..], 1)?)
     }

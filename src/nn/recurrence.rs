@@ -25,11 +25,11 @@ struct FeedbackLoop {
     /// Bias of the features `[F]`.
     bias: Vec<f32>,
     /// Whether the layer's output is added to the features before, instead of replacing them.
-    adds: bool,
+    residual: bool,
 }
 
 /// What the steps did, for the way back: rows are B of a step, then the next step's.
-struct Trace {
+struct RecurrenceTrace {
     /// [T · B, 4H].
     activations: Vec<f32>,
     /// [(T + 1) · B, H].
@@ -46,11 +46,11 @@ struct Recurrence {
     w_h: Tensor,
     peepholes: [Vec<f32>; 3],
     feedback: Option<FeedbackLoop>,
-    trace: Mutex<Option<Trace>>,
+    trace: Mutex<Option<RecurrenceTrace>>,
 }
 
 /// Runs the cell on sums that are known beforehand, `drive` `[T, B, 4H]` = `W_x x + b`: every h `[T, B, H]` and the last c `[B, H]`.
-pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
+pub(super) fn forward_sequence(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
     let steps = drive.dim(0)?;
     let start = Tensor::cat(&[&state.h, &state.c], 1)?;
     let all = Recurrence::new(cell, None, steps)?.apply(&drive.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
@@ -59,20 +59,20 @@ pub(super) fn driven(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> 
 
 /// Runs a decoder on its own output: features `[T, B, F]`. Only the first F rows of the cell's `w_x` take features; `drive`
 /// is what all else adds to the sums, `[T, B, 4H]`, or `[4H]` if the same in every step.
-pub(super) fn fed_back(
+pub(super) fn decode_autoregressive(
     decoder: &Decoder,
     steps: usize,
     drive: &Tensor,
     first: &Tensor,
     state: &LstmState,
 ) -> Result<Tensor> {
-    let Decoder { cell, output, adds } = *decoder;
+    let Decoder { cell, output, residual } = *decoder;
     let w_x = cell.w_x.narrow(0, 0, first.dim(1)?)?;
     let feedback = FeedbackLoop {
         w_x: w_x.detach(),
         weight: output.weight.detach(),
         bias: output.bias.to_vec1()?,
-        adds,
+        residual,
     };
     let start = Tensor::cat(&[&state.h, &state.c, first], 1)?;
     let drive = if drive.rank() == 1 {
@@ -129,10 +129,10 @@ impl Recurrence {
     }
 
     /// All steps from `start` [B, H + H + F].
-    fn run(&self, drive: &[f32], start: &[f32]) -> Result<Trace> {
+    fn run(&self, drive: &[f32], start: &[f32]) -> Result<RecurrenceTrace> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = start.len() / (2 * hidden + features);
-        let mut trace = Trace::starting(start, [hidden, hidden, features], self.steps);
+        let mut trace = RecurrenceTrace::starting(start, [hidden, hidden, features], self.steps);
         for t in 0..self.steps {
             let before = t * batch..(t + 1) * batch;
             let h = matrix(trace.h[before.start * hidden..before.end * hidden].to_vec(), hidden)?;
@@ -171,9 +171,9 @@ impl Recurrence {
     }
 
     /// Step `t` from the parts of its sums.
-    fn advance(&self, trace: &mut Trace, t: usize, batch: usize, parts: [&[f32]; 3]) {
+    fn advance(&self, trace: &mut RecurrenceTrace, t: usize, batch: usize, parts: [&[f32]; 3]) {
         let hidden = self.hidden;
-        let Trace { activations, h, c, .. } = trace;
+        let RecurrenceTrace { activations, h, c, .. } = trace;
         let (c_before, c) = c[t * batch * hidden..].split_at_mut(batch * hidden);
         let h = &mut h[(t + 1) * batch * hidden..];
         let sums = &mut activations[t * batch * 4 * hidden..(t + 1) * batch * 4 * hidden];
@@ -209,7 +209,7 @@ impl FeedbackLoop {
             {
                 after.copy_from_slice(change);
                 add_columns(after, bias);
-                if self.adds {
+                if self.residual {
                     add_columns(after, before);
                 }
             }
@@ -217,7 +217,7 @@ impl FeedbackLoop {
     }
 }
 
-impl Trace {
+impl RecurrenceTrace {
     /// Room for all steps, with the state before the first one in place.
     fn starting(start: &[f32], sides: [usize; 3], steps: usize) -> Self {
         let [hidden, _, features] = sides;

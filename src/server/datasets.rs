@@ -11,7 +11,7 @@ use super::page::Page;
 use super::predict::PredictError;
 use super::{App, blocking};
 use crate::dataset::{self, Dataset, DatasetInfo};
-use crate::evaluation::figures::montage::{Row, Style, montage};
+use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::jobs::{JobError, datasets};
 use crate::types::Channel;
@@ -215,9 +215,9 @@ fn contact_sheet(title: &str, frames: Vec<Frame>) -> Result<Vec<u8>, FrameError>
         .step_by(stride)
         .map(|(number, frame)| (number.to_string(), frame))
         .collect();
-    let rows: Vec<Row> = shown
+    let rows: Vec<MontageRow> = shown
         .chunks(ROW_FRAMES)
-        .map(|cells| Row {
+        .map(|cells| MontageRow {
             label: String::new(),
             cells: cells.to_vec(),
         })

@@ -12,7 +12,7 @@ use super::extract::{Json, Path};
 use super::images::{self, ImageBytes, ImageFormat};
 use super::{App, blocking};
 use crate::nn::spec::MAX_MODEL_SIDE_PX;
-use crate::sim::{self, Environment, Observation, Scenario, SimError, Step, TrialParameters, World, WorldConfig};
+use crate::sim::{self, Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
 use crate::types::{Action, Channel, Seed, ValueError};
 
 pub(super) use table::Environments;
@@ -122,7 +122,7 @@ pub(super) enum EnvironmentError {
     #[error("action: {0}")]
     Value(#[from] ValueError),
     #[error("action: {0}")]
-    Step(SimError),
+    StepResult(SimError),
     #[error("the episode is over; reset the environment to begin the next")]
     Ended,
     #[error(transparent)]
@@ -232,14 +232,14 @@ fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBod
 
 fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, EnvironmentError> {
     let action = Action::try_from(action)?;
-    let Step {
+    let StepResult {
         observation,
         reward,
         terminated,
         truncated,
     } = environment.step(&action).map_err(|error| match error {
         SimError::Ended => EnvironmentError::Ended,
-        other => EnvironmentError::Step(other),
+        other => EnvironmentError::StepResult(other),
     })?;
     Ok(StepBody {
         info: info(environment.world(), &observation, None),

@@ -53,7 +53,7 @@ pub(super) enum ApiError {
     NotAcceptable(String),
     Timeout(String),
     Conflict(String),
-    Gone(String),
+    ClientGone(String),
     TooLarge(String),
     UnsupportedMedia(String),
     Unprocessable(String),
@@ -80,7 +80,7 @@ impl ApiError {
             Self::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable"),
             Self::Timeout(_) => (StatusCode::REQUEST_TIMEOUT, "timeout"),
             Self::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
-            Self::Gone(_) => (StatusCode::GONE, "gone"),
+            Self::ClientGone(_) => (StatusCode::GONE, "gone"),
             Self::TooLarge(_) => (StatusCode::PAYLOAD_TOO_LARGE, "too-large"),
             Self::UnsupportedMedia(_) => (StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported-media-type"),
             Self::Unprocessable(_) => (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable"),
@@ -98,7 +98,7 @@ impl ApiError {
             | Self::NotAcceptable(detail)
             | Self::Timeout(detail)
             | Self::Conflict(detail)
-            | Self::Gone(detail)
+            | Self::ClientGone(detail)
             | Self::TooLarge(detail)
             | Self::UnsupportedMedia(detail)
             | Self::Unprocessable(detail)
@@ -187,7 +187,7 @@ impl From<PredictError> for ApiError {
             PredictError::TooMany { .. } | PredictError::TooLarge { .. } => Self::TooLarge(error.to_string()),
             PredictError::Image(image) => image.into(),
             PredictError::Serving(serving) => serving.into(),
-            PredictError::Warming { .. } => Self::Conflict(error.to_string()),
+            PredictError::Buffering { .. } => Self::Conflict(error.to_string()),
             PredictError::Value { .. }
             | PredictError::BothStates
             | PredictError::StateCount { .. }
@@ -224,7 +224,7 @@ impl From<TableError> for ApiError {
     fn from(error: TableError) -> Self {
         match error {
             TableError::Unknown(_) => Self::NotFound(error.to_string()),
-            TableError::Expired { .. } => Self::Gone(error.to_string()),
+            TableError::Expired { .. } => Self::ClientGone(error.to_string()),
             TableError::Token => Self::Forbidden(error.to_string()),
             TableError::Full(_) => Self::unavailable(error.to_string()),
         }

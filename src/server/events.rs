@@ -45,7 +45,7 @@ pub(super) async fn events(
     let last_seen = headers
         .get("last-event-id")
         .and_then(|seen| seen.to_str().ok()?.parse().ok());
-    let watch = Watch {
+    let watch = JobEventStream {
         _place: app.streams().enter()?,
         stopping: app.streams().stopping(),
         app,
@@ -63,7 +63,7 @@ pub(super) async fn events(
 }
 
 /// One client that watches a job.
-struct Watch {
+struct JobEventStream {
     app: App,
     id: String,
     /// As last sent.
@@ -76,7 +76,7 @@ struct Watch {
     _place: OwnedSemaphorePermit,
 }
 
-impl Watch {
+impl JobEventStream {
     async fn next(&mut self) -> Option<Event> {
         loop {
             if let Some(event) = self.waiting.pop_front() {

@@ -73,13 +73,13 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequestParts<S> for Query<T> {
 
 /// In which form the client wants a prediction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Wanted {
+pub(super) enum ResponseFormat {
     Json,
     Png,
     Gif,
 }
 
-impl Wanted {
+impl ResponseFormat {
     /// The first form named in an `Accept` header that can be had; JSON where there is none.
     fn from_accept(accept: &str) -> Result<Self, ApiError> {
         let named = accept
@@ -99,7 +99,7 @@ impl Wanted {
     }
 }
 
-impl<S: Send + Sync> FromRequestParts<S> for Wanted {
+impl<S: Send + Sync> FromRequestParts<S> for ResponseFormat {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
@@ -118,8 +118,8 @@ mod tests {
 
     #[test]
     fn the_first_form_named_that_there_is_is_taken() {
-        assert_eq!(Wanted::from_accept("text/html, image/gif;q=0.8, */*"), Ok(Wanted::Gif));
-        assert_eq!(Wanted::from_accept("*/*"), Ok(Wanted::Json));
-        assert!(Wanted::from_accept("text/html").is_err());
+        assert_eq!(ResponseFormat::from_accept("text/html, image/gif;q=0.8, */*"), Ok(ResponseFormat::Gif));
+        assert_eq!(ResponseFormat::from_accept("*/*"), Ok(ResponseFormat::Json));
+        assert!(ResponseFormat::from_accept("text/html").is_err());
     }
 }

@@ -82,7 +82,7 @@ pub(super) struct LogQuery {
 
 /// The loss curves of a training.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct Curves {
+pub(super) struct LossCurves {
     /// In the order of the training.
     points: Vec<CurvePoint>,
 }
@@ -228,11 +228,11 @@ pub(super) async fn logs(
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/metrics", tag = "jobs",
     params(("id" = String, Path, description = "The job's id")),
-    responses((status = 200, body = Curves), (status = 404, description = "No such job", body = Problem))
+    responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
 )]
-pub(super) async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<Curves>, ApiError> {
+pub(super) async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
     let points = app.jobs().losses(&id).await?;
-    Ok(axum::Json(Curves {
+    Ok(axum::Json(LossCurves {
         points: points.into_iter().map(CurvePoint::from).collect(),
     }))
 }

@@ -74,19 +74,19 @@ impl NewKey {
 /// Who may call; clones are the same.
 #[derive(Clone)]
 pub struct Keys {
-    shared: Arc<Shared>,
+    shared: Arc<KeyCache>,
 }
 
-struct Shared {
+struct KeyCache {
     store: Option<Store>,
     is_required: bool,
-    known: Mutex<Known>,
+    known: Mutex<KnownKey>,
     /// Slow hashes are computed one at a time, so that wrong keys cannot take all cores.
     verifying: tokio::sync::Mutex<()>,
 }
 
 #[derive(Default)]
-struct Known {
+struct KnownKey {
     /// Hashes of the keys that are not revoked, by id.
     hashes: HashMap<String, String>,
     /// Whether there has been any key, revoked or not.
@@ -112,7 +112,7 @@ impl Keys {
 
     fn with(store: Option<Store>, is_required: bool) -> Self {
         Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(KeyCache {
                 store,
                 is_required,
                 known: Mutex::default(),
@@ -189,7 +189,7 @@ impl Keys {
         self.known().verified.contains_key(digest)
     }
 
-    fn known(&self) -> MutexGuard<'_, Known> {
+    fn known(&self) -> MutexGuard<'_, KnownKey> {
         self.shared.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -44,7 +44,7 @@ impl BoundedListener {
     }
 
     /// The next connection that has a place. Nothing is lost when the future is dropped.
-    pub(super) async fn accept(&self) -> Connection {
+    pub(super) async fn accept(&self) -> BoundedConnection {
         loop {
             let stream = match self.inner.accept().await {
                 Ok((stream, _)) => stream,
@@ -58,7 +58,7 @@ impl BoundedListener {
                 warn!(%error, "could not set TCP_NODELAY");
             }
             match Arc::clone(&self.places).try_acquire_owned() {
-                Ok(place) => return Connection::new(stream, place, self.write_stall),
+                Ok(place) => return BoundedConnection::new(stream, place, self.write_stall),
                 Err(_) => self.refuse(stream),
             }
         }
@@ -112,14 +112,14 @@ async fn hang_up(mut stream: TcpStream) -> io::Result<()> {
 
 /// A connection that holds its place until it has ended, and fails when its client reads nothing for too long. Dropped, it
 /// gives the client time to read the last that was written.
-pub(super) struct Connection {
+pub(super) struct BoundedConnection {
     /// None once it is dropped.
     open: Option<(TcpStream, OwnedSemaphorePermit)>,
     write_stall: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
-impl Connection {
+impl BoundedConnection {
     fn new(stream: TcpStream, place: OwnedSemaphorePermit, write_stall: Duration) -> Self {
         gauge!(names::HTTP_CONNECTIONS).increment(1.0);
         Self {
@@ -149,7 +149,7 @@ impl Connection {
     }
 }
 
-impl Drop for Connection {
+impl Drop for BoundedConnection {
     fn drop(&mut self) {
         gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
         // Without a runtime all ends at once.
@@ -162,13 +162,13 @@ impl Drop for Connection {
     }
 }
 
-impl AsyncRead for Connection {
+impl AsyncRead for BoundedConnection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         self.stream()?.poll_read(cx, buffer)
     }
 }
 
-impl AsyncWrite for Connection {
+impl AsyncWrite for BoundedConnection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = self.stream()?.poll_write(cx, bytes);
         self.watch(cx, written)

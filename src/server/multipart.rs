@@ -17,9 +17,9 @@ pub(super) trait WithFrames {
 
 /// A JSON body, or a form (`multipart/form-data`): a part `request`, which is the JSON body, and a part `frames` for each
 /// image, in order. Refused unread where there is no place for its prediction.
-pub(super) struct Upload<T>(pub(super) T);
+pub(super) struct JsonOrForm<T>(pub(super) T);
 
-impl<T: DeserializeOwned + WithFrames> FromRequest<App> for Upload<T> {
+impl<T: DeserializeOwned + WithFrames> FromRequest<App> for JsonOrForm<T> {
     type Rejection = ApiError;
 
     async fn from_request(request: Request, app: &App) -> Result<Self, ApiError> {

@@ -64,7 +64,7 @@ const STREAMS: &str = include_str!("../../openapi/asyncapi.yaml");
         dashboard::page,
     ),
     components(schemas(error::Problem)),
-    modifiers(&Keys, &Problems),
+    modifiers(&KeySecurity, &Problems),
     security((), ("key" = [])),
     tags(
         (name = "models", description = "Models and their predictions"),
@@ -79,9 +79,9 @@ const STREAMS: &str = include_str!("../../openapi/asyncapi.yaml");
 struct Contract;
 
 /// How a request shows its key, where one is asked for; without a valid one the answer is 401.
-struct Keys;
+struct KeySecurity;
 
-impl Modify for Keys {
+impl Modify for KeySecurity {
     fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
         let scheme = HttpBuilder::new()
             .scheme(HttpAuthScheme::Bearer)

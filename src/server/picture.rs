@@ -5,7 +5,7 @@ use axum::response::{IntoResponse, Response};
 
 use super::error::ApiError;
 use super::predict::PredictError;
-use crate::evaluation::figures::montage::{Row, Style, montage};
+use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 
 /// How long an animation rests on its last frame, in frame periods.
@@ -28,12 +28,12 @@ pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, ApiErr
 /// The frames seen (none where they are not known), and a row for each future; plain and small where there are many.
 /// Errors: `Size` if they are too many.
 pub(super) fn rollout_sheet(seen: &[Frame], futures: &[Vec<Frame>]) -> Result<Frame, FrameError> {
-    let inputs = Row::in_time("inputs", seen, 1 - seen.len() as i64);
+    let inputs = MontageRow::in_time("inputs", seen, 1 - seen.len() as i64);
     let rows = futures
         .iter()
         .enumerate()
-        .map(|(index, frames)| Row::in_time(&format!("candidate {index}"), frames, 1));
-    let mut rows: Vec<Row> = Some(inputs)
+        .map(|(index, frames)| MontageRow::in_time(&format!("candidate {index}"), frames, 1));
+    let mut rows: Vec<MontageRow> = Some(inputs)
         .filter(|_| !seen.is_empty())
         .into_iter()
         .chain(rows)
@@ -54,11 +54,11 @@ pub(super) fn rollout_animation(seen: &[Frame], futures: &[Vec<Frame>], period_s
     let columns = (futures.len() as f64).sqrt().ceil().max(1.0) as usize;
     let steps = futures.iter().map(Vec::len).max().unwrap_or(0);
     let grid = |cells: Vec<(String, Frame)>| {
-        let rows = cells.chunks(columns).map(|cells| Row {
+        let rows = cells.chunks(columns).map(|cells| MontageRow {
             label: String::new(),
             cells: cells.to_vec(),
         });
-        let rows: Vec<Row> = rows.collect();
+        let rows: Vec<MontageRow> = rows.collect();
         montage("", &rows, &style(futures)).or_else(|_| montage("", &rows, &SMALL))
     };
     let named = |(index, frame): (usize, &Frame)| (index.to_string(), frame.clone());
@@ -100,15 +100,15 @@ fn style(futures: &[Vec<Frame>]) -> Style {
 /// Errors: `Size` if the frames are too large.
 pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> Result<Vec<u8>, FrameError> {
     let rows = [
-        Row::in_time("", seen, 1 - seen.len() as i64),
-        Row::in_time("", predicted, 1),
+        MontageRow::in_time("", seen, 1 - seen.len() as i64),
+        MontageRow::in_time("", predicted, 1),
     ];
     let picture = |cell: (String, Frame)| {
         let style = Style {
             grid_lines: 0,
             ..Style::for_frames_of(cell.1.width())
         };
-        let row = Row {
+        let row = MontageRow {
             label: String::new(),
             cells: vec![cell],
         };

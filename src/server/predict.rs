@@ -7,9 +7,9 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::error::{ApiError, Problem};
-use super::extract::{Path, Wanted};
+use super::extract::{Path, ResponseFormat};
 use super::images::{self, ImageBytes, ImageError, ImageFormat};
-use super::multipart::{Upload, WithFrames};
+use super::multipart::{JsonOrForm, WithFrames};
 use super::picture;
 use super::protocol::Timing;
 use super::{App, blocking};
@@ -83,7 +83,7 @@ pub(super) enum PredictError {
     #[error("candidates is empty; give at least one sequence of future actions")]
     NoCandidates,
     #[error("the session has {have} frames of the {need} that a prediction takes; send it more")]
-    Warming { have: usize, need: usize },
+    Buffering { have: usize, need: usize },
     #[error("{field}: {source}")]
     Value { field: String, source: ValueError },
     #[error("state and states are both given; give one")]
@@ -129,8 +129,8 @@ impl WithFrames for PredictRequest {
 pub(super) async fn predict(
     State(app): State<App>,
     Path(model): Path<String>,
-    wanted: Wanted,
-    Upload(request): Upload<PredictRequest>,
+    wanted: ResponseFormat,
+    JsonOrForm(request): JsonOrForm<PredictRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let _place = app.admission().enter()?;
@@ -218,7 +218,7 @@ pub(super) fn check_count(field: &'static str, found: usize, limit: usize) -> Re
 }
 
 fn answer(
-    wanted: Wanted,
+    wanted: ResponseFormat,
     format: ImageFormat,
     seen: &[Frame],
     prediction: Prediction,
@@ -226,9 +226,9 @@ fn answer(
 ) -> Result<Response, ApiError> {
     let predicted = &prediction.frames;
     match wanted {
-        Wanted::Png => picture::png(prediction_sheet(seen, predicted, &[])),
-        Wanted::Gif => picture::gif(picture::animation(seen, predicted, period_s)),
-        Wanted::Json => {
+        ResponseFormat::Png => picture::png(prediction_sheet(seen, predicted, &[])),
+        ResponseFormat::Gif => picture::gif(picture::animation(seen, predicted, period_s)),
+        ResponseFormat::Json => {
             let format = format.answer();
             Ok(axum::Json(PredictResponse {
                 model: prediction.model,

@@ -123,7 +123,7 @@ pub enum ServerMessage {
         next_seq: u64,
     },
     /// Frames are missing until the context is full.
-    Warming {
+    Buffering {
         /// The frame's number.
         seq: u64,
         /// The frame's time, echoed.

@@ -7,16 +7,16 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::error::{ApiError, Problem};
-use super::extract::{Json, Path, Wanted};
+use super::extract::{Json, Path, ResponseFormat};
 use super::images::{self, ImageBytes, ImageFormat};
-use super::multipart::{Upload, WithFrames};
+use super::multipart::{JsonOrForm, WithFrames};
 use super::predict::{self, PredictError};
 use super::protocol::Timing;
-use super::sessions::Owned;
+use super::sessions::AuthorizedSession;
 use super::{App, ServerConfig, blocking, picture};
 use crate::frame::Frame;
 use crate::registry::{LoadedModel, Manifest};
-use crate::serving::{Computed, Premise, Task};
+use crate::serving::{TaskOutput, ConditioningInput, Task};
 use crate::types::RobotState;
 
 /// A context, and what might be done.
@@ -94,8 +94,8 @@ impl WithFrames for RolloutRequest {
 pub(super) async fn of_model(
     State(app): State<App>,
     Path(model): Path<String>,
-    wanted: Wanted,
-    Upload(request): Upload<RolloutRequest>,
+    wanted: ResponseFormat,
+    JsonOrForm(request): JsonOrForm<RolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.config().clone());
@@ -126,15 +126,15 @@ pub(super) async fn of_model(
 )]
 pub(super) async fn of_session(
     State(app): State<App>,
-    Owned(session): Owned,
-    wanted: Wanted,
+    AuthorizedSession(session): AuthorizedSession,
+    wanted: ResponseFormat,
     Json(request): Json<SessionRolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = Arc::clone(session.model());
     let (state, format) = (session.state().0, request.format);
     let (have, need) = (state.have(), model.manifest.spec.context);
     if have < need {
-        return Err(PredictError::Warming { have, need }.into());
+        return Err(PredictError::Buffering { have, need }.into());
     }
     let told = predict::last_state(request.state, None, 0)?.or_else(|| state.robot_state().cloned());
     let task = state.futures(premises(request.candidates, told, &model.manifest, app.config())?);
@@ -157,7 +157,7 @@ fn premises(
     state: Option<RobotState>,
     manifest: &Manifest,
     config: &ServerConfig,
-) -> Result<Vec<Premise>, PredictError> {
+) -> Result<Vec<ConditioningInput>, PredictError> {
     let spec = &manifest.spec;
     predict::check_count("candidates", candidates.len(), config.max_candidates)?;
     if candidates.is_empty() {
@@ -175,15 +175,15 @@ fn premises(
         .enumerate()
         .map(|(index, values)| predict::actions(&format!("candidates[{index}]"), values))
         .collect::<Result<_, _>>()?;
-    Ok(Premise::candidates(candidates, state, &manifest.name, spec)?)
+    Ok(ConditioningInput::candidates(candidates, state, &manifest.name, spec)?)
 }
 
 fn answer(
-    wanted: Wanted,
+    wanted: ResponseFormat,
     format: ImageFormat,
     model: &LoadedModel,
     seen: &[Frame],
-    computed: &Computed,
+    computed: &TaskOutput,
 ) -> Result<Response, ApiError> {
     let futures = &computed.futures;
     let encoded = |format| {
@@ -193,13 +193,13 @@ fn answer(
             .collect::<Result<_, _>>()
     };
     match wanted {
-        Wanted::Png => picture::png(picture::rollout_sheet(seen, futures)),
-        Wanted::Gif => picture::gif(picture::rollout_animation(
+        ResponseFormat::Png => picture::png(picture::rollout_sheet(seen, futures)),
+        ResponseFormat::Gif => picture::gif(picture::rollout_animation(
             seen,
             futures,
             model.manifest.spec.frame_period_s,
         )),
-        Wanted::Json => {
+        ResponseFormat::Json => {
             let format = format.answer();
             Ok(axum::Json(RolloutResponse {
                 model: model.manifest.name.clone(),

@@ -111,7 +111,7 @@ pub(super) async fn get(
         (status = 410, description = "It has expired", body = Problem),
     )
 )]
-pub(super) async fn delete(State(app): State<App>, session: Owned) -> StatusCode {
+pub(super) async fn delete(State(app): State<App>, session: AuthorizedSession) -> StatusCode {
     app.sessions().remove(&session.0);
     StatusCode::NO_CONTENT
 }
@@ -130,7 +130,7 @@ pub(super) async fn delete(State(app): State<App>, session: Owned) -> StatusCode
         (status = 410, description = "It has expired", body = Problem),
     )
 )]
-pub(super) async fn state(session: Owned) -> axum::Json<ExportedState> {
+pub(super) async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
     let (state, settings) = session.0.state();
     let manifest = &session.0.model().manifest;
     axum::Json(ExportedState {
@@ -152,9 +152,9 @@ pub(super) struct TokenQuery {
 }
 
 /// The session in the path, for who has its token.
-pub(super) struct Owned(pub(super) Arc<Session>);
+pub(super) struct AuthorizedSession(pub(super) Arc<Session>);
 
-impl axum::extract::FromRequestParts<App> for Owned {
+impl axum::extract::FromRequestParts<App> for AuthorizedSession {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut axum::http::request::Parts, app: &App) -> Result<Self, ApiError> {

@@ -18,9 +18,9 @@ use super::extract::Path;
 use super::protocol::Codec;
 use super::sessions::core::Settings;
 use super::sessions::session::Session;
-use super::sessions::{self, Owned};
+use super::sessions::{self, AuthorizedSession};
 use crate::serving::SessionState;
-use connection::Connection;
+use connection::StreamConnection;
 
 /// What is read of a socket at once, in bytes. Before every read as much is zeroed, and a stream holds it as long as it is
 /// open; a longer message has its own room.
@@ -47,7 +47,7 @@ type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
         (status = 503, description = "Too many streams", body = Problem),
     )
 )]
-pub(super) async fn of_session(State(app): State<App>, session: Owned, upgrade: Upgrade) -> Result<Response, ApiError> {
+pub(super) async fn of_session(State(app): State<App>, session: AuthorizedSession, upgrade: Upgrade) -> Result<Response, ApiError> {
     open(app, session.0, true, upgrade)
 }
 
@@ -92,7 +92,7 @@ fn open(app: App, session: Arc<Session>, is_kept: bool, upgrade: Upgrade) -> Res
         .max_frame_size(limit)
         .read_buffer_size(READ_BYTES);
     Ok(upgrade.on_upgrade(move |socket| {
-        let connection = Connection::new(app, &session, is_kept, chosen.unwrap_or_default());
+        let connection = StreamConnection::new(app, &session, is_kept, chosen.unwrap_or_default());
         async move {
             connection.run(socket).await;
             drop(place);

@@ -19,7 +19,7 @@ pub struct Candidate {
 
 /// Positions in the queue, each in rising order and in at most one of the two.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Plan {
+pub struct BatchPlan {
     /// Those whose answer nobody waits for any more.
     pub discard: Vec<usize>,
     /// Those to compute now, together.
@@ -29,8 +29,8 @@ pub struct Plan {
 /// The oldest task that is still wanted chooses the model. Those behind it for the same model join in order as long as the
 /// rows stay within the limit, at most one of a session; the oldest goes even if it alone is over the limit.
 #[must_use]
-pub fn plan(waiting: &[Candidate], now: Instant, row_limit: usize) -> Plan {
-    let mut plan = Plan::default();
+pub fn plan(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchPlan {
+    let mut plan = BatchPlan::default();
     let (mut model, mut rows, mut sessions) = (None, 0, Vec::new());
     for (position, candidate) in waiting.iter().enumerate() {
         if candidate.abandoned || candidate.deadline <= now {
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[derive(Clone, Debug)]
-    struct Kind {
+    struct TaskKind {
         model: usize,
         session: Option<u64>,
         rows: usize,
@@ -65,8 +65,8 @@ mod tests {
         late: bool,
     }
 
-    fn of(model: usize) -> Kind {
-        Kind {
+    fn of(model: usize) -> TaskKind {
+        TaskKind {
             model,
             session: None,
             rows: 1,
@@ -75,7 +75,7 @@ mod tests {
         }
     }
 
-    fn kinds() -> impl Strategy<Value = Vec<Kind>> {
+    fn kinds() -> impl Strategy<Value = Vec<TaskKind>> {
         let kind = (
             0usize..3,
             proptest::option::of(0u64..4),
@@ -83,7 +83,7 @@ mod tests {
             any::<bool>(),
             any::<bool>(),
         );
-        let kind = kind.prop_map(|(model, session, rows, abandoned, late)| Kind {
+        let kind = kind.prop_map(|(model, session, rows, abandoned, late)| TaskKind {
             model,
             session,
             rows,
@@ -93,7 +93,7 @@ mod tests {
         proptest::collection::vec(kind, 0..40)
     }
 
-    fn candidates(kinds: &[Kind], now: Instant) -> Vec<Candidate> {
+    fn candidates(kinds: &[TaskKind], now: Instant) -> Vec<Candidate> {
         kinds
             .iter()
             .map(|kind| Candidate {
@@ -106,14 +106,14 @@ mod tests {
             .collect()
     }
 
-    fn planned(kinds: &[Kind], limit: usize) -> Plan {
+    fn planned(kinds: &[TaskKind], limit: usize) -> BatchPlan {
         let now = Instant::now();
         plan(&candidates(kinds, now), now, limit)
     }
 
     #[test]
     fn the_oldest_task_chooses_the_model_and_others_of_it_join() {
-        let abandoned = Kind {
+        let abandoned = TaskKind {
             abandoned: true,
             ..of(0)
         };
@@ -123,13 +123,13 @@ mod tests {
 
     #[test]
     fn a_task_past_its_deadline_is_not_computed() {
-        let plan = planned(&[Kind { late: true, ..of(0) }], 8);
+        let plan = planned(&[TaskKind { late: true, ..of(0) }], 8);
         assert_eq!((plan.discard, plan.batch), (vec![0], vec![]));
     }
 
     #[test]
     fn a_second_step_of_a_session_waits_for_the_next_batch() {
-        let step = |session| Kind {
+        let step = |session| TaskKind {
             session: Some(session),
             ..of(0)
         };
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn many_futures_go_alone_and_hold_nobody_small_back() {
-        let rows = |rows| Kind { rows, ..of(0) };
+        let rows = |rows| TaskKind { rows, ..of(0) };
         assert_eq!(planned(&[rows(100), of(0)], 8).batch, [0]);
         assert_eq!(planned(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
     }

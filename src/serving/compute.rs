@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 
-use super::{PredictionInput, Premise, ServingError, Task};
+use super::{PredictionInput, ConditioningInput, ServingError, Task};
 use crate::frame::Frame;
 use crate::nn::tensors::with_values;
-use crate::nn::{Condition, ModelSpec};
+use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
 use crate::types::{Action, RobotState};
 
@@ -19,7 +19,7 @@ const DECODED_FRAMES: usize = 1024;
 
 /// What came of a [`Task`].
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Computation {
+pub(super) struct BatchOutput {
     /// Of the task's frames, in order.
     pub(super) features: Vec<Features>,
     /// One for each of the task's premises, in order.
@@ -42,11 +42,11 @@ pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<
 
 /// Computes the tasks as one batch: all new frames are encoded in one product, all futures predicted in one.
 /// Errors: `Model` if one does not fit the model, `Tensor`, `Frame`.
-pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Computation>, ServingError> {
+pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<BatchOutput>, ServingError> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
-    let mut computations: Vec<Computation> = tasks
+    let mut computations: Vec<BatchOutput> = tasks
         .iter()
-        .map(|task| Computation {
+        .map(|task| BatchOutput {
             features: encoded.by_ref().take(task.frames.len()).collect(),
             futures: Vec::with_capacity(task.premises.len()),
         })
@@ -60,7 +60,7 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Computati
         window_of.extend(vec![windows.len() as u32; task.premises.len()]);
         windows.push(task.known.iter().chain(&computation.features));
     }
-    let premises: Vec<&Premise> = tasks.iter().flat_map(|task| &task.premises).collect();
+    let premises: Vec<&ConditioningInput> = tasks.iter().flat_map(|task| &task.premises).collect();
     if premises.is_empty() {
         return Ok(computations);
     }
@@ -104,7 +104,7 @@ fn predict_windows(
     loaded: &LoadedModel,
     values: Vec<f32>,
     window_of: &[u32],
-    premises: &[&Premise],
+    premises: &[&ConditioningInput],
 ) -> Result<Vec<Vec<Frame>>, ServingError> {
     let spec = loaded.model.spec();
     let count = values.len() / (spec.context * spec.features);
@@ -148,7 +148,7 @@ fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingErr
 }
 
 /// Actions `[N, horizon, A]` and state `[N, S]` in raw units, where the model takes them.
-fn condition(spec: &ModelSpec, premises: &[&Premise]) -> Result<Condition, ServingError> {
+fn condition(spec: &ModelSpec, premises: &[&ConditioningInput]) -> Result<ConditioningTensors, ServingError> {
     let actions = premises
         .iter()
         .flat_map(|premise| &premise.actions)
@@ -163,7 +163,7 @@ fn condition(spec: &ModelSpec, premises: &[&Premise]) -> Result<Condition, Servi
             .then(|| Tensor::from_vec(values, shape, &Device::Cpu).map_err(tensor_error))
             .transpose()
     };
-    Ok(Condition {
+    Ok(ConditioningTensors {
         actions: tensor(
             actions.copied().collect(),
             &[premises.len(), spec.horizon, spec.actions.len()],

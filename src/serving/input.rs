@@ -1,6 +1,6 @@
 //! What a prediction takes, and whether it fits a model.
 
-use super::task::{Premise, REQUEST, Task, Told};
+use super::task::{ConditioningInput, REQUEST, Task, RawConditioning};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
@@ -133,13 +133,13 @@ impl PredictionInput {
     }
 
     /// What the future is predicted under. Errors name the field, what it is and what it should be.
-    pub(crate) fn premise(&self, model: &str, spec: &ModelSpec) -> Result<Premise, InputError> {
-        let told = Told {
+    pub(crate) fn premise(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
+        let told = RawConditioning {
             past: &self.actions,
             future: self.future_actions.as_deref(),
             state: self.state.as_ref(),
         };
-        Premise::new(told, &REQUEST, model, spec)
+        ConditioningInput::new(told, &REQUEST, model, spec)
     }
 
     /// All of it as a task of one future. Errors: as [`PredictionInput::check`].

@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
 use super::batch::{self, Candidate};
-use super::{Computed, ServingError, Task, meter};
+use super::{TaskOutput, ServingError, Task, meter};
 use crate::registry::LoadedModel;
 
 /// A full queue of the reference model's predictions is worked off well within this.
 const RETRY_AFTER_S: u64 = 1;
 
 /// A task that waits.
-pub(super) struct Waiting {
+pub(super) struct QueuedTask {
     pub(super) model: Arc<LoadedModel>,
     pub(super) task: Task,
     /// The session that it is a step of.
@@ -24,31 +24,31 @@ pub(super) struct Waiting {
     pub(super) deadline: Instant,
     /// How long it may take in all, as whoever waits is told.
     pub(super) limit: Duration,
-    pub(super) reply: oneshot::Sender<Result<Computed, ServingError>>,
+    pub(super) reply: oneshot::Sender<Result<TaskOutput, ServingError>>,
 }
 
 /// A model to take in.
-pub(super) struct Load {
+pub(super) struct ModelLoad {
     pub(super) model: LoadedModel,
     pub(super) reply: SyncSender<Result<(), ServingError>>,
 }
 
 /// What the worker does next.
-pub(super) enum Work {
-    Load(Box<Load>),
-    Batch(Vec<Waiting>),
+pub(super) enum WorkItem {
+    ModelLoad(Box<ModelLoad>),
+    Batch(Vec<QueuedTask>),
     Stop,
 }
 
 #[derive(Default)]
-struct State {
-    waiting: VecDeque<Waiting>,
-    loads: VecDeque<Load>,
+struct QueueState {
+    waiting: VecDeque<QueuedTask>,
+    loads: VecDeque<ModelLoad>,
     closed: bool,
 }
 
 pub(super) struct Queue {
-    state: Mutex<State>,
+    state: Mutex<QueueState>,
     arrived: Condvar,
     capacity: usize,
     batch_limit: usize,
@@ -64,7 +64,7 @@ impl Queue {
         }
     }
 
-    pub(super) fn push(&self, request: Waiting) -> Result<(), ServingError> {
+    pub(super) fn push(&self, request: QueuedTask) -> Result<(), ServingError> {
         let mut state = self.state();
         if state.closed {
             return Err(ServingError::Stopped);
@@ -89,7 +89,7 @@ impl Queue {
         Ok(())
     }
 
-    pub(super) fn load(&self, load: Load) -> Result<(), ServingError> {
+    pub(super) fn load(&self, load: ModelLoad) -> Result<(), ServingError> {
         let mut state = self.state();
         if state.closed {
             return Err(ServingError::Stopped);
@@ -106,30 +106,30 @@ impl Queue {
     }
 
     /// Blocks until there is something to do.
-    pub(super) fn take(&self) -> Work {
+    pub(super) fn take(&self) -> WorkItem {
         let mut state = self.state();
         loop {
             if let Some(load) = state.loads.pop_front() {
-                return Work::Load(Box::new(load));
+                return WorkItem::ModelLoad(Box::new(load));
             }
             let batch = state.next_batch(Instant::now(), self.batch_limit);
             if !batch.is_empty() {
-                return Work::Batch(batch);
+                return WorkItem::Batch(batch);
             }
             if state.closed {
-                return Work::Stop;
+                return WorkItem::Stop;
             }
             state = self.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, QueueState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl State {
-    fn next_batch(&mut self, now: Instant, limit: usize) -> Vec<Waiting> {
+impl QueueState {
+    fn next_batch(&mut self, now: Instant, limit: usize) -> Vec<QueuedTask> {
         let candidates: Vec<Candidate> = self
             .waiting
             .iter()
@@ -171,12 +171,12 @@ mod tests {
     use super::*;
     use crate::serving::test_model;
 
-    type Answer = oneshot::Receiver<Result<Computed, ServingError>>;
+    type Answer = oneshot::Receiver<Result<TaskOutput, ServingError>>;
 
-    fn request(model: &Arc<LoadedModel>) -> (Waiting, Answer) {
+    fn request(model: &Arc<LoadedModel>) -> (QueuedTask, Answer) {
         let (reply, answer) = oneshot::channel();
         let accepted = Instant::now();
-        let waiting = Waiting {
+        let waiting = QueuedTask {
             model: Arc::clone(model),
             task: Task::default(),
             session: None,
@@ -205,7 +205,7 @@ mod tests {
         drop(answer);
         let (second, _answer) = request(&other);
         queue.push(second).unwrap();
-        let Work::Batch(batch) = queue.take() else { panic!() };
+        let WorkItem::Batch(batch) = queue.take() else { panic!() };
         assert_eq!(batch.len(), 1);
         assert!(Arc::ptr_eq(&batch[0].model, &other));
     }
@@ -217,8 +217,8 @@ mod tests {
         for request in requests {
             queue.push(request).unwrap();
         }
-        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 2));
-        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 1));
+        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 2));
+        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 1));
     }
 
     #[test]
@@ -228,7 +228,7 @@ mod tests {
         queue.push(first).unwrap();
         queue.close();
         assert!(matches!(queue.push(request(&model).0), Err(ServingError::Stopped)));
-        assert!(matches!(queue.take(), Work::Batch(batch) if batch.len() == 1));
-        assert!(matches!(queue.take(), Work::Stop));
+        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 1));
+        assert!(matches!(queue.take(), WorkItem::Stop));
     }
 }

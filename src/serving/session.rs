@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compute::Features;
 use super::input::InputError;
-use super::task::{Fields, Premise, Task, Told};
+use super::task::{FieldNames, ConditioningInput, Task, RawConditioning};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
@@ -53,7 +53,7 @@ pub enum MemoryError {
     },
     /// Actions or state that do not fit.
     #[error("memory: {0}")]
-    Premise(#[from] InputError),
+    ConditioningInput(#[from] InputError),
 }
 
 /// A session's memory as it travels between servers.
@@ -77,7 +77,7 @@ pub struct SessionMemory {
 pub struct SessionState {
     next_seq: u64,
     features: VecDeque<Features>,
-    premise: Premise,
+    premise: ConditioningInput,
 }
 
 impl SessionState {
@@ -100,9 +100,9 @@ impl SessionState {
             check_features(index, features, spec)?;
         }
         let premise = match frames {
-            0 => Premise::default(),
-            _ => Premise::new(
-                Told {
+            0 => ConditioningInput::default(),
+            _ => ConditioningInput::new(
+                RawConditioning {
                     past: &[],
                     future: Some(&memory.actions),
                     state: memory.state.as_ref(),
@@ -150,7 +150,7 @@ impl SessionState {
 
     /// What to compute for the next frame: its features and, if it fills the context, its future under the premise.
     #[must_use]
-    pub fn step(&self, frame: Frame, premise: Option<Premise>, spec: &ModelSpec) -> Task {
+    pub fn step(&self, frame: Frame, premise: Option<ConditioningInput>, spec: &ModelSpec) -> Task {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
         let known: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
         let is_full = known.len() + 1 == spec.context;
@@ -162,7 +162,7 @@ impl SessionState {
     }
 
     /// Keeps what came of the step of frame `seq`.
-    pub fn advance(&mut self, seq: u64, features: Features, premise: Premise, spec: &ModelSpec) {
+    pub fn advance(&mut self, seq: u64, features: Features, premise: ConditioningInput, spec: &ModelSpec) {
         self.features.push_back(features);
         while self.features.len() > spec.context {
             self.features.pop_front();
@@ -179,7 +179,7 @@ impl SessionState {
 
     /// What to compute for the futures that follow the last frame, if the context is full.
     #[must_use]
-    pub fn futures(&self, premises: Vec<Premise>) -> Task {
+    pub fn futures(&self, premises: Vec<ConditioningInput>) -> Task {
         Task {
             known: self.features.iter().cloned().collect(),
             frames: Vec::new(),
@@ -188,7 +188,7 @@ impl SessionState {
     }
 }
 
-const MEMORY: Fields = Fields {
+const MEMORY: FieldNames = FieldNames {
     past: |_| "actions".to_owned(),
     future: "actions",
     missing: "actions",
@@ -229,8 +229,8 @@ mod tests {
         Action::try_from(vec![value]).unwrap()
     }
 
-    fn premise(value: f32) -> Premise {
-        Premise {
+    fn premise(value: f32) -> ConditioningInput {
+        ConditioningInput {
             actions: vec![action(value); 2],
             state: RobotState::try_from(vec![value]).ok(),
         }

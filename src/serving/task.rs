@@ -9,14 +9,14 @@ use crate::types::{Action, RobotState};
 /// What a future is predicted under, checked, of what the model takes: an action for each predicted frame, and the state
 /// at the last frame seen.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Premise {
+pub struct ConditioningInput {
     pub(super) actions: Vec<Action>,
     pub(super) state: Option<RobotState>,
 }
 
 /// Actions and state as they were given.
 #[derive(Clone, Copy)]
-pub(crate) struct Told<'a> {
+pub(crate) struct RawConditioning<'a> {
     /// What acted so far, the last of it still under way.
     pub(crate) past: &'a [Action],
     /// What will act; else the last of the past is held.
@@ -26,28 +26,28 @@ pub(crate) struct Told<'a> {
 }
 
 /// What errors call the fields.
-pub(crate) struct Fields {
+pub(crate) struct FieldNames {
     pub(super) past: fn(usize) -> String,
     pub(super) future: &'static str,
     pub(super) missing: &'static str,
 }
 
 /// The fields of a request.
-pub(super) const REQUEST: Fields = Fields {
+pub(super) const REQUEST: FieldNames = FieldNames {
     past: |index| format!("actions[{index}]"),
     future: "future_actions",
     missing: "future_actions",
 };
 /// The fields of a stream's frame.
-pub(crate) const STEP: Fields = Fields {
+pub(crate) const STEP: FieldNames = FieldNames {
     past: |_| "action".to_owned(),
     future: "plan",
     missing: "action",
 };
 
-impl Premise {
+impl ConditioningInput {
     /// Of what was told, that which the model takes. Errors name the field, what it is and what it should be.
-    pub(crate) fn new(told: Told<'_>, fields: &Fields, model: &str, spec: &ModelSpec) -> Result<Self, InputError> {
+    pub(crate) fn new(told: RawConditioning<'_>, fields: &FieldNames, model: &str, spec: &ModelSpec) -> Result<Self, InputError> {
         if spec.conditioning == Conditioning::None {
             return Ok(Self::default());
         }
@@ -105,14 +105,14 @@ pub struct Task {
     /// The frames that follow those, to be encoded.
     pub(super) frames: Vec<Frame>,
     /// One for each future to predict; none where the context is not full.
-    pub(super) premises: Vec<Premise>,
+    pub(super) premises: Vec<ConditioningInput>,
 }
 
 impl Task {
     /// Futures of the context in `frames`, one for each premise. Errors: those of the frames.
     pub(crate) fn futures(
         frames: Vec<Frame>,
-        premises: Vec<Premise>,
+        premises: Vec<ConditioningInput>,
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {

@@ -7,8 +7,8 @@ use std::time::Instant;
 use tracing::{error, info};
 
 use super::catalog::Catalog;
-use super::queue::{Load, Queue, Waiting, Work};
-use super::{Computed, PredictionInput, ServingError, Task, compute, meter};
+use super::queue::{ModelLoad, Queue, QueuedTask, WorkItem};
+use super::{TaskOutput, PredictionInput, ServingError, Task, compute, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
@@ -41,14 +41,14 @@ fn run(queue: &Queue, catalog: &Catalog) {
     catalog.set_ready();
     loop {
         match queue.take() {
-            Work::Load(load) => take_in(*load, catalog),
-            Work::Batch(batch) => answer(batch),
-            Work::Stop => return,
+            WorkItem::ModelLoad(load) => load_model(*load, catalog),
+            WorkItem::Batch(batch) => answer(batch),
+            WorkItem::Stop => return,
         }
     }
 }
 
-fn take_in(Load { model, reply }: Load, catalog: &Catalog) {
+fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
     let result = warm_up(&model);
     if result.is_ok() {
         catalog.insert(model);
@@ -81,7 +81,7 @@ fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
     })
 }
 
-fn answer(batch: Vec<Waiting>) {
+fn answer(batch: Vec<QueuedTask>) {
     let Some(model) = batch.first().map(|first| Arc::clone(&first.model)) else {
         return;
     };
@@ -92,7 +92,7 @@ fn answer(batch: Vec<Waiting>) {
             let compute_us = micros_since(started);
             let accepted: Vec<Instant> = batch.iter().map(|waiting| waiting.accepted).collect();
             for (waiting, computation) in batch.into_iter().zip(computations) {
-                let computed = Computed {
+                let computed = TaskOutput {
                     features: computation.features,
                     futures: computation.futures,
                     queue_us: micros(started.saturating_duration_since(waiting.accepted)),

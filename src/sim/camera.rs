@@ -10,7 +10,7 @@ use rapier3d::parry::shape::Cuboid;
 use rapier3d::prelude::Vector;
 
 use super::cast::UprightCylinder;
-use super::mover::{Hit, Mover, Seen, face};
+use super::mover::{NearestHit, Mover, MoverView, face};
 use super::{PlanarPose, SimError, WorldConfig, arena};
 use crate::frame::Frame;
 
@@ -25,7 +25,7 @@ static LIGHT: LazyLock<Vector> = LazyLock::new(|| Vector::new(-0.45, 0.35, 0.82)
 
 /// What one ray brings back.
 #[derive(Clone, Copy)]
-struct Sample {
+struct RaySample {
     gray: f32,
     /// Which face of which solid; differs between any two.
     surface: u16,
@@ -98,8 +98,8 @@ impl Camera {
     }
 
     /// One ray through each pixel's middle, then more where they disagree.
-    fn render(&self, movers: &[Mover]) -> Vec<Sample> {
-        let seen: Vec<Seen> = movers.iter().map(|mover| Seen::new(mover, self.position)).collect();
+    fn render(&self, movers: &[Mover]) -> Vec<RaySample> {
+        let seen: Vec<MoverView> = movers.iter().map(|mover| MoverView::new(mover, self.position)).collect();
         let mut middles = Vec::with_capacity(self.width * self.height);
         for row in 0..self.height {
             for column in 0..self.width {
@@ -117,7 +117,7 @@ impl Camera {
             .collect()
     }
 
-    fn is_edge(&self, samples: &[Sample], index: usize) -> bool {
+    fn is_edge(&self, samples: &[RaySample], index: usize) -> bool {
         let here = samples[index];
         let (row, column) = (index / self.width, index % self.width);
         let differs = |other: usize| {
@@ -131,7 +131,7 @@ impl Camera {
     }
 
     /// The mean of a grid of rays; the pixel belongs to whom most of them hit.
-    fn average(&self, seen: &[Seen], index: usize) -> Sample {
+    fn average(&self, seen: &[MoverView], index: usize) -> RaySample {
         let (row, column) = (index / self.width, index % self.width);
         let mut sum = 0.0;
         let mut owners = [0u8; EDGE_RAYS * EDGE_RAYS];
@@ -147,7 +147,7 @@ impl Camera {
             *owner = sample.owner;
         }
         owners.sort_unstable();
-        Sample {
+        RaySample {
             gray: sum / owners.len() as f32,
             surface: 0,
             owner: most_frequent(&owners),
@@ -155,7 +155,7 @@ impl Camera {
     }
 
     /// Casts the ray through a point of the image and shades what it hits.
-    fn sample(&self, seen: &[Seen], column: f32, row: f32) -> Sample {
+    fn sample(&self, seen: &[MoverView], column: f32, row: f32) -> RaySample {
         let right = (column - self.width as f32 / 2.0) * self.pixel_m;
         let down = (row - self.height as f32 / 2.0) * self.pixel_m;
         let direction = self.forward - self.left * right - self.up * down;
@@ -169,7 +169,7 @@ impl Camera {
             };
             let ray = Ray::new(self.position - Vector::new(x, y, 0.0), direction);
             if let Some(found) = shape.cast_local_ray_and_get_normal(&ray, hit.time, true) {
-                hit = Hit {
+                hit = NearestHit {
                     time: found.time_of_impact,
                     normal: found.normal,
                     albedo: pillar.albedo,
@@ -191,7 +191,7 @@ impl Camera {
         let lambert = hit.normal.dot(*LIGHT).max(0.0);
         let way_squared = direction.length_squared() * hit.time * hit.time;
         let near = 1.0 / (1.0 + 0.012 * way_squared);
-        Sample {
+        RaySample {
             gray: hit.albedo * (AMBIENT + (1.0 - AMBIENT) * lambert) * near,
             surface: hit.surface,
             owner: hit.owner,
@@ -199,7 +199,7 @@ impl Camera {
     }
 
     /// The room is a box seen from within, so every ray meets one of its sides.
-    fn cast_room(&self, direction: Vector) -> Hit {
+    fn cast_room(&self, direction: Vector) -> NearestHit {
         let half = Vector::new(arena::LENGTH_M, arena::WIDTH_M, arena::HEIGHT_M) / 2.0;
         let middle = Vector::new(arena::LENGTH_M / 2.0, 0.0, arena::HEIGHT_M / 2.0);
         let ray = Ray::new(self.position - middle, direction);
@@ -210,7 +210,7 @@ impl Camera {
         let mut normal = Vector::ZERO;
         normal[axis] = if far { -1.0 } else { 1.0 };
         let point = self.position + direction * time;
-        Hit {
+        NearestHit {
             time,
             normal,
             albedo: arena::side_albedo(side, point.x, point.y, point.z),

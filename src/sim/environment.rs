@@ -1,6 +1,6 @@
 //! Gymnasium's face of a [`World`]: `reset` begins an episode, `step` acts in it.
 
-use super::{Observation, Scenario, SimError, Step, TrialParameters, World, WorldConfig};
+use super::{Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
 use crate::types::{Action, Seed};
 
 /// An environment with one scenario, which runs one trial after another.
@@ -40,7 +40,7 @@ impl Environment {
     }
 
     /// Acts for one frame period. Errors: `NotReset` before the first reset, and as [`World::step`].
-    pub fn step(&mut self, action: &Action) -> Result<Step, SimError> {
+    pub fn step(&mut self, action: &Action) -> Result<StepResult, SimError> {
         self.world.as_mut().ok_or(SimError::NotReset)?.step(action)
     }
 

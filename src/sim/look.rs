@@ -9,35 +9,35 @@ pub(super) enum Solid {
 }
 
 /// A solid with its gray, 0…1.
-pub(super) struct Part {
+pub(super) struct ShadedSolid {
     pub(super) solid: Solid,
     pub(super) albedo: f32,
 }
 
 /// A robot's body.
-pub(super) struct Look {
+pub(super) struct RobotAppearance {
     /// Of its round base, which is what bumps into things.
     pub(super) radius_m: f32,
     pub(super) height_m: f32,
-    pub(super) parts: &'static [Part],
+    pub(super) parts: &'static [ShadedSolid],
 }
 
-const fn cylinder(radius: f32, bottom: f32, top: f32, albedo: f32) -> Part {
-    Part {
+const fn cylinder(radius: f32, bottom: f32, top: f32, albedo: f32) -> ShadedSolid {
+    ShadedSolid {
         solid: Solid::Cylinder(UprightCylinder { radius, bottom, top }),
         albedo,
     }
 }
 
-const fn block(middle: [f32; 3], half: [f32; 3], albedo: f32) -> Part {
-    Part {
+const fn block(middle: [f32; 3], half: [f32; 3], albedo: f32) -> ShadedSolid {
+    ShadedSolid {
         solid: Solid::Block(Block { middle, half }),
         albedo,
     }
 }
 
 /// Dark base and mast, a light plate on top, a light sensor at the front.
-pub(super) static TURTLEBOT: Look = Look {
+pub(super) static TURTLEBOT: RobotAppearance = RobotAppearance {
     radius_m: 0.177,
     height_m: 0.42,
     parts: &[
@@ -49,7 +49,7 @@ pub(super) static TURTLEBOT: Look = Look {
 };
 
 /// A light one with a dark plate.
-static PALE: Look = Look {
+static PALE: RobotAppearance = RobotAppearance {
     radius_m: 0.177,
     height_m: 0.42,
     parts: &[
@@ -61,7 +61,7 @@ static PALE: Look = Look {
 };
 
 /// A low cart with a box on it.
-static CART: Look = Look {
+static CART: RobotAppearance = RobotAppearance {
     radius_m: 0.2,
     height_m: 0.36,
     parts: &[
@@ -71,7 +71,7 @@ static CART: Look = Look {
 };
 
 /// A tall dark column on wheels.
-static TALL: Look = Look {
+static TALL: RobotAppearance = RobotAppearance {
     radius_m: 0.18,
     height_m: 0.8,
     parts: &[
@@ -82,7 +82,7 @@ static TALL: Look = Look {
 };
 
 /// Tb2 is a TurtleBot; those after it differ.
-pub(super) fn of_mover(index: usize) -> &'static Look {
+pub(super) fn of_mover(index: usize) -> &'static RobotAppearance {
     match index {
         0 => &TURTLEBOT,
         1 => &PALE,

@@ -5,10 +5,10 @@ use rapier3d::parry::shape::FeatureId;
 use rapier3d::prelude::Vector;
 
 use super::PlanarPose;
-use super::look::{Look, Solid};
+use super::look::{RobotAppearance, Solid};
 
 /// What a ray hits first, so far.
-pub(super) struct Hit {
+pub(super) struct NearestHit {
     pub(super) time: f32,
     pub(super) normal: Vector,
     pub(super) albedo: f32,
@@ -18,7 +18,7 @@ pub(super) struct Hit {
 
 /// A robot as the camera sees it.
 pub(super) struct Mover {
-    look: &'static Look,
+    look: &'static RobotAppearance,
     position: Vector,
     cos: f32,
     sin: f32,
@@ -26,7 +26,7 @@ pub(super) struct Mover {
 }
 
 impl Mover {
-    pub(super) fn new(look: &'static Look, pose: PlanarPose, id: u8) -> Self {
+    pub(super) fn new(look: &'static RobotAppearance, pose: PlanarPose, id: u8) -> Self {
         let (sin, cos) = pose.heading_rad.sin_cos();
         Self {
             look,
@@ -56,7 +56,7 @@ impl Mover {
 }
 
 /// A mover with what is the same for all rays of a picture.
-pub(super) struct Seen<'a> {
+pub(super) struct MoverView<'a> {
     pub(super) mover: &'a Mover,
     /// Camera in the mover's own axes.
     origin: Vector,
@@ -66,7 +66,7 @@ pub(super) struct Seen<'a> {
     outside: f32,
 }
 
-impl<'a> Seen<'a> {
+impl<'a> MoverView<'a> {
     /// The mover as seen from that place.
     pub(super) fn new(mover: &'a Mover, camera: Vector) -> Self {
         let half = mover.look.height_m / 2.0;
@@ -81,7 +81,7 @@ impl<'a> Seen<'a> {
     }
 
     /// Puts the mover's nearest part into `hit` if it is before what was there.
-    pub(super) fn cast(&self, direction: Vector, hit: &mut Hit) {
+    pub(super) fn cast(&self, direction: Vector, hit: &mut NearestHit) {
         let along = self.to_middle.dot(direction);
         if along * along < direction.length_squared() * self.outside {
             return;
@@ -93,7 +93,7 @@ impl<'a> Seen<'a> {
                 Solid::Block(shape) => shape.cast_local_ray_and_get_normal(&ray, hit.time, true),
             };
             if let Some(found) = found {
-                *hit = Hit {
+                *hit = NearestHit {
                     time: found.time_of_impact,
                     normal: self.mover.outward(found.normal),
                     albedo: part.albedo,

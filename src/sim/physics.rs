@@ -28,12 +28,12 @@ struct Body {
 }
 
 /// The arena with its robots, in the order they were added.
-pub(super) struct Stage {
+pub(super) struct PhysicsScene {
     physics: PhysicsWorld,
     robots: Vec<Body>,
 }
 
-impl Stage {
+impl PhysicsScene {
     /// The empty arena: walls and pillars.
     pub(super) fn new() -> Self {
         let mut physics = PhysicsWorld::new();

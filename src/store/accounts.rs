@@ -1,6 +1,6 @@
 //! What jobs say of themselves while they run: a bounded log, and the loss curves of trainings.
 
-use super::database::{Row, Tx};
+use super::database::{DatabaseRow, Tx};
 use super::{Store, StoreError};
 
 /// A point of a training's loss curves.
@@ -29,7 +29,7 @@ pub struct LogRow {
 
 /// What is written of a running job at one time.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Account {
+pub struct JobUpdate {
     /// How far it is.
     pub progress: String,
     /// Lines for its log: when, and what.
@@ -46,7 +46,7 @@ impl Store {
         let sql = "SELECT * FROM job_logs WHERE job = $1 AND seq > $2 ORDER BY seq LIMIT $3";
         let values = vec![number.into(), after.into(), limit.into()];
         let rows = self.database.fetch(sql, values).await?;
-        let line = |row: &Row| {
+        let line = |row: &DatabaseRow| {
             Ok(LogRow {
                 seq: row.get("seq")?,
                 time_s: row.get("time_s")?,
@@ -60,7 +60,7 @@ impl Store {
     pub async fn job_losses(&self, number: i64) -> Result<Vec<LossRow>, StoreError> {
         let sql = "SELECT * FROM job_losses WHERE job = $1 ORDER BY stage DESC, step";
         let rows = self.database.fetch(sql, vec![number.into()]).await?;
-        let point = |row: &Row| {
+        let point = |row: &DatabaseRow| {
             Ok(LossRow {
                 stage: row.get("stage")?,
                 step: row.get("step")?,
@@ -73,7 +73,7 @@ impl Store {
 }
 
 /// Writes it in the transaction that has found the lease to hold.
-pub(super) async fn write_account(tx: &mut Tx, number: i64, account: Account) -> Result<(), StoreError> {
+pub(super) async fn write_account(tx: &mut Tx, number: i64, account: JobUpdate) -> Result<(), StoreError> {
     for (time_s, line) in account.lines {
         let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
              SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";

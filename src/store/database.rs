@@ -9,7 +9,7 @@ use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow};
 use sqlx::{
-    AssertSqlSafe, Connection as _, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
+    AssertSqlSafe, Connection as _, Decode, Encode, Postgres, DatabaseRow as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
     Type,
 };
 
@@ -24,7 +24,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "initial", include_str!("migratio
 
 /// What a statement is given for `$1`, `$2`, …
 #[derive(Clone, Debug)]
-pub(super) enum Value {
+pub(super) enum DatabaseValue {
     Text(Option<String>),
     Int(Option<i64>),
     Real(Option<f64>),
@@ -32,7 +32,7 @@ pub(super) enum Value {
 
 macro_rules! value_from {
     ($variant:ident: $($from:ty => $convert:expr),+) => {
-        $(impl From<$from> for Value {
+        $(impl From<$from> for DatabaseValue {
             fn from(value: $from) -> Self {
                 Self::$variant($convert(value))
             }
@@ -45,12 +45,12 @@ value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::f
 value_from!(Real: f64 => Some, Option<f64> => |real| real);
 
 /// A row that came back.
-pub(super) enum Row {
+pub(super) enum DatabaseRow {
     Sqlite(SqliteRow),
     Postgres(PgRow),
 }
 
-impl Row {
+impl DatabaseRow {
     /// The value in a column. Errors: `Query` if there is none of that name and type.
     pub(super) fn get<T>(&self, column: &str) -> Result<T, StoreError>
     where
@@ -76,16 +76,16 @@ pub(super) enum Tx {
     Postgres(Transaction<'static, Postgres>),
 }
 
-fn bind<'q, DB: sqlx::Database>(sql: SqlStr, values: Vec<Value>) -> Query<'q, DB, DB::Arguments>
+fn bind<'q, DB: sqlx::Database>(sql: SqlStr, values: Vec<DatabaseValue>) -> Query<'q, DB, DB::Arguments>
 where
     Option<String>: Encode<'q, DB> + Type<DB>,
     Option<i64>: Encode<'q, DB> + Type<DB>,
     Option<f64>: Encode<'q, DB> + Type<DB>,
 {
     values.into_iter().fold(sqlx::query(sql), |query, value| match value {
-        Value::Text(text) => query.bind(text),
-        Value::Int(int) => query.bind(int),
-        Value::Real(real) => query.bind(real),
+        DatabaseValue::Text(text) => query.bind(text),
+        DatabaseValue::Int(int) => query.bind(int),
+        DatabaseValue::Real(real) => query.bind(real),
     })
 }
 
@@ -158,7 +158,7 @@ impl Database {
     }
 
     /// The rows that a statement gives.
-    pub(super) async fn fetch(&self, sql: &'static str, values: Vec<Value>) -> Result<Vec<Row>, StoreError> {
+    pub(super) async fn fetch(&self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(pool) => sqlite_rows(bind::<Sqlite>(sql, values).fetch_all(pool).await?),
@@ -167,7 +167,7 @@ impl Database {
     }
 
     /// How many rows a statement changed.
-    pub(super) async fn execute(&self, sql: &'static str, values: Vec<Value>) -> Result<u64, StoreError> {
+    pub(super) async fn execute(&self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<u64, StoreError> {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(pool) => bind::<Sqlite>(sql, values).execute(pool).await?.rows_affected(),
@@ -185,12 +185,12 @@ impl Database {
 }
 
 impl Tx {
-    pub(super) async fn fetch(&mut self, sql: &'static str, values: Vec<Value>) -> Result<Vec<Row>, StoreError> {
+    pub(super) async fn fetch(&mut self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
         self.fetch_any(sql.into_sql_str(), values).await
     }
 
     /// As `fetch`, but holds the rows and passes over those that another transaction holds.
-    pub(super) async fn fetch_free(&mut self, sql: &'static str, values: Vec<Value>) -> Result<Vec<Row>, StoreError> {
+    pub(super) async fn fetch_free(&mut self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
         let sql = match self {
             Self::Sqlite(_) => sql.into_sql_str(),
             Self::Postgres(_) => AssertSqlSafe(format!("{sql} FOR UPDATE SKIP LOCKED")).into_sql_str(),
@@ -198,14 +198,14 @@ impl Tx {
         self.fetch_any(sql, values).await
     }
 
-    async fn fetch_any(&mut self, sql: SqlStr, values: Vec<Value>) -> Result<Vec<Row>, StoreError> {
+    async fn fetch_any(&mut self, sql: SqlStr, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
         Ok(match self {
             Self::Sqlite(tx) => sqlite_rows(bind::<Sqlite>(sql, values).fetch_all(&mut **tx).await?),
             Self::Postgres(tx) => postgres_rows(bind::<Postgres>(sql, values).fetch_all(&mut **tx).await?),
         })
     }
 
-    pub(super) async fn execute(&mut self, sql: &'static str, values: Vec<Value>) -> Result<u64, StoreError> {
+    pub(super) async fn execute(&mut self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<u64, StoreError> {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(tx) => bind::<Sqlite>(sql, values).execute(&mut **tx).await?.rows_affected(),
@@ -222,12 +222,12 @@ impl Tx {
     }
 }
 
-fn sqlite_rows(rows: Vec<SqliteRow>) -> Vec<Row> {
-    rows.into_iter().map(Row::Sqlite).collect()
+fn sqlite_rows(rows: Vec<SqliteRow>) -> Vec<DatabaseRow> {
+    rows.into_iter().map(DatabaseRow::Sqlite).collect()
 }
 
-fn postgres_rows(rows: Vec<PgRow>) -> Vec<Row> {
-    rows.into_iter().map(Row::Postgres).collect()
+fn postgres_rows(rows: Vec<PgRow>) -> Vec<DatabaseRow> {
+    rows.into_iter().map(DatabaseRow::Postgres).collect()
 }
 
 fn unopened(source: sqlx::Error) -> StoreError {

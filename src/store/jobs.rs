@@ -3,8 +3,8 @@
 //! A lease runs out unless renewed. Each taking up raises the row's token, and every write of a job's work names the
 //! token it was given, so that one who was thought dead and comes back writes nothing.
 
-use super::accounts::{Account, write_account};
-use super::database::{Row, Tx, Value};
+use super::accounts::{JobUpdate, write_account};
+use super::database::{DatabaseRow, Tx, DatabaseValue};
 use super::{Store, StoreError};
 
 /// A job as it is kept. Structured values are JSON of the one who wrote them.
@@ -37,7 +37,7 @@ pub struct JobRow {
 }
 
 impl JobRow {
-    fn of(row: &Row) -> Result<Self, StoreError> {
+    fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
         Ok(Self {
             number: row.get("number")?,
             kind: row.get("kind")?,
@@ -72,7 +72,7 @@ pub struct NewJob {
 
 /// What came of enqueueing.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Enqueued {
+pub enum EnqueueResult {
     /// It waits.
     New(JobRow),
     /// A job of that idempotency key is there.
@@ -94,7 +94,7 @@ pub struct Lease {
 
 /// How a job's work ended.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Ending {
+pub struct JobOutcome {
     /// The state that follows.
     pub state: &'static str,
     /// Why it failed.
@@ -127,32 +127,32 @@ async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
 }
 
 /// Whether one more may wait, and none that has not ended makes the same.
-async fn has_place(tx: &mut Tx, makes: Option<&str>, max_queued: i64) -> Result<Option<Enqueued>, StoreError> {
+async fn has_place(tx: &mut Tx, makes: Option<&str>, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
     // Nothing equals NULL, so that a job that makes nothing of its own is never in another's way.
     let sql = "SELECT number FROM jobs WHERE makes = $1 AND state IN ('queued', 'running')";
     if !tx.fetch(sql, vec![makes.into()]).await?.is_empty() {
-        return Ok(Some(Enqueued::Taken));
+        return Ok(Some(EnqueueResult::Taken));
     }
     let queued = tx
         .fetch("SELECT number FROM jobs WHERE state = 'queued'", vec![])
         .await?
         .len();
-    Ok((queued as i64 >= max_queued).then_some(Enqueued::Full))
+    Ok((queued as i64 >= max_queued).then_some(EnqueueResult::Full))
 }
 
-fn first(rows: &[Row]) -> Result<Option<JobRow>, StoreError> {
+fn first(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
     rows.first().map(JobRow::of).transpose()
 }
 
 impl Store {
     /// Enqueues a job unless as many wait as may. Errors: `Query`.
-    pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<Enqueued, StoreError> {
+    pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<EnqueueResult, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
         if let Some(key) = &new.idempotency_key {
             let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
             if let Some(row) = first(&tx.fetch(sql, vec![key.as_str().into()]).await?)? {
-                return Ok(Enqueued::Same(row));
+                return Ok(EnqueueResult::Same(row));
             }
         }
         if let Some(refused) = has_place(&mut tx, new.makes.as_deref(), max_queued).await? {
@@ -162,7 +162,7 @@ impl Store {
             .await?;
         let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s) \
              SELECT value, $1, $2, 'queued', $3, $4, $5, $6 FROM counters WHERE name = 'job' RETURNING *";
-        let values: Vec<Value> = vec![
+        let values: Vec<DatabaseValue> = vec![
             new.kind.into(),
             new.makes.into(),
             new.spec.into(),
@@ -172,12 +172,12 @@ impl Store {
         ];
         let row = first(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;
-        row.map(Enqueued::New)
+        row.map(EnqueueResult::New)
             .ok_or(StoreError::Query(sqlx::Error::RowNotFound))
     }
 
     /// Puts a job that failed or was cancelled back among those that wait. Errors: `Query`.
-    pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<Enqueued>, StoreError> {
+    pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
         let sql = "SELECT makes FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
@@ -191,7 +191,7 @@ impl Store {
              lease_until_s = NULL WHERE number = $1 RETURNING *";
         let row = first(&tx.fetch(sql, vec![number.into()]).await?)?;
         tx.commit().await?;
-        Ok(row.map(Enqueued::New))
+        Ok(row.map(EnqueueResult::New))
     }
 
     /// Forgets ended jobs but the latest `kept`; returns their numbers. Errors: `Query`.
@@ -241,7 +241,7 @@ impl Store {
     }
 
     /// Takes up the job that has waited longest, or one whose lease has run out. Errors: `Query`.
-    pub async fn take_up(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+    pub async fn claim(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
              ORDER BY number LIMIT 1";
@@ -270,7 +270,7 @@ impl Store {
 
     /// Renews a lease and writes what happened since; says whether the job was asked to stop, or `None` if the lease is
     /// lost, and then nothing is written. Errors: `Query`.
-    pub async fn renew(&self, lease: Lease, until_s: f64, account: Account) -> Result<Option<bool>, StoreError> {
+    pub async fn renew(&self, lease: Lease, until_s: f64, account: JobUpdate) -> Result<Option<bool>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4 \
              WHERE number = $1 AND token = $2 AND state = 'running' RETURNING cancelling";
@@ -289,7 +289,7 @@ impl Store {
     }
 
     /// Ends a job's work; says whether the lease still held, and writes nothing if not. Errors: `Query`.
-    pub async fn end(&self, lease: Lease, ending: Ending, account: Account) -> Result<bool, StoreError> {
+    pub async fn end(&self, lease: Lease, ending: JobOutcome, account: JobUpdate) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
              cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \

@@ -1,6 +1,6 @@
 //! The API keys: who may call. What is kept of a secret is its hash; this module knows only texts and times.
 
-use super::database::Row;
+use super::database::DatabaseRow;
 use super::{Store, StoreError};
 
 /// A key as it is kept.
@@ -19,7 +19,7 @@ pub struct KeyRow {
 }
 
 impl KeyRow {
-    fn of(row: &Row) -> Result<Self, StoreError> {
+    fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
         Ok(Self {
             id: row.get("id")?,
             name: row.get("name")?,

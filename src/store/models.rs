@@ -1,6 +1,6 @@
 //! Which versions of the models were published, and which of them serves. The files are in the objects.
 
-use super::database::{Row, Tx};
+use super::database::{DatabaseRow, Tx};
 use super::jobs::Lease;
 use super::{Store, StoreError};
 
@@ -15,7 +15,7 @@ pub struct VersionRow {
     pub published_s: f64,
 }
 
-fn version_of(row: &Row) -> Result<u32, StoreError> {
+fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
     let version: i64 = row.get("version")?;
     u32::try_from(version).map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
 }
@@ -49,7 +49,7 @@ impl Store {
         let sql = "SELECT model, version, published_s FROM model_versions \
              WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
         let rows = self.database.fetch(sql, vec![]).await?;
-        let version = |row: &Row| {
+        let version = |row: &DatabaseRow| {
             Ok(VersionRow {
                 model: row.get("model")?,
                 version: version_of(row)?,

@@ -10,7 +10,7 @@ use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
 use crate::frame::preprocess::Preprocess;
-use crate::nn::Condition;
+use crate::nn::ConditioningTensors;
 use crate::types::Seed;
 
 /// A data set's frames in the model's space.
@@ -31,7 +31,7 @@ pub(super) struct WindowBatch {
     /// `[B, horizon, P]`, the same as the encoder would read them, if asked for.
     pub(super) future: Option<Tensor>,
     /// The actions that lead to the targets, and the state at the last input.
-    pub(super) condition: Condition,
+    pub(super) condition: ConditioningTensors,
 }
 
 impl<'a> FrameSource<'a> {
@@ -105,7 +105,7 @@ impl<'a> FrameSource<'a> {
         })
     }
 
-    fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<Condition, TrainError> {
+    fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {
         let (actions, states) = (
             self.dataset.info().action_channels.len(),
             self.dataset.info().state_channels.len(),
@@ -121,7 +121,7 @@ impl<'a> FrameSource<'a> {
             .copied()
             .collect();
         let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
-        Ok(Condition {
+        Ok(ConditioningTensors {
             actions: (actions > 0)
                 .then(|| tensor(future, &[windows.len(), shape.horizon, actions]))
                 .transpose()?,

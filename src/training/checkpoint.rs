@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
-use super::observer::Stage;
+use super::observer::TrainingStage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
 use crate::files::{is_partial_of, remove_abandoned, sha256_hex, write_atomically};
@@ -126,9 +126,9 @@ fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> Tr
 
 /// The numbers beside the tensors.
 #[derive(Serialize, Deserialize)]
-struct Meta {
+struct CheckpointMeta {
     fingerprint: String,
-    stage: Stage,
+    stage: TrainingStage,
     step: usize,
     best_step: usize,
     best_loss: Option<f64>,
@@ -137,14 +137,14 @@ struct Meta {
 
 /// How far a training is: the later, the greater.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
-pub struct Reached {
+pub struct CheckpointPosition {
     /// In this stage.
-    pub stage: Stage,
+    pub stage: TrainingStage,
     /// Updates made in it.
     pub step: usize,
 }
 
-impl Reached {
+impl CheckpointPosition {
     /// How far the training was whose checkpoint these bytes are; none if they are no checkpoint.
     #[must_use]
     pub fn of(checkpoint: &[u8]) -> Option<Self> {
@@ -162,7 +162,7 @@ impl Checkpoint {
     /// Replaces the run's checkpoint by this state. Errors: `Io`, `Checkpoint`.
     pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
         let path = files.checkpoint();
-        let meta = Meta {
+        let meta = CheckpointMeta {
             fingerprint: files.fingerprint().clone(),
             stage: state.stage,
             step: state.step,
@@ -206,7 +206,7 @@ impl Checkpoint {
             .as_ref()
             .and_then(|metadata| metadata.get(META_KEY))
             .ok_or_else(|| failed("it carries no training state".to_owned()))?;
-        let meta: Meta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
+        let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
         if meta.fingerprint != files.fingerprint() {
             return Err(failed("it belongs to another run".to_owned()));
         }

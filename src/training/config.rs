@@ -158,7 +158,7 @@ pub enum TrainingFeedback {
     /// Its own last prediction, as when it is used.
     Prediction,
     /// The true frame's features (teacher forcing).
-    Truth,
+    TeacherForcing,
 }
 
 /// What both stages share.

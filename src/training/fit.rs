@@ -4,9 +4,9 @@ use candle_core::Tensor;
 
 use super::batches::Shuffle;
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
-use super::observer::Stage;
-use super::stage::{Objective, Part};
-use super::{Plan, TrainError};
+use super::observer::TrainingStage;
+use super::stage::{Objective, BatchPart};
+use super::{TrainingPlan, TrainError};
 use crate::dataset::Window;
 use crate::nn::loss::Loss;
 use crate::nn::{Feedback, Model, Parameters};
@@ -18,13 +18,13 @@ const VALIDATION_BATCH_SIZE: usize = 64;
 
 /// The error of prediction and reconstruction.
 pub(super) struct SequenceObjective<'a> {
-    plan: &'a Plan<'a>,
+    plan: &'a TrainingPlan<'a>,
     config: &'a TrainConfig,
     shuffle: Shuffle,
 }
 
 impl<'a> SequenceObjective<'a> {
-    pub(super) fn new(plan: &'a Plan<'a>, config: &'a TrainConfig) -> Self {
+    pub(super) fn new(plan: &'a TrainingPlan<'a>, config: &'a TrainConfig) -> Self {
         Self {
             plan,
             config,
@@ -52,8 +52,8 @@ impl<'a> SequenceObjective<'a> {
 }
 
 impl Objective for SequenceObjective<'_> {
-    fn stage(&self) -> Stage {
-        Stage::Fit
+    fn stage(&self) -> TrainingStage {
+        TrainingStage::Fit
     }
 
     fn steps(&self) -> usize {
@@ -64,11 +64,11 @@ impl Objective for SequenceObjective<'_> {
         self.config.fit.learning_rate
     }
 
-    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError> {
+    fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
         let fit = &self.config.fit;
         let drawn = part.of(self.shuffle.batch(step, fit.batch_size));
         let windows: Vec<&Window> = drawn.into_iter().map(|position| &self.plan.train[position]).collect();
-        let is_forced = fit.feedback == TrainingFeedback::Truth;
+        let is_forced = fit.feedback == TrainingFeedback::TeacherForcing;
         let batch = self
             .plan
             .source
@@ -81,7 +81,7 @@ impl Objective for SequenceObjective<'_> {
             .as_ref()
             .map(|future| self.features(&model, future))
             .transpose()?;
-        let feedback = truth.as_ref().map_or(Feedback::Prediction, Feedback::Truth);
+        let feedback = truth.as_ref().map_or(Feedback::Prediction, Feedback::TeacherForcing);
         let predicted = model.predict(&inputs, &batch.condition, feedback)?;
         let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
         if fit.reconstruction_weight == 0.0 {

@@ -5,14 +5,14 @@ use serde::{Deserialize, Serialize};
 /// The two stages of a training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum Stage {
+pub enum TrainingStage {
     /// The dense codec alone.
     Pretrain,
     /// The recurrent network.
     Fit,
 }
 
-impl std::fmt::Display for Stage {
+impl std::fmt::Display for TrainingStage {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str(match self {
             Self::Pretrain => "pretrain",
@@ -23,11 +23,11 @@ impl std::fmt::Display for Stage {
 
 /// Something that happened.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Event {
+pub enum TrainingEvent {
     /// The run starts, or goes on, here.
     Started {
         /// In this stage.
-        stage: Stage,
+        stage: TrainingStage,
         /// After so many updates of it.
         step: usize,
         /// Training windows there are.
@@ -36,7 +36,7 @@ pub enum Event {
     /// A validation of an earlier call, as the checkpoint recalls it; told before `Started` where a run goes on.
     Recalled {
         /// In this stage.
-        stage: Stage,
+        stage: TrainingStage,
         /// After so many updates.
         step: usize,
         /// The loss of that update's batch.
@@ -47,7 +47,7 @@ pub enum Event {
     /// An update was made.
     Step {
         /// In this stage.
-        stage: Stage,
+        stage: TrainingStage,
         /// Updates made, this one included.
         step: usize,
         /// Updates to make.
@@ -58,7 +58,7 @@ pub enum Event {
     /// The validation windows were predicted.
     Validated {
         /// In this stage.
-        stage: Stage,
+        stage: TrainingStage,
         /// After so many updates.
         step: usize,
         /// Their mean squared error against the target frames.
@@ -69,7 +69,7 @@ pub enum Event {
     /// The state was written to disk.
     Checkpointed {
         /// In this stage.
-        stage: Stage,
+        stage: TrainingStage,
         /// After so many updates.
         step: usize,
     },
@@ -78,11 +78,11 @@ pub enum Event {
 /// Whoever watches a training.
 pub trait Observer {
     /// Is told of each event on the training's thread; a slow answer slows the training.
-    fn on_event(&mut self, event: Event);
+    fn on_event(&mut self, event: TrainingEvent);
 }
 
-impl<F: FnMut(Event)> Observer for F {
-    fn on_event(&mut self, event: Event) {
+impl<F: FnMut(TrainingEvent)> Observer for F {
+    fn on_event(&mut self, event: TrainingEvent) {
         self(event);
     }
 }

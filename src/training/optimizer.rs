@@ -78,7 +78,7 @@ impl Default for AdamConfig {
 
 /// Running means of a tensor's gradient and of its square.
 #[derive(Clone, Debug)]
-struct Moments {
+struct AdamMoments {
     shape: Vec<usize>,
     first: Vec<f32>,
     second: Vec<f32>,
@@ -89,7 +89,7 @@ struct Moments {
 pub struct Adam {
     config: AdamConfig,
     step: u64,
-    moments: BTreeMap<String, Moments>,
+    moments: BTreeMap<String, AdamMoments>,
 }
 
 impl Adam {
@@ -127,7 +127,7 @@ impl Adam {
             clip_norm,
         } = self.config;
         let second_correction = 1.0 - beta2.powi(steps);
-        let rule = Rule {
+        let rule = AdamStep {
             scale: if norm > clip_norm {
                 (clip_norm / norm) as f32
             } else {
@@ -143,13 +143,13 @@ impl Adam {
             let Some(gradient) = gradients.get(name) else {
                 continue;
             };
-            let moments = self.moments.entry(name.to_owned()).or_insert_with(|| Moments {
+            let moments = self.moments.entry(name.to_owned()).or_insert_with(|| AdamMoments {
                 shape: var.dims().to_vec(),
                 first: vec![0.0; var.elem_count()],
                 second: vec![0.0; var.elem_count()],
             });
             with_values(gradient, |gradient| {
-                var.inplace_op1(&Apply {
+                var.inplace_op1(&AdamUpdate {
                     rule,
                     gradient,
                     moments: RefCell::new(moments),
@@ -206,7 +206,7 @@ impl Adam {
                 (Some(first), Some(second)) => {
                     let shape = var.dims().to_vec();
                     let (first, second) = (read(&keys[0], first)?, read(&keys[1], second)?);
-                    moments.insert(name.to_owned(), Moments { shape, first, second });
+                    moments.insert(name.to_owned(), AdamMoments { shape, first, second });
                 }
                 (first, _) => return Err(problem(&keys[usize::from(first.is_some())], "is missing".to_owned())),
             }
@@ -217,7 +217,7 @@ impl Adam {
 
 /// The numbers of one update.
 #[derive(Clone, Copy)]
-struct Rule {
+struct AdamStep {
     scale: f32,
     beta1: f32,
     beta2: f32,
@@ -225,7 +225,7 @@ struct Rule {
     epsilon: f32,
 }
 
-impl Rule {
+impl AdamStep {
     #[inline(always)]
     fn apply(self, parameters: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32]) {
         let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
@@ -239,13 +239,13 @@ impl Rule {
 }
 
 /// One tensor's update, in one pass and in place: candle's own operations would take a dozen passes.
-struct Apply<'a> {
-    rule: Rule,
+struct AdamUpdate<'a> {
+    rule: AdamStep,
     gradient: &'a [f32],
-    moments: RefCell<&'a mut Moments>,
+    moments: RefCell<&'a mut AdamMoments>,
 }
 
-impl InplaceOp1 for Apply<'_> {
+impl InplaceOp1 for AdamUpdate<'_> {
     fn name(&self) -> &'static str {
         "adam"
     }
@@ -255,7 +255,7 @@ impl InplaceOp1 for Apply<'_> {
             candle_core::bail!("adam takes contiguous f32 parameters");
         };
         let mut moments = self.moments.borrow_mut();
-        let Moments { first, second, .. } = &mut **moments;
+        let AdamMoments { first, second, .. } = &mut **moments;
         Arch::new().dispatch(
             #[inline(always)]
             || self.rule.apply(&mut values[from..to], self.gradient, first, second),

@@ -4,9 +4,9 @@ use candle_core::Tensor;
 
 use super::batches::Shuffle;
 use super::config::TrainConfig;
-use super::observer::Stage;
-use super::stage::{Objective, Part};
-use super::{Plan, TrainError, window_frames};
+use super::observer::TrainingStage;
+use super::stage::{Objective, BatchPart};
+use super::{TrainingPlan, TrainError, window_frames};
 use crate::nn::loss::Loss;
 use crate::nn::{Model, Parameters};
 
@@ -15,7 +15,7 @@ const MAX_VALIDATION_FRAMES: usize = 1024;
 
 /// The codec's reconstruction error.
 pub(super) struct CodecObjective<'a> {
-    plan: &'a Plan<'a>,
+    plan: &'a TrainingPlan<'a>,
     config: &'a TrainConfig,
     frames: Vec<usize>,
     shuffle: Shuffle,
@@ -24,7 +24,7 @@ pub(super) struct CodecObjective<'a> {
 }
 
 impl<'a> CodecObjective<'a> {
-    pub(super) fn new(plan: &'a Plan<'a>, config: &'a TrainConfig) -> Result<Self, TrainError> {
+    pub(super) fn new(plan: &'a TrainingPlan<'a>, config: &'a TrainConfig) -> Result<Self, TrainError> {
         let length = config.model.context + config.model.horizon;
         let frames = window_frames(&plan.train, length);
         let validation = window_frames(&plan.validation, length);
@@ -46,8 +46,8 @@ impl<'a> CodecObjective<'a> {
 }
 
 impl Objective for CodecObjective<'_> {
-    fn stage(&self) -> Stage {
-        Stage::Pretrain
+    fn stage(&self) -> TrainingStage {
+        TrainingStage::Pretrain
     }
 
     fn steps(&self) -> usize {
@@ -58,7 +58,7 @@ impl Objective for CodecObjective<'_> {
         self.config.pretrain.learning_rate
     }
 
-    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError> {
+    fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
         let batch = part.of(self.shuffle.batch(step, self.config.pretrain.batch_size));
         let batch: Vec<usize> = batch.into_iter().map(|position| self.frames[position]).collect();
         let frames = self.plan.source.frames(&batch)?;

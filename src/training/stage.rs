@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::TrainError;
 use super::checkpoint::{Checkpoint, RunFiles};
 use super::config::RunConfig;
-use super::observer::{Event, Observer, Stage};
+use super::observer::{TrainingEvent, Observer, TrainingStage};
 use super::optimizer::{Adam, Gradients, OptimizerError};
 use crate::nn::Parameters;
 
@@ -21,13 +21,13 @@ const MAX_LOSS: f64 = 1e3;
 /// What a stage minimizes.
 pub(super) trait Objective: Sync {
     /// Which of the two it is.
-    fn stage(&self) -> Stage;
+    fn stage(&self) -> TrainingStage;
     /// Updates to make.
     fn steps(&self) -> usize;
     /// Adam's learning rate at its highest.
     fn learning_rate(&self) -> f64;
     /// The loss of one part of the batch that belongs to a step, a scalar to differentiate.
-    fn loss(&self, parameters: &Parameters, step: usize, part: Part) -> Result<Tensor, TrainError>;
+    fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
     /// The mean squared error of the validation split against the target frames.
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
 }
@@ -35,12 +35,12 @@ pub(super) trait Objective: Sync {
 /// One of the equal parts of a batch, which are differentiated side by side. Their number is a setting, not the machine's
 /// count of cores, so that the same bits come out everywhere.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Part {
+pub(super) struct BatchPart {
     pub(super) index: usize,
     pub(super) count: usize,
 }
 
-impl Part {
+impl BatchPart {
     /// This part of the batch's items.
     pub(super) fn of(self, items: Vec<usize>) -> Vec<usize> {
         let size = items.len() / self.count;
@@ -51,7 +51,7 @@ impl Part {
 /// A point of the loss curves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct HistoryPoint {
-    pub(super) stage: Stage,
+    pub(super) stage: TrainingStage,
     pub(super) step: usize,
     pub(super) train_loss: f64,
     pub(super) validation_loss: f64,
@@ -59,7 +59,7 @@ pub(super) struct HistoryPoint {
 
 /// Everything that the next step depends on.
 pub(super) struct TrainState {
-    pub(super) stage: Stage,
+    pub(super) stage: TrainingStage,
     /// Updates made in the stage.
     pub(super) step: usize,
     pub(super) parameters: Parameters,
@@ -75,7 +75,7 @@ impl TrainState {
     pub(super) fn new(parameters: Parameters, run: &RunConfig) -> Result<Self, TrainError> {
         let best = parameters.snapshot()?;
         Ok(Self {
-            stage: Stage::Pretrain,
+            stage: TrainingStage::Pretrain,
             step: 0,
             parameters,
             optimizer: Adam::new(run.adam()),
@@ -87,7 +87,7 @@ impl TrainState {
     }
 
     /// Takes the best weights of this stage and starts the next with a fresh optimizer.
-    pub(super) fn enter(&mut self, stage: Stage, run: &RunConfig) -> Result<(), TrainError> {
+    pub(super) fn enter(&mut self, stage: TrainingStage, run: &RunConfig) -> Result<(), TrainError> {
         self.restore_best()?;
         self.stage = stage;
         self.step = 0;
@@ -106,7 +106,7 @@ impl TrainState {
 
 /// Whether a stage came to its end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Flow {
+pub(super) enum StageEnd {
     Done,
     Interrupted,
 }
@@ -126,18 +126,18 @@ impl StageRunner<'_> {
         objective: &dyn Objective,
         state: &mut TrainState,
         observer: &mut dyn Observer,
-    ) -> Result<Flow, TrainError> {
+    ) -> Result<StageEnd, TrainError> {
         let (stage, steps) = (objective.stage(), objective.steps());
         let mut saved_step = state.step;
         while state.step < steps {
             if self.cancelled.load(Ordering::Relaxed) {
                 self.save(state, observer)?;
-                return Ok(Flow::Interrupted);
+                return Ok(StageEnd::Interrupted);
             }
             let loss = self.update(objective, state, saved_step)?;
             state.step += 1;
             let step = state.step;
-            observer.on_event(Event::Step {
+            observer.on_event(TrainingEvent::Step {
                 stage,
                 step,
                 steps,
@@ -151,7 +151,7 @@ impl StageRunner<'_> {
                 saved_step = step;
             }
         }
-        Ok(Flow::Done)
+        Ok(StageEnd::Done)
     }
 
     /// One update; returns the batch's loss.
@@ -168,7 +168,7 @@ impl StageRunner<'_> {
             let loss = objective.loss(
                 parameters,
                 step,
-                Part {
+                BatchPart {
                     index,
                     count: self.run.batch_parts,
                 },
@@ -228,7 +228,7 @@ impl StageRunner<'_> {
             train_loss,
             validation_loss: loss,
         });
-        observer.on_event(Event::Validated {
+        observer.on_event(TrainingEvent::Validated {
             stage,
             step,
             loss,
@@ -240,7 +240,7 @@ impl StageRunner<'_> {
     /// Writes the state to disk.
     pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
         Checkpoint::save(self.files, state)?;
-        observer.on_event(Event::Checkpointed {
+        observer.on_event(TrainingEvent::Checkpointed {
             stage: state.stage,
             step: state.step,
         });

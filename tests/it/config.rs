@@ -1,24 +1,24 @@
 //! The configuration: what goes over what, where values come from, and how wrong ones are refused.
 
-use foreframe::config::{Config, ConfigError, Layer, Loaded};
+use foreframe::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
 use foreframe::telemetry::LogFormat;
 
-fn environment(variables: &[(&str, &str)]) -> Vec<Layer> {
+fn environment(variables: &[(&str, &str)]) -> Vec<ConfigLayer> {
     let owned = variables
         .iter()
         .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()));
-    Layer::environment(owned).collect()
+    ConfigLayer::environment(owned).collect()
 }
 
-fn file(text: &str) -> Layer {
+fn file(text: &str) -> ConfigLayer {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("mine.toml");
     std::fs::write(&path, text).unwrap();
-    Layer::file(&path).unwrap()
+    ConfigLayer::file(&path).unwrap()
 }
 
-fn refused(layers: Vec<Layer>) -> String {
-    Loaded::from_layers(layers).unwrap_err().to_string()
+fn refused(layers: Vec<ConfigLayer>) -> String {
+    LoadedConfig::from_layers(layers).unwrap_err().to_string()
 }
 
 #[test]
@@ -29,8 +29,8 @@ fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
             ("FOREFRAME_MAX_STREAMS", "2"),
             ("FOREFRAME_MAX_FRAMES", "2"),
         ]))
-        .chain([Layer::setting("max_streams=3").unwrap()]);
-    let loaded = Loaded::from_layers(layers).unwrap();
+        .chain([ConfigLayer::setting("max_streams=3").unwrap()]);
+    let loaded = LoadedConfig::from_layers(layers).unwrap();
     let limits = &loaded.config.server;
     assert_eq!((limits.max_streams, limits.max_frames, limits.max_batch), (3, 2, 1));
     let text = loaded.to_toml();
@@ -53,9 +53,9 @@ fn what_is_printed_can_be_read_as_a_file() {
         "log_format=json",
         "models_dir=m",
     ];
-    let settings = settings.map(|setting| Layer::setting(setting).unwrap());
-    let printed = Loaded::from_layers(settings).unwrap();
-    let read = Loaded::from_layers([file(&printed.to_toml())]).unwrap();
+    let settings = settings.map(|setting| ConfigLayer::setting(setting).unwrap());
+    let printed = LoadedConfig::from_layers(settings).unwrap();
+    let read = LoadedConfig::from_layers([file(&printed.to_toml())]).unwrap();
     assert_eq!(read.config, printed.config);
     assert_eq!(read.config.log_format, LogFormat::Json);
     assert_eq!(read.config.server.cors_origins, ["http://a"]);
@@ -65,9 +65,9 @@ fn what_is_printed_can_be_read_as_a_file() {
 fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
     let defaults = Config::default().server;
     for (field, value, range) in defaults.bounds() {
-        let setting = Layer::setting(&format!("{field}={value}")).unwrap();
+        let setting = ConfigLayer::setting(&format!("{field}={value}")).unwrap();
         assert_eq!(
-            Loaded::from_layers([setting]).unwrap().config.server,
+            LoadedConfig::from_layers([setting]).unwrap().config.server,
             defaults,
             "{field}"
         );
@@ -87,7 +87,7 @@ fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
 
 #[test]
 fn what_is_no_setting_is_refused_with_where_it_was_given() {
-    let set = |setting| vec![Layer::setting(setting).unwrap()];
+    let set = |setting| vec![ConfigLayer::setting(setting).unwrap()];
     for (layers, expected) in [
         (
             environment(&[("FOREFRAME_MAX_STREAM", "2")]),
@@ -114,15 +114,15 @@ fn what_is_no_setting_is_refused_with_where_it_was_given() {
     ] {
         assert_eq!(refused(layers), expected);
     }
-    assert!(matches!(Layer::setting("max_streams"), Err(ConfigError::Setting(_))));
+    assert!(matches!(ConfigLayer::setting("max_streams"), Err(ConfigError::Setting(_))));
     let dir = tempfile::tempdir().unwrap();
     assert!(matches!(
-        Layer::file(&dir.path().join("none")),
+        ConfigLayer::file(&dir.path().join("none")),
         Err(ConfigError::Read { .. })
     ));
     std::fs::write(dir.path().join("bad"), "a = = 1").unwrap();
     assert!(matches!(
-        Layer::file(&dir.path().join("bad")),
+        ConfigLayer::file(&dir.path().join("bad")),
         Err(ConfigError::Toml { .. })
     ));
 }
@@ -134,14 +134,14 @@ fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
         ("FOREFRAME_TEST_POSTGRES", "x"),
         ("HOME", "/"),
     ];
-    let loaded = Loaded::from_layers(environment(&variables)).unwrap();
+    let loaded = LoadedConfig::from_layers(environment(&variables)).unwrap();
     assert_eq!(loaded.config, Config::default());
 }
 
 #[test]
 fn a_password_is_not_printed() {
     let url = "database_url=postgres://ada:secret@db/foreframe";
-    let text = Loaded::from_layers([Layer::setting(url).unwrap()]).unwrap().to_toml();
+    let text = LoadedConfig::from_layers([ConfigLayer::setting(url).unwrap()]).unwrap().to_toml();
     assert!(
         text.contains("postgres://ada:***@db/foreframe") && !text.contains("secret"),
         "{text}"

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use foreframe::dataset::{CollectConfig, Dataset, DatasetError, DatasetInfo, Progress, Standing, collect};
+use foreframe::dataset::{CollectConfig, Dataset, DatasetError, DatasetInfo, CollectProgress, CollectionStatus, collect};
 use foreframe::sim::{Scenario, World, WorldConfig};
 use foreframe::types::Seed;
 use proptest::prelude::*;
@@ -34,7 +34,7 @@ fn run(config: &CollectConfig) -> Result<DatasetInfo, DatasetError> {
 fn run_until(config: &CollectConfig, trials: u64) -> Result<DatasetInfo, DatasetError> {
     let cancelled = AtomicBool::new(false);
     let seen = AtomicU64::new(0);
-    let on_progress = |_: Progress| {
+    let on_progress = |_: CollectProgress| {
         if seen.fetch_add(1, Ordering::Relaxed) >= trials {
             cancelled.store(true, Ordering::Relaxed);
         }
@@ -141,9 +141,9 @@ fn going_on_simulates_only_what_is_missing() {
         error.to_string(),
         "stopped with 6 of 11 trials kept; run the same command again to go on"
     );
-    assert_eq!(Standing::of(&one_thread).unwrap(), Standing::Begun { trials: 6 });
+    assert_eq!(CollectionStatus::of(&one_thread).unwrap(), CollectionStatus::PendingStep { trials: 6 });
     let first = AtomicU64::new(u64::MAX);
-    let told = |progress: Progress| {
+    let told = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
     };
     collect(&one_thread, &told, &AtomicBool::new(false)).unwrap();
@@ -187,7 +187,7 @@ fn a_finished_set_is_returned_at_once() {
         &AtomicBool::new(false),
     )
     .unwrap();
-    assert_eq!(Standing::of(&config(&out)).unwrap(), Standing::Finished(Box::new(info)));
+    assert_eq!(CollectionStatus::of(&config(&out)).unwrap(), CollectionStatus::Finished(Box::new(info)));
     assert_eq!(contents(&out), before);
 }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use foreframe::dataset::Dataset;
-use foreframe::evaluation::report::{Outcome, Report};
+use foreframe::evaluation::report::{SetOutcome, EvaluationReport};
 use foreframe::evaluation::{self, EvaluateConfig, EvaluationError};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe::registry::{DatasetStamp, LoadedModel};
@@ -56,7 +56,7 @@ fn config() -> EvaluateConfig<'static> {
     }
 }
 
-fn evaluate(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> Result<Report, EvaluationError> {
+fn evaluate(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> Result<EvaluationReport, EvaluationError> {
     evaluation::run(loaded, dataset, config, &|_| {})
 }
 
@@ -85,7 +85,7 @@ fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
     let variants = &scores.actions.as_ref().unwrap().rows;
     assert_eq!(variants.len(), 4);
     assert!((variants[0].mse.mean - scores.methods[0].mse.mean).abs() < 1e-9);
-    assert!(matches!(&report.sets[1].outcome, Outcome::Skipped { reason } if reason.contains("start/goal")));
+    assert!(matches!(&report.sets[1].outcome, SetOutcome::Skipped { reason } if reason.contains("start/goal")));
     assert_eq!(report.stamp.split_seed, Seed(7), "the split is that of the training");
 }
 
@@ -129,7 +129,7 @@ fn report_and_figures_are_written_and_read_back() {
         "report.md",
     ];
     assert_eq!(written, expected.map(str::to_owned).into());
-    let read: Report = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    let read: EvaluationReport = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(
         read.to_markdown(),
         std::fs::read_to_string(out.join("report.md")).unwrap()

@@ -41,7 +41,7 @@ async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009
             client
                 .send(&ClientMessage::Frame(FrameMessage { image, ..step(9) }))
                 .await;
-            assert!(matches!(client.receive().await, ServerMessage::Warming { .. }));
+            assert!(matches!(client.receive().await, ServerMessage::Buffering { .. }));
             let refused = client.receive().await;
             let (code, detail, next_seq) = refusal(&refused);
             assert_eq!((code, next_seq), (ErrorCode::Malformed, answered as u64 + 1));
@@ -103,7 +103,7 @@ async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_
             assert_eq!(refusal(&answer), (ErrorCode::Malformed, detail.as_str(), seq));
             assert!(matches!(
                 client.ask(&send_frame(seq)).await,
-                ServerMessage::Warming { .. }
+                ServerMessage::Buffering { .. }
             ));
         };
         scene.beside(confused).await;
@@ -169,7 +169,7 @@ async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_go
         }
         assert!(matches!(
             client.ask(&send_frame(0)).await,
-            ServerMessage::Warming { .. }
+            ServerMessage::Buffering { .. }
         ));
     };
     scene.beside(lying).await;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::jobs::{Execute, Failure, JobError, JobLimits, JobSpec, Jobs, Outcome, Report};
+use foreframe::jobs::{JobExecutor, JobFailure, JobError, JobLimits, JobSpec, Jobs, JobResult, JobReporter};
 use foreframe::nn::Conditioning;
 use foreframe::server::{App, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
@@ -20,31 +20,31 @@ const JOBS: &str = "/v1/jobs";
 
 /// Work that does what the test says, and looks at its flag.
 struct Puppet {
-    orders: Mutex<Receiver<Result<(), Failure>>>,
+    orders: Mutex<Receiver<Result<(), JobFailure>>>,
     heeds_cancel: bool,
 }
 
-impl Execute for Puppet {
+impl JobExecutor for Puppet {
     fn check<'a>(&'a self, _: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
         Box::pin(async { Ok(()) })
     }
 
-    fn execute(&self, _: &JobSpec, report: &Report, cancelled: &AtomicBool) -> Result<Outcome, Failure> {
+    fn execute(&self, _: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         report.progress(3, 10, "pretending");
         report.line(format!("attempt {}", report.lease().token));
         let orders = self.orders.lock().unwrap();
         loop {
             if let Ok(order) = orders.recv_timeout(Duration::from_millis(1)) {
-                return order.map(|()| Outcome::default());
+                return order.map(|()| JobResult::default());
             }
             if self.heeds_cancel && cancelled.load(Ordering::Acquire) {
-                return Err(Failure::Cancelled);
+                return Err(JobFailure::Cancelled);
             }
         }
     }
 }
 
-fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<(), Failure>>) {
+fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<(), JobFailure>>) {
     let (order, orders) = channel();
     let puppet = Puppet {
         orders: Mutex::new(orders),
@@ -103,7 +103,7 @@ async fn a_job_goes_its_way_and_can_be_watched() {
     state_becomes(&app, "job-1", "succeeded").await;
 
     post(&app, JOBS, &collect("b")).await;
-    order.send(Err(Failure::Failed("the disk is full".to_owned()))).unwrap();
+    order.send(Err(JobFailure::Failed("the disk is full".to_owned()))).unwrap();
     assert_eq!(
         state_becomes(&app, "job-2", "failed").await["error"],
         "the disk is full"
@@ -195,7 +195,7 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
         post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"],
         "queued"
     );
-    order.send(Err(Failure::Failed("no luck".to_owned()))).unwrap();
+    order.send(Err(JobFailure::Failed("no luck".to_owned()))).unwrap();
     let path = "/v1/jobs/job-1";
     let failed = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
     assert_eq!((&failed["error"], &failed["attempts"]), (&json!("no luck"), &json!(2)));
@@ -220,7 +220,7 @@ async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
     let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
     until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
     // To another process whose clock says that the lease has long run out.
-    let (row, thief) = app.store().take_up("another", 1e12, 2e12).await.unwrap().unwrap();
+    let (row, thief) = app.store().claim("another", 1e12, 2e12).await.unwrap().unwrap();
     assert_eq!((row.number, thief.token), (1, 2));
     post(&app, JOBS, &collect("b")).await;
     // The runner is free for the next job once it has seen that it lost this one.

@@ -84,7 +84,7 @@ impl Scene {
         self.robot.next_seq += 1;
         let answer = self.robot.ask(&send_frame(seq)).await;
         let Some(first) = (seq + 1).checked_sub(CONTEXT as u64) else {
-            assert!(matches!(answer, ServerMessage::Warming { .. }), "{answer:?}");
+            assert!(matches!(answer, ServerMessage::Buffering { .. }), "{answer:?}");
             return;
         };
         let ServerMessage::Prediction { frames, .. } = answer else {

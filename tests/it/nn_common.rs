@@ -1,7 +1,7 @@
 //! Small models and inputs for the tests of the network.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{ChannelScale, Condition, Conditioning, ModelSpec, Reconstruction};
+use foreframe::nn::{ChannelScale, ConditioningTensors, Conditioning, ModelSpec, Reconstruction};
 
 pub(crate) fn channel(name: &str, mean: f32, std: f32) -> ChannelScale {
     ChannelScale {
@@ -39,16 +39,16 @@ pub(crate) fn values(shape: &[usize], phase: f32) -> Tensor {
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
-pub(crate) fn condition(spec: &ModelSpec, batch: usize) -> Condition {
-    Condition {
+pub(crate) fn condition(spec: &ModelSpec, batch: usize) -> ConditioningTensors {
+    ConditioningTensors {
         actions: Some(values(&[batch, spec.horizon, spec.actions.len()], 1.0)),
         state: Some((values(&[batch, spec.states.len()], 2.0) * 1e-3).unwrap()),
     }
 }
 
-pub(crate) fn in_f64(condition: &Condition) -> Condition {
+pub(crate) fn in_f64(condition: &ConditioningTensors) -> ConditioningTensors {
     let cast = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.to_dtype(DType::F64).unwrap());
-    Condition {
+    ConditioningTensors {
         actions: cast(&condition.actions),
         state: cast(&condition.state),
     }

@@ -1,19 +1,19 @@
 //! The whole model: gradients, determinism, conditioning, and what it refuses.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{Condition, Conditioning, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
+use foreframe::nn::{ConditioningTensors, Conditioning, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
 use crate::nn_common::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
 
 /// A loss that every tensor of the model has a part in.
-fn whole_loss(model: &Model, frames: &Tensor, condition: &Condition, truth: Option<&Tensor>) -> Tensor {
+fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
     let spec = model.spec();
     let batch = frames.dim(0).unwrap();
     let flat = frames.flatten(0, 1).unwrap();
     let features = model.encode_frames(&flat).unwrap();
     let features = features.reshape((batch, spec.context, spec.features)).unwrap();
-    let feedback = truth.map_or(Feedback::Prediction, Feedback::Truth);
+    let feedback = truth.map_or(Feedback::Prediction, Feedback::TeacherForcing);
     let predicted = model.predict(&features, condition, feedback).unwrap();
     let again = model.reconstruct(&features).unwrap();
     let predicted = model.decode_frames(&predicted.flatten(0, 1).unwrap()).unwrap();
@@ -125,7 +125,7 @@ fn one_seed_gives_one_set_of_bits_whatever_other_threads_do() {
     let run = || {
         let parameters = Parameters::initialize(&spec, Seed(11)).unwrap();
         let model = Model::new(spec.clone(), &parameters).unwrap();
-        let loss = whole_loss(&model, &frames, &Condition::none(), None);
+        let loss = whole_loss(&model, &frames, &ConditioningTensors::none(), None);
         let gradients = loss.backward().unwrap();
         let of = |(_, var): (&str, &candle_core::Var)| bits(gradients.get(var.as_tensor()).unwrap());
         (bits(&loss), parameters.iter().map(of).collect::<Vec<_>>())
@@ -149,7 +149,7 @@ fn a_window_is_predicted_alike_alone_and_in_company() {
     let together = model.predict_frames(&frames, &condition).unwrap();
     for window in 0..5 {
         let one = |tensor: &Tensor| tensor.narrow(0, window, 1).unwrap();
-        let own = Condition {
+        let own = ConditioningTensors {
             actions: condition.actions.as_ref().map(one),
             state: condition.state.as_ref().map(one),
         };
@@ -163,7 +163,7 @@ fn without_conditioning_given_actions_change_nothing() {
     let spec = tiny(Conditioning::None, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
-    let without = model.predict_frames(&frames, &Condition::none()).unwrap();
+    let without = model.predict_frames(&frames, &ConditioningTensors::none()).unwrap();
     let with = model.predict_frames(&frames, &condition(&spec, 2)).unwrap();
     assert_eq!(bits(&without), bits(&with));
 }
@@ -177,7 +177,7 @@ fn with_conditioning_each_action_changes_only_what_follows_it() {
         let mut actions = vec![0.1f32; spec.horizon * 2];
         actions[2 * 2] = third;
         let actions = Tensor::from_vec(actions, (1, spec.horizon, 2), &Device::Cpu).unwrap();
-        let condition = Condition {
+        let condition = ConditioningTensors {
             actions: Some(actions),
             state: None,
         };
@@ -200,19 +200,19 @@ fn a_missing_or_misshapen_input_is_named_with_what_would_be_right() {
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
     let error =
-        |frames: &Tensor, condition: &Condition| model.predict_frames(frames, condition).unwrap_err().to_string();
+        |frames: &Tensor, condition: &ConditioningTensors| model.predict_frames(frames, condition).unwrap_err().to_string();
     let full = condition(&spec, 2);
     assert_eq!(
-        error(&frames, &Condition::none()),
+        error(&frames, &ConditioningTensors::none()),
         "no actions given; this model's conditioning is \"state-action\", which takes [2, 4, 2]: windows, predicted \
          frames, components (linear, angular)"
     );
-    let stateless = Condition {
+    let stateless = ConditioningTensors {
         state: None,
         ..full.clone()
     };
     assert!(error(&frames, &stateless).starts_with("no state given"));
-    let short = Condition {
+    let short = ConditioningTensors {
         actions: Some(values(&[2, 3, 2], 0.0)),
         ..full.clone()
     };

@@ -34,7 +34,7 @@ async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() 
     assert_eq!(client.ask(&configure).await, configured);
     for (seq, expected) in [(2, 2), (3, 0), (5, 1)] {
         let answer = client.ask(&send_frame(seq)).await;
-        let (ServerMessage::Warming { skipped, .. } | ServerMessage::Prediction { skipped, .. }) = answer else {
+        let (ServerMessage::Buffering { skipped, .. } | ServerMessage::Prediction { skipped, .. }) = answer else {
             panic!("{answer:?}")
         };
         assert_eq!(skipped, expected);
@@ -91,7 +91,7 @@ async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from
                 in_a_row += 1;
                 assert!(in_a_row <= ServerConfig::default().max_pipelined_frames);
             }
-            ServerMessage::Warming { seq, .. } => assert_eq!(*seq, expected),
+            ServerMessage::Buffering { seq, .. } => assert_eq!(*seq, expected),
             _ => {
                 // From the same context, whatever was predicted on the way.
                 assert_eq!(frames(&answer), frames(&from_all));
@@ -123,7 +123,7 @@ async fn frames_sent_ahead_of_their_answers_are_answered_in_order() {
     client.send(&ClientMessage::Close(CloseMessage {})).await;
     for expected in 0..100 {
         let answer = client.receive().await;
-        let (ServerMessage::Warming { seq, .. } | ServerMessage::Prediction { seq, .. }) = answer else {
+        let (ServerMessage::Buffering { seq, .. } | ServerMessage::Prediction { seq, .. }) = answer else {
             panic!("{answer:?}")
         };
         assert_eq!(seq, expected);
@@ -277,7 +277,7 @@ async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
     assert_eq!(client.next_seq, 1);
     assert!(matches!(
         client.ask(&send_frame(1)).await,
-        ServerMessage::Warming { have: 2, .. }
+        ServerMessage::Buffering { have: 2, .. }
     ));
     server.stop().await;
 }
@@ -344,7 +344,7 @@ async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was()
     assert_eq!(get(&app, &session.path("/state")).await.json(), before);
     assert!(matches!(
         client.ask(&send_frame(0)).await,
-        ServerMessage::Warming { have: 1, .. }
+        ServerMessage::Buffering { have: 1, .. }
     ));
     server.stop().await;
 }

@@ -88,7 +88,7 @@ async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
     assert_eq!(older.end().await, (Some(ClosingReason::Replaced), Some(1008)));
     assert!(matches!(
         newer.ask(&send_frame(1)).await,
-        ServerMessage::Warming { have: 2, .. }
+        ServerMessage::Buffering { have: 2, .. }
     ));
     let gone = Request::delete(session.path("")).body(Body::empty()).unwrap();
     assert_eq!(send(&app, gone).await.status, 204);
@@ -140,7 +140,7 @@ async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_neve
     // While its stream is open it does not expire, and holds its place.
     assert!(matches!(
         client.ask(&send_frame(0)).await,
-        ServerMessage::Warming { .. }
+        ServerMessage::Buffering { .. }
     ));
     let full = post(&app, "/v1/sessions", &moving()).await;
     assert_eq!(full.detail(503), "1 sessions are open already; try again later");

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use foreframe::store::{Account, Ending, Enqueued, JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
+use foreframe::store::{JobUpdate, JobOutcome, EnqueueResult, JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
@@ -61,13 +61,13 @@ fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
 
 async fn enqueued(store: &Store) -> JobRow {
     match store.enqueue(job(None, None), 100, 1.0).await.unwrap() {
-        Enqueued::New(row) => row,
+        EnqueueResult::New(row) => row,
         other => panic!("{other:?}"),
     }
 }
 
-fn ending(state: &'static str) -> Ending {
-    Ending {
+fn ending(state: &'static str) -> JobOutcome {
+    JobOutcome {
         state,
         error: None,
         outcome: Some("{}".to_owned()),
@@ -76,8 +76,8 @@ fn ending(state: &'static str) -> Ending {
     }
 }
 
-fn account(line: &str) -> Account {
-    Account {
+fn account(line: &str) -> JobUpdate {
+    JobUpdate {
         progress: "{\"done\":1}".to_owned(),
         lines: vec![(2.0, line.to_owned())],
         losses: vec![LossRow {
@@ -95,17 +95,17 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
     for (_dir, store) in stores("way").await {
         let row = enqueued(&store).await;
         assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
-        let (row, lease) = store.take_up("me", 2.0, 10.0).await.unwrap().unwrap();
+        let (row, lease) = store.claim("me", 2.0, 10.0).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.started_s, row.token),
             ("running", Some(2.0), 1)
         );
-        assert_eq!(store.take_up("me", 3.0, 10.0).await.unwrap(), None);
+        assert_eq!(store.claim("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
             assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
-        assert_eq!(store.renew(lease, 20.0, Account::default()).await.unwrap(), Some(true));
+        assert_eq!(store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(), Some(true));
         assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
         assert_eq!(
@@ -121,7 +121,7 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
         assert_eq!(lines, [(4, "four"), (5, "five")]);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
         assert_eq!(store.job_losses(1).await.unwrap(), account("").losses);
-        assert!(!store.end(lease, ending("succeeded"), Account::default()).await.unwrap());
+        assert!(!store.end(lease, ending("succeeded"), JobUpdate::default()).await.unwrap());
     }
 }
 
@@ -129,9 +129,9 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
 async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
     for (_dir, store) in stores("fence").await {
         enqueued(&store).await;
-        let (_, stale) = store.take_up("slow", 0.0, 10.0).await.unwrap().unwrap();
-        assert_eq!(store.take_up("quick", 9.9, 30.0).await.unwrap(), None);
-        let (row, fresh) = store.take_up("quick", 10.1, 30.0).await.unwrap().unwrap();
+        let (_, stale) = store.claim("slow", 0.0, 10.0).await.unwrap().unwrap();
+        assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
+        let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
         assert_eq!(store.renew(stale, 99.0, account("from the dead")).await.unwrap(), None);
         assert!(
@@ -142,10 +142,10 @@ async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
         );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
-        assert_eq!(store.renew(fresh, 40.0, Account::default()).await.unwrap(), Some(false));
+        assert_eq!(store.renew(fresh, 40.0, JobUpdate::default()).await.unwrap(), Some(false));
         assert_eq!(store.release_leases("slow").await.unwrap(), 0);
         assert_eq!(store.release_leases("quick").await.unwrap(), 1);
-        assert_eq!(store.take_up("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
+        assert_eq!(store.claim("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
     }
 }
 
@@ -155,15 +155,15 @@ async fn places_keys_and_names_are_given_once() {
         let enqueue = async |new: NewJob| store.enqueue(new, 2, 0.0).await.unwrap();
         assert!(matches!(
             enqueue(job(Some("data set a"), Some("k"))).await,
-            Enqueued::New(_)
+            EnqueueResult::New(_)
         ));
-        assert!(matches!(enqueue(job(Some("data set b"), Some("k"))).await, Enqueued::Same(row) if row.number == 1));
-        assert_eq!(enqueue(job(Some("data set a"), None)).await, Enqueued::Taken);
-        assert!(matches!(enqueue(job(None, None)).await, Enqueued::New(_)));
-        assert_eq!(enqueue(job(None, None)).await, Enqueued::Full);
+        assert!(matches!(enqueue(job(Some("data set b"), Some("k"))).await, EnqueueResult::Same(row) if row.number == 1));
+        assert_eq!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::Taken);
+        assert!(matches!(enqueue(job(None, None)).await, EnqueueResult::New(_)));
+        assert_eq!(enqueue(job(None, None)).await, EnqueueResult::Full);
         assert!(store.cancel_queued(1, 1.0).await.unwrap() && !store.cancel_queued(1, 1.0).await.unwrap());
-        assert!(matches!(enqueue(job(Some("data set a"), None)).await, Enqueued::New(row) if row.number == 3));
-        assert_eq!(store.requeue(1, 2).await.unwrap(), Some(Enqueued::Taken));
+        assert!(matches!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::New(row) if row.number == 3));
+        assert_eq!(store.requeue(1, 2).await.unwrap(), Some(EnqueueResult::Taken));
         assert_eq!(store.requeue(2, 2).await.unwrap(), None);
         assert_eq!(store.job_of_key("k").await.unwrap().unwrap().number, 1);
     }
@@ -178,7 +178,7 @@ async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
         });
         let mut taken = 0;
         for task in enqueueing.collect::<Vec<_>>() {
-            taken += usize::from(matches!(task.await.unwrap(), Enqueued::New(_)));
+            taken += usize::from(matches!(task.await.unwrap(), EnqueueResult::New(_)));
         }
         assert_eq!(taken, 20);
         let runners = (0..6).map(|runner| {
@@ -186,7 +186,7 @@ async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
             tokio::spawn(async move {
                 let mut numbers = Vec::new();
                 while numbers.len() < 20 {
-                    match store.take_up(&runner.to_string(), 0.0, 10.0).await.unwrap() {
+                    match store.claim(&runner.to_string(), 0.0, 10.0).await.unwrap() {
                         Some((row, _)) => numbers.push(row.number),
                         // Those that others are about to take are passed over.
                         None if store.jobs(queued()).await.unwrap().is_empty() => break,
@@ -258,7 +258,7 @@ async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
 /// A job of that model, taken up, with its version reserved.
 async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
     enqueued(store).await;
-    let (_, lease) = store.take_up("me", 0.0, 10.0).await.unwrap().unwrap();
+    let (_, lease) = store.claim("me", 0.0, 10.0).await.unwrap().unwrap();
     (lease, store.reserve_version(lease, model, 4).await.unwrap().unwrap())
 }
 
@@ -271,14 +271,14 @@ async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_end
             (5, Some(5))
         );
         assert_eq!(store.published_versions().await.unwrap(), []);
-        let published = |version, activates| Ending {
+        let published = |version, activates| JobOutcome {
             published: Some(("m".to_owned(), version, activates)),
             ..ending("succeeded")
         };
-        assert!(store.end(lease, published(5, true), Account::default()).await.unwrap());
+        assert!(store.end(lease, published(5, true), JobUpdate::default()).await.unwrap());
         let (lease, version) = reserve(&store, "m").await;
         assert_eq!(version, 6);
-        assert!(store.end(lease, published(6, true), Account::default()).await.unwrap());
+        assert!(store.end(lease, published(6, true), JobUpdate::default()).await.unwrap());
         let listed = store.published_versions().await.unwrap();
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
         // The first stays chosen until another is.

@@ -69,12 +69,12 @@ async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
     let server = run(app.clone()).await;
     let mut socket = open(&server, "plain").await;
     for seq in 0..CONTEXT as u64 - 1 {
-        let warming = ask(&mut socket, frame_message(seq)).await;
+        let buffering = ask(&mut socket, frame_message(seq)).await;
         assert_eq!(
-            (&warming["type"], &warming["have"]),
-            (&json!("warming"), &json!(seq + 1))
+            (&buffering["type"], &buffering["have"]),
+            (&json!("buffering"), &json!(seq + 1))
         );
-        assert_eq!(warming["need"], CONTEXT);
+        assert_eq!(buffering["need"], CONTEXT);
     }
     let prediction = ask(&mut socket, frame_message(CONTEXT as u64 - 1)).await;
     assert_eq!(prediction["timestamp_us"], (CONTEXT as u64 - 1) * 1000);
@@ -202,7 +202,7 @@ async fn what_is_refused_leaves_the_stream_where_it_was() {
     }
     socket.send(Message::binary(vec![1, 2, 3])).await.unwrap();
     assert_eq!(receive(&mut socket).await["code"], "malformed");
-    assert_eq!(ask(&mut socket, with(json!({}))).await["type"], "warming");
+    assert_eq!(ask(&mut socket, with(json!({}))).await["type"], "buffering");
     let pong = ask(&mut socket, json!({"type": "ping", "timestamp_us": 7})).await;
     assert_eq!(pong, json!({"type": "pong", "timestamp_us": 7}));
     let closing = ask(&mut socket, json!({"type": "close"})).await;

@@ -134,7 +134,7 @@ async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_
             .unwrap();
         for seq in 0..trip.frames.len() {
             match client.ask(&trip.message(seq)).await {
-                ServerMessage::Warming { have, .. } => assert_eq!(have, seq + 1),
+                ServerMessage::Buffering { have, .. } => assert_eq!(have, seq + 1),
                 ServerMessage::Prediction { frames, .. } => trip.check(model, seq, &frames),
                 other => panic!("{other:?}"),
             }
@@ -157,14 +157,14 @@ fn a_batch_of_many_windows_is_predicted_to_1e_5_as_each_alone() {
         };
         let features = tensor(&[24, spec.context, spec.features]);
         let windows: Vec<u32> = (0..64).map(|future| future * 7 % 24).collect();
-        let condition = foreframe::nn::Condition {
+        let condition = foreframe::nn::ConditioningTensors {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
         };
         let together = model.model.predict_futures(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
             let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
-            let condition = foreframe::nn::Condition {
+            let condition = foreframe::nn::ConditioningTensors {
                 actions: row(&condition.actions),
                 state: row(&condition.state),
             };
@@ -199,7 +199,7 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
             tokio::task::yield_now().await;
         }
         match client.receive().await {
-            ServerMessage::Warming { have, .. } => assert_eq!(have, answered + 1),
+            ServerMessage::Buffering { have, .. } => assert_eq!(have, answered + 1),
             ServerMessage::Prediction { frames, seq, .. } => {
                 assert_eq!(seq, answered as u64);
                 unchecked.push((answered, frames));

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use foreframe::dataset::Dataset;
 use foreframe::registry;
-use foreframe::training::{Event, Outcome, TrainConfig, TrainError, Training, run};
+use foreframe::training::{TrainingEvent, TrainingOutcome, TrainConfig, TrainError, Training, run};
 
 use crate::fixtures::moving_squares;
 
@@ -34,12 +34,12 @@ fn small_config(extra: &[&str]) -> TrainConfig {
     TrainConfig::layered("paper", None, &settings).unwrap()
 }
 
-fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<Outcome, TrainError> {
+fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<TrainingOutcome, TrainError> {
     train_until(config, dataset, dir, usize::MAX)
 }
 
 /// Trains until so many updates were made in this call.
-fn train_until(config: &TrainConfig, dataset: &Dataset, dir: &Path, updates: usize) -> Result<Outcome, TrainError> {
+fn train_until(config: &TrainConfig, dataset: &Dataset, dir: &Path, updates: usize) -> Result<TrainingOutcome, TrainError> {
     let cancelled = AtomicBool::new(false);
     let made = Cell::new(0);
     let training = Training {
@@ -48,8 +48,8 @@ fn train_until(config: &TrainConfig, dataset: &Dataset, dir: &Path, updates: usi
         run_dir: dir,
         command: "test",
     };
-    let mut observer = |event: Event| {
-        if let Event::Step { .. } = event {
+    let mut observer = |event: TrainingEvent| {
+        if let TrainingEvent::Step { .. } = event {
             made.set(made.get() + 1);
             cancelled.store(made.get() >= updates, Ordering::Relaxed);
         }
@@ -76,7 +76,7 @@ fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
         let broken = dir.path().join(name);
         for updates in stops {
             let outcome = train_until(&config, &dataset, &broken, updates).unwrap();
-            assert!(matches!(outcome, Outcome::Interrupted { .. }), "{name}: {outcome:?}");
+            assert!(matches!(outcome, TrainingOutcome::Interrupted { .. }), "{name}: {outcome:?}");
         }
         train(&config, &dataset, &broken).unwrap();
         assert_eq!(
@@ -108,8 +108,8 @@ fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_mani
         run_dir: dir.path(),
         command: "test",
     };
-    let mut observer = |event: Event| {
-        if let Event::Step { loss, .. } = event {
+    let mut observer = |event: TrainingEvent| {
+        if let TrainingEvent::Step { loss, .. } = event {
             first.set(first.get().or(Some(loss)));
             last.set(loss);
         }
@@ -121,7 +121,7 @@ fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_mani
         first.get(),
         last.get()
     );
-    let Outcome::Finished { model_dir, manifest } = outcome else {
+    let TrainingOutcome::Finished { model_dir, manifest } = outcome else {
         panic!("{outcome:?}")
     };
     let loaded = registry::load(&model_dir).unwrap();
@@ -134,7 +134,7 @@ fn a_finished_run_is_answered_without_training_again() {
     let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train(&config, &dataset, dir.path()).unwrap();
     let outcome = train_until(&config, &dataset, dir.path(), 1).unwrap();
-    assert!(matches!(outcome, Outcome::Finished { .. }));
+    assert!(matches!(outcome, TrainingOutcome::Finished { .. }));
 }
 
 #[test]

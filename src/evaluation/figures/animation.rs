@@ -1,11 +1,11 @@
 //! What the model sees ahead over a whole trial, as an endless GIF.
 
-use super::montage::{Row, Style, montage};
+use super::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 
 /// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
 #[derive(Clone, Debug)]
-pub struct Moment {
+pub struct AnimationFrame {
     /// What came.
     pub truth: Frame,
     /// What the model predicted.
@@ -24,7 +24,7 @@ pub struct Animation {
     /// The baseline's name.
     pub baseline: &'static str,
     /// What is shown.
-    pub moments: Vec<Moment>,
+    pub moments: Vec<AnimationFrame>,
 }
 
 impl Animation {
@@ -43,7 +43,7 @@ impl Animation {
     pub fn encode(&self) -> Result<Vec<u8>, FrameError> {
         let frames = self.moments.iter().map(|moment| {
             let cell = |label: &str, frame: &Frame| (label.to_owned(), frame.clone());
-            let row = Row {
+            let row = MontageRow {
                 label: String::new(),
                 cells: vec![
                     cell("truth", &moment.truth),

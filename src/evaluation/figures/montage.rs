@@ -15,14 +15,14 @@ const GRID_STRENGTH: f32 = 0.3;
 
 /// A row of frames under a heading.
 #[derive(Clone, Debug)]
-pub struct Row {
+pub struct MontageRow {
     /// The heading; none if empty.
     pub label: String,
     /// Frames with their captions.
     pub cells: Vec<(String, Frame)>,
 }
 
-impl Row {
+impl MontageRow {
     /// Consecutive frames captioned `t-1`, `t`, `t+1`, …; `first` is the first one's distance from t.
     #[must_use]
     pub fn in_time(label: &str, frames: &[Frame], first: i64) -> Self {
@@ -77,14 +77,14 @@ pub(super) fn prediction_panel(
     predicted: &[Frame],
     truth: &[Frame],
 ) -> Result<Frame, FrameError> {
-    let rows: Vec<Row> = [
+    let rows: Vec<MontageRow> = [
         ("predicted", predicted, 1),
         ("ground truth", truth, 1),
         ("inputs", seen, 1 - seen.len() as i64),
     ]
     .into_iter()
     .filter(|(_, frames, _)| !frames.is_empty())
-    .map(|(label, frames, first)| Row::in_time(label, frames, first))
+    .map(|(label, frames, first)| MontageRow::in_time(label, frames, first))
     .collect();
     let width = seen.first().or(predicted.first()).map_or(1, Frame::width);
     montage(title, &rows, &Style::for_frames_of(width))
@@ -92,7 +92,7 @@ pub(super) fn prediction_panel(
 
 /// Puts the rows under each other below a title (none if empty). Frames may differ in size.
 /// Errors: `Size` if there is no frame at all or the image gets too large.
-pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameError> {
+pub fn montage(title: &str, rows: &[MontageRow], style: &Style) -> Result<Frame, FrameError> {
     let cells = || rows.iter().flat_map(|row| &row.cells);
     let cell_width = cells().map(|(_, frame)| frame.width() as usize).max().unwrap_or(0) * style.scale;
     let widest_caption = cells()
@@ -126,7 +126,7 @@ pub fn montage(title: &str, rows: &[Row], style: &Style) -> Result<Frame, FrameE
     Frame::new(side(width), side(height), canvas.pixels)
 }
 
-fn row_height(row: &Row, style: &Style, line: usize) -> usize {
+fn row_height(row: &MontageRow, style: &Style, line: usize) -> usize {
     let heading = if row.label.is_empty() { 0 } else { line };
     let captions = if row.cells.iter().all(|(caption, _)| caption.is_empty()) {
         0
@@ -137,12 +137,12 @@ fn row_height(row: &Row, style: &Style, line: usize) -> usize {
 }
 
 /// The tallest frame of the row, enlarged.
-fn frames_height(row: &Row, style: &Style) -> usize {
+fn frames_height(row: &MontageRow, style: &Style) -> usize {
     let heights = row.cells.iter().map(|(_, frame)| frame.height() as usize);
     heights.max().unwrap_or(0) * style.scale
 }
 
-fn draw_row(canvas: &mut Canvas, row: &Row, style: &Style, (mut top, column): (usize, usize)) {
+fn draw_row(canvas: &mut Canvas, row: &MontageRow, style: &Style, (mut top, column): (usize, usize)) {
     if !row.label.is_empty() {
         canvas.write((MARGIN_PX, top), &row.label, LETTER_SCALE, INK);
         top += height_px(LETTER_SCALE) + GAP_PX;
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn every_frame_is_shown_enlarged_at_its_place() {
-        let row = Row {
+        let row = MontageRow {
             label: String::new(),
             cells: vec![(String::new(), frame(10)), (String::new(), frame(200))],
         };
@@ -211,7 +211,7 @@ mod tests {
 
     #[test]
     fn captions_count_from_now() {
-        let row = Row::in_time("", &[frame(0), frame(0), frame(0)], -1);
+        let row = MontageRow::in_time("", &[frame(0), frame(0), frame(0)], -1);
         let captions: Vec<&str> = row.cells.iter().map(|(caption, _)| caption.as_str()).collect();
         assert_eq!(captions, ["t-1", "t", "t+1"]);
     }
@@ -221,6 +221,6 @@ mod tests {
         let style = Style::for_frames_of(64);
         assert!(montage("title", &[], &style).is_err());
         let many: Vec<Frame> = (0..600).map(|_| frame(0)).collect();
-        assert!(montage("", &[Row::in_time("", &many, 0)], &style).is_err());
+        assert!(montage("", &[MontageRow::in_time("", &many, 0)], &style).is_err());
     }
 }

@@ -5,12 +5,12 @@
 use candle_core::{Result, Tensor};
 use pulp::Arch;
 
-use super::super::gates::{self, Kept, add_product};
+use super::super::gates::{self, StepActivations, add_product};
 use super::super::tensors::{add_columns, matrix, with_values};
-use super::{Recurrence, Trace};
+use super::{Recurrence, RecurrenceTrace};
 
 /// Gradients on the way back.
-pub(super) struct Back {
+pub(super) struct RecurrenceGradients {
     /// Of the sums [T · B, 4H].
     pub(super) sums: Vec<f32>,
     /// Of h and c before the step, `[B, H]` each.
@@ -25,11 +25,11 @@ pub(super) struct Back {
 
 impl Recurrence {
     /// From the gradient of the output back through every step.
-    pub(super) fn back(&self, trace: &Trace, gradient: &[f32]) -> Result<Back> {
+    pub(super) fn back(&self, trace: &RecurrenceTrace, gradient: &[f32]) -> Result<RecurrenceGradients> {
         let (hidden, features, steps) = (self.hidden, self.features(), self.steps);
         let batch = trace.h.len() / ((steps + 1) * hidden);
         let rows = batch * hidden;
-        let mut back = Back {
+        let mut back = RecurrenceGradients {
             sums: vec![0.0; steps * batch * 4 * hidden],
             h: vec![0.0; rows],
             c: vec![0.0; rows],
@@ -49,7 +49,7 @@ impl Recurrence {
                     back.features[step].copy_from_slice(&back.first);
                     let through = matrix(back.first.clone(), features)?.matmul(&feedback.weight.t()?)?;
                     with_values(&through, |through| add_columns(&mut back.h, through))?;
-                    if !feedback.adds {
+                    if !feedback.residual {
                         back.first.fill(0.0);
                     }
                 }
@@ -66,9 +66,9 @@ impl Recurrence {
         Ok(back)
     }
 
-    fn step_back(&self, trace: &Trace, back: &mut Back, t: usize, batch: usize) {
+    fn step_back(&self, trace: &RecurrenceTrace, back: &mut RecurrenceGradients, t: usize, batch: usize) {
         let hidden = self.hidden;
-        let Back {
+        let RecurrenceGradients {
             sums,
             h,
             c,
@@ -81,7 +81,7 @@ impl Recurrence {
                 for row in 0..batch {
                     let before = (t * batch + row) * hidden;
                     let after = before + batch * hidden;
-                    let kept = Kept {
+                    let kept = StepActivations {
                         activations: &trace.activations[4 * before..4 * (before + hidden)],
                         c_before: &trace.c[before..before + hidden],
                         c: &trace.c[after..after + hidden],
@@ -98,7 +98,7 @@ impl Recurrence {
     }
 
     /// Gradients of the weights in the order in which they were joined.
-    pub(super) fn weights_back(&self, trace: &Trace, back: &Back, sums: &Tensor) -> Result<Tensor> {
+    pub(super) fn weights_back(&self, trace: &RecurrenceTrace, back: &RecurrenceGradients, sums: &Tensor) -> Result<Tensor> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = back.h.len() / hidden;
         let past = |values: &[f32], side: usize| matrix(values[..values.len() - batch * side].to_vec(), side);

@@ -179,7 +179,7 @@ async function drive(model) {
           compare(origin, past.slice(1).map(moment => moment.frame));
         }
         const speed = action.map(value => value.toFixed(2));
-        by_id("status").textContent = (answer.type === "warming" ? `${answer.have} of ${context} frames seen` :
+        by_id("status").textContent = (answer.type === "buffering" ? `${answer.have} of ${context} frames seen` :
           `answered in ${round_trip_ms.toFixed(1)} ms, ${(answer.timing.compute_us / 1000).toFixed(1)} ms of it the model`) +
           (told ? `; ${held.size ? "your keys" : "its own driver"}: ${speed[0]} m/s, ${speed[1]} rad/s` : "");
         const step = await call("POST", `${path}/step`, { action });

@@ -8,15 +8,15 @@ use crate::server::error::ApiError;
 use crate::sim::Environment;
 
 /// An environment, stepped by one at a time.
-pub(super) type Shared = Arc<Mutex<Environment>>;
+pub(super) type SharedEnvironment = Arc<Mutex<Environment>>;
 
 struct Entry {
-    environment: Shared,
+    environment: SharedEnvironment,
     used: Instant,
 }
 
 #[derive(Default)]
-struct Table {
+struct EnvironmentTable {
     next: u64,
     entries: BTreeMap<String, Entry>,
 }
@@ -25,7 +25,7 @@ struct Table {
 pub(in crate::server) struct Environments {
     limit: usize,
     idle: Duration,
-    table: Mutex<Table>,
+    table: Mutex<EnvironmentTable>,
 }
 
 impl Environments {
@@ -57,7 +57,7 @@ impl Environments {
     }
 
     /// Errors: `NotFound`.
-    pub(super) fn get(&self, id: &str) -> Result<Shared, ApiError> {
+    pub(super) fn get(&self, id: &str) -> Result<SharedEnvironment, ApiError> {
         let mut table = self.table();
         let entry = table.entries.get_mut(id).ok_or_else(|| self.unknown(id))?;
         entry.used = Instant::now();
@@ -79,7 +79,7 @@ impl Environments {
     }
 
     /// The table, without those that have been idle too long.
-    fn table(&self) -> MutexGuard<'_, Table> {
+    fn table(&self) -> MutexGuard<'_, EnvironmentTable> {
         let mut table = lock(&self.table);
         table.entries.retain(|_, entry| entry.used.elapsed() < self.idle);
         table

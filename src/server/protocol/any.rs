@@ -14,7 +14,7 @@ const MAX_ITEMS: usize = 4096;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct AnyMessage {
-    r#type: Kind,
+    r#type: MessageKind,
     seq: Option<u64>,
     timestamp_us: Option<i64>,
     image: Option<ImageBytes>,
@@ -28,7 +28,7 @@ pub(super) struct AnyMessage {
 
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Kind {
+enum MessageKind {
     Frame,
     Configure,
     Ping,
@@ -72,7 +72,7 @@ impl TryFrom<AnyMessage> for ClientMessage {
 
     fn try_from(mut any: AnyMessage) -> Result<Self, String> {
         let message = match any.r#type {
-            Kind::Frame => Self::Frame(FrameMessage {
+            MessageKind::Frame => Self::Frame(FrameMessage {
                 seq: any.seq.take().ok_or_else(|| missing("seq"))?,
                 timestamp_us: any.timestamp_us.take().ok_or_else(|| missing("timestamp_us"))?,
                 image: any.image.take().ok_or_else(|| missing("image"))?,
@@ -81,15 +81,15 @@ impl TryFrom<AnyMessage> for ClientMessage {
                 state: any.state.take().map(numbers),
                 plan: any.plan.take().map(|plan| plan.0.into_iter().map(numbers).collect()),
             }),
-            Kind::Configure => Self::Configure(ConfigureMessage {
+            MessageKind::Configure => Self::Configure(ConfigureMessage {
                 on_gap: any.on_gap.take(),
                 on_late: any.on_late.take(),
                 format: any.format.take(),
             }),
-            Kind::Ping => Self::Ping(PingMessage {
+            MessageKind::Ping => Self::Ping(PingMessage {
                 timestamp_us: any.timestamp_us.take().unwrap_or_default(),
             }),
-            Kind::Close => Self::Close(CloseMessage {}),
+            MessageKind::Close => Self::Close(CloseMessage {}),
         };
         any.left().map_or(Ok(message), |field| {
             Err(format!("unknown field `{field}`: a message of this type has none"))

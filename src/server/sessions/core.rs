@@ -6,16 +6,16 @@ use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::server::images::{self, ImageError, ImageFormat};
 use crate::server::protocol::{ErrorCode, OnGap, OnLate, ServerMessage, Timing};
-use crate::serving::{Computed, InputError, Premise, ServingError, SessionState, Task};
+use crate::serving::{TaskOutput, InputError, ConditioningInput, ServingError, SessionState, Task};
 use crate::types::ValueError;
 
 /// A frame whose values fit the model.
 #[derive(Clone, Debug)]
-pub(in crate::server) struct Step {
+pub(in crate::server) struct FrameStep {
     pub(in crate::server) seq: u64,
     pub(in crate::server) timestamp_us: i64,
     pub(in crate::server) frame: Frame,
-    pub(in crate::server) premise: Premise,
+    pub(in crate::server) premise: ConditioningInput,
     pub(in crate::server) format: ImageFormat,
     /// Whether newer frames wait behind this one, and need not wait for it to be predicted from.
     pub(in crate::server) is_overtaken: bool,
@@ -68,16 +68,16 @@ pub(in crate::server) struct Settings {
 }
 
 /// What a session remembers, with its last answer.
-pub(super) struct Core {
+pub(super) struct SessionCore {
     pub(super) state: SessionState,
     pub(super) settings: Settings,
     /// None before the first frame and after an import, where the last answer is computed again.
-    kept: Option<Kept>,
+    kept: Option<CachedAnswer>,
 }
 
 /// The answer to the last frame.
 #[derive(Clone)]
-pub(super) struct Kept {
+pub(super) struct CachedAnswer {
     seq: u64,
     timestamp_us: i64,
     skipped: u64,
@@ -87,16 +87,16 @@ pub(super) struct Kept {
 }
 
 /// What a frame needs.
-pub(super) enum Begun {
+pub(super) enum PendingStep {
     /// It has been answered.
-    Kept(Kept),
+    CachedAnswer(CachedAnswer),
     /// This is to be computed, and committed.
     New { task: Task, skipped: u64 },
     /// This is to be computed, and kept.
     Again(Task),
 }
 
-impl Core {
+impl SessionCore {
     pub(super) fn new(state: SessionState, settings: Settings) -> Self {
         Self {
             state,
@@ -105,17 +105,17 @@ impl Core {
         }
     }
 
-    /// Changes nothing: what came of it is for [`Core::commit`].
-    pub(super) fn begin(&self, step: &Step, spec: &ModelSpec) -> Result<Begun, StepError> {
+    /// Changes nothing: what came of it is for [`SessionCore::commit`].
+    pub(super) fn begin(&self, step: &FrameStep, spec: &ModelSpec) -> Result<PendingStep, StepError> {
         let next = self.state.next_seq();
         if step.seq == u64::MAX {
             return Err(StepError::Seq(step.seq));
         }
         if step.seq < next {
             return Ok(match (&self.kept, self.state.again(spec)) {
-                (Some(kept), _) => Begun::Kept(kept.clone()),
-                (None, Some(task)) => Begun::Again(task),
-                (None, None) => Begun::Kept(self.last(step.timestamp_us, 0, None)),
+                (Some(kept), _) => PendingStep::CachedAnswer(kept.clone()),
+                (None, Some(task)) => PendingStep::Again(task),
+                (None, None) => PendingStep::CachedAnswer(self.last(step.timestamp_us, 0, None)),
             });
         }
         if step.seq > next && self.settings.on_gap == OnGap::Error {
@@ -125,19 +125,19 @@ impl Core {
             });
         }
         let premise = (!self.is_skipped(step)).then(|| step.premise.clone());
-        Ok(Begun::New {
+        Ok(PendingStep::New {
             task: self.state.step(step.frame.clone(), premise, spec),
             skipped: step.seq - next,
         })
     }
 
     /// Whether nothing is to be predicted from the step.
-    fn is_skipped(&self, step: &Step) -> bool {
+    fn is_skipped(&self, step: &FrameStep) -> bool {
         step.is_overtaken && self.settings.on_late == OnLate::Skip
     }
 
     /// Takes the step, of which this was computed.
-    pub(super) fn commit(&mut self, step: Step, mut computed: Computed, skipped: u64, spec: &ModelSpec) -> Kept {
+    pub(super) fn commit(&mut self, step: FrameStep, mut computed: TaskOutput, skipped: u64, spec: &ModelSpec) -> CachedAnswer {
         if let Some(features) = computed.features.pop() {
             self.state.advance(step.seq, features, step.premise, spec);
         }
@@ -145,7 +145,7 @@ impl Core {
     }
 
     /// Keeps what was computed as the answer to the last frame.
-    pub(super) fn keep(&mut self, timestamp_us: i64, skipped: u64, computed: Computed) -> Kept {
+    pub(super) fn keep(&mut self, timestamp_us: i64, skipped: u64, computed: TaskOutput) -> CachedAnswer {
         let timing = Timing {
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
@@ -157,8 +157,8 @@ impl Core {
         kept
     }
 
-    fn last(&self, timestamp_us: i64, skipped: u64, prediction: Option<(Arc<[Frame]>, Timing)>) -> Kept {
-        Kept {
+    fn last(&self, timestamp_us: i64, skipped: u64, prediction: Option<(Arc<[Frame]>, Timing)>) -> CachedAnswer {
+        CachedAnswer {
             seq: self.state.next_seq().saturating_sub(1),
             timestamp_us,
             skipped,
@@ -168,7 +168,7 @@ impl Core {
     }
 }
 
-impl Kept {
+impl CachedAnswer {
     pub(super) fn answer(self, format: ImageFormat, spec: &ModelSpec) -> Result<ServerMessage, StepError> {
         let Self {
             seq,
@@ -185,7 +185,7 @@ impl Kept {
                     skipped,
                 });
             }
-            return Ok(ServerMessage::Warming {
+            return Ok(ServerMessage::Buffering {
                 seq,
                 timestamp_us,
                 have,

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-use super::core::{Begun, Core, Settings, Step, StepError};
+use super::core::{PendingStep, SessionCore, Settings, FrameStep, StepError};
 use super::token::{Token, TokenHash};
 use crate::registry::LoadedModel;
 use crate::server::images::ImageFormat;
@@ -28,12 +28,12 @@ pub(in crate::server) struct Session {
     /// Tells the predictor's sessions apart.
     key: u64,
     model: Arc<LoadedModel>,
-    inner: Mutex<Inner>,
+    inner: Mutex<SessionInner>,
     holder: watch::Sender<Holder>,
 }
 
-struct Inner {
-    core: Core,
+struct SessionInner {
+    core: SessionCore,
     connections: u64,
     is_held: bool,
     /// When the session was last used.
@@ -54,8 +54,8 @@ impl Session {
             id: id.id(),
             token_hash: token.hash(),
             model,
-            inner: Mutex::new(Inner {
-                core: Core::new(state, settings),
+            inner: Mutex::new(SessionInner {
+                core: SessionCore::new(state, settings),
                 connections: 0,
                 is_held: false,
                 used: now,
@@ -142,7 +142,7 @@ impl Session {
         self.holder.send_replace(Holder::Deleted);
     }
 
-    fn inner(&self) -> MutexGuard<'_, Inner> {
+    fn inner(&self) -> MutexGuard<'_, SessionInner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -180,7 +180,7 @@ impl Hold {
     }
 
     /// Answers a frame: from memory if it has been answered, else by a step. Errors leave the session as it was.
-    pub(in crate::server) async fn step(&self, predictor: &Predictor, step: Step) -> Result<ServerMessage, StepError> {
+    pub(in crate::server) async fn step(&self, predictor: &Predictor, step: FrameStep) -> Result<ServerMessage, StepError> {
         let (key, model) = (self.session.key, &self.session.model);
         let (format, begun) = {
             let inner = self.inner()?;
@@ -188,12 +188,12 @@ impl Hold {
             (format, inner.core.begin(&step, model.model.spec())?)
         };
         let kept = match begun {
-            Begun::Kept(kept) => kept,
-            Begun::New { task, skipped } => {
+            PendingStep::CachedAnswer(kept) => kept,
+            PendingStep::New { task, skipped } => {
                 let computed = predictor.compute(model, task, Some(key)).await?;
                 self.inner()?.core.commit(step, computed, skipped, model.model.spec())
             }
-            Begun::Again(task) => {
+            PendingStep::Again(task) => {
                 let computed = predictor.compute(model, task, Some(key)).await?;
                 self.inner()?.core.keep(step.timestamp_us, 0, computed)
             }
@@ -202,7 +202,7 @@ impl Hold {
     }
 
     /// What the lock guards, if the session is still held. Errors: `NotHeld`.
-    fn inner(&self) -> Result<MutexGuard<'_, Inner>, StepError> {
+    fn inner(&self) -> Result<MutexGuard<'_, SessionInner>, StepError> {
         let inner = self.session.inner();
         if *self.session.holder.borrow() == Holder::Connection(self.number) {
             Ok(inner)

@@ -26,20 +26,20 @@ pub(in crate::server) enum TableError {
     Full(usize),
 }
 
-pub(in crate::server) struct Table {
-    inner: Mutex<Inner>,
+pub(in crate::server) struct SessionTable {
+    inner: Mutex<SessionTableInner>,
     limit: usize,
     grace: Duration,
 }
 
 #[derive(Default)]
-struct Inner {
+struct SessionTableInner {
     sessions: BTreeMap<String, Arc<Session>>,
     /// The last to expire, so that they can be told apart from those that never were; as many as may be open.
     expired: VecDeque<String>,
 }
 
-impl Table {
+impl SessionTable {
     pub(in crate::server) fn new(limit: usize, grace: Duration) -> Self {
         Self {
             inner: Mutex::default(),
@@ -112,8 +112,8 @@ impl Table {
         inner.sessions.len()
     }
 
-    fn evict(&self, inner: &mut Inner, now: Instant) {
-        let Inner { sessions, expired } = inner;
+    fn evict(&self, inner: &mut SessionTableInner, now: Instant) {
+        let SessionTableInner { sessions, expired } = inner;
         sessions.retain(|id, session| {
             let is_over = session.left(self.grace, now).is_some_and(|left| left.is_zero());
             if is_over {
@@ -128,7 +128,7 @@ impl Table {
         expired.drain(..surplus);
     }
 
-    fn inner(&self) -> MutexGuard<'_, Inner> {
+    fn inner(&self) -> MutexGuard<'_, SessionTableInner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

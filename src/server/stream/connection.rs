@@ -19,11 +19,11 @@ use crate::server::images;
 use crate::server::protocol::{
     ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, WarningCode,
 };
-use crate::server::sessions::core::{Step, StepError};
+use crate::server::sessions::core::{FrameStep, StepError};
 use crate::server::sessions::limits;
 use crate::server::sessions::session::{Hold, Holder, Session};
 use crate::server::{App, streams};
-use crate::serving::{Premise, STEP, Told};
+use crate::serving::{ConditioningInput, STEP, RawConditioning};
 use crate::telemetry::names;
 use crate::types::{Action, RobotState};
 
@@ -31,13 +31,13 @@ use crate::types::{Action, RobotState};
 const LINGER: Duration = Duration::from_secs(1);
 
 /// What is answered in the order in which it came.
-enum Item {
-    Frame(Box<Step>),
+enum PipelinedItem {
+    Frame(Box<FrameStep>),
     Configure(ConfigureMessage),
     Refused(ErrorCode, String),
 }
 
-impl Item {
+impl PipelinedItem {
     /// What waits to be told is bounded as what is told.
     fn refused(code: ErrorCode, detail: String) -> Self {
         Self::Refused(code, bounded(detail))
@@ -54,9 +54,9 @@ enum Received {
 }
 
 /// The client is gone: nothing more can be said to it.
-struct Gone;
+struct ClientGone;
 
-pub(super) struct Connection {
+pub(super) struct StreamConnection {
     app: App,
     hold: Hold,
     is_kept: bool,
@@ -66,7 +66,7 @@ pub(super) struct Connection {
     overtaken: Counter,
 }
 
-impl Connection {
+impl StreamConnection {
     /// Takes the session from whoever holds it.
     pub(super) fn new(app: App, session: &Arc<Session>, is_kept: bool, codec: Codec) -> Self {
         let outbox = Outbox::new(app.config().max_stream_buffer_bytes);
@@ -94,7 +94,7 @@ impl Connection {
             let (reason, ()) = tokio::try_join!(self.read(&mut stream, inbox), answered)?;
             self.outbox.close(reason);
             // The writer ends the stream.
-            std::future::pending::<Result<(), Gone>>().await
+            std::future::pending::<Result<(), ClientGone>>().await
         };
         let ended = tokio::select! {
             gone = worked => gone,
@@ -128,14 +128,14 @@ impl Connection {
     async fn read(
         &self,
         stream: &mut SplitStream<WebSocket>,
-        inbox: mpsc::Sender<Item>,
-    ) -> Result<ClosingReason, Gone> {
+        inbox: mpsc::Sender<PipelinedItem>,
+    ) -> Result<ClosingReason, ClientGone> {
         let mut stopping = self.app.streams().stopping();
         tokio::select! {
             biased;
             () = streams::told(&mut stopping) => Ok(ClosingReason::Shutdown),
             holder = self.hold.lost() => Ok(match holder {
-                Holder::Connection(_) => ClosingReason::Replaced,
+                Holder::StreamConnection(_) => ClosingReason::Replaced,
                 Holder::Deleted => ClosingReason::Deleted,
             }),
             end = self.read_all(stream, &inbox) => end,
@@ -145,17 +145,17 @@ impl Connection {
     async fn read_all(
         &self,
         stream: &mut SplitStream<WebSocket>,
-        inbox: &mpsc::Sender<Item>,
-    ) -> Result<ClosingReason, Gone> {
+        inbox: &mpsc::Sender<PipelinedItem>,
+    ) -> Result<ClosingReason, ClientGone> {
         loop {
             let message = match self.receive(stream).await? {
                 Received::Message(message) => message,
                 Received::Nothing => return Ok(ClosingReason::Idle),
                 Received::Unreadable(reason, detail) => {
                     inbox
-                        .send(Item::refused(ErrorCode::Malformed, detail))
+                        .send(PipelinedItem::refused(ErrorCode::Malformed, detail))
                         .await
-                        .map_err(|_| Gone)?;
+                        .map_err(|_| ClientGone)?;
                     return Ok(reason);
                 }
             };
@@ -164,23 +164,23 @@ impl Connection {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
                     self.checked(frame)
-                        .map_or_else(|error| Item::refused(error.code(), error.to_string()), Item::Frame)
+                        .map_or_else(|error| PipelinedItem::refused(error.code(), error.to_string()), PipelinedItem::Frame)
                 }
-                Ok(ClientMessage::Configure(message)) => Item::Configure(message),
+                Ok(ClientMessage::Configure(message)) => PipelinedItem::Configure(message),
                 Ok(ClientMessage::Ping(ping)) => {
                     let timestamp_us = ping.timestamp_us;
                     self.outbox.push(ServerMessage::Pong { timestamp_us }).await;
                     continue;
                 }
                 Ok(ClientMessage::Close(_)) => return Ok(ClosingReason::Asked),
-                Err(error) => Item::refused(ErrorCode::Malformed, error.to_string()),
+                Err(error) => PipelinedItem::refused(ErrorCode::Malformed, error.to_string()),
             };
-            inbox.send(item).await.map_err(|_| Gone)?;
+            inbox.send(item).await.map_err(|_| ClientGone)?;
         }
     }
 
     /// The next message of the protocol, warning once of silence.
-    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, Gone> {
+    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, ClientGone> {
         let quarter = Duration::from_millis(self.app.config().stream_idle_ms) / 4;
         let mut is_warned = false;
         loop {
@@ -191,11 +191,11 @@ impl Connection {
                 }
                 // Answered by the WebSocket itself; a sign of life.
                 Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
-                Ok(None) => return Err(Gone),
+                Ok(None) => return Err(ClientGone),
                 Ok(Some(Ok(Message::Close(_)))) => {
                     // The answer to a close is sent with the next read.
                     read_out(stream).await;
-                    return Err(Gone);
+                    return Err(ClientGone);
                 }
                 Ok(Some(Err(error))) => return unreadable(error),
                 Err(_) if is_warned => return Ok(Received::Nothing),
@@ -210,7 +210,7 @@ impl Connection {
     }
 
     /// The frame, if it fits the model.
-    fn checked(&self, message: FrameMessage) -> Result<Box<Step>, StepError> {
+    fn checked(&self, message: FrameMessage) -> Result<Box<FrameStep>, StepError> {
         let manifest = &self.hold.session().model().manifest;
         let action = |field| {
             move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
@@ -222,15 +222,15 @@ impl Connection {
             .transpose()?;
         let state = message.state.map(RobotState::try_from).transpose();
         let state = state.map_err(|source| StepError::Value { field: "state", source })?;
-        let told = Told {
+        let told = RawConditioning {
             past: past.as_slice(),
             future: plan.as_deref(),
             state: state.as_ref(),
         };
-        Ok(Box::new(Step {
+        Ok(Box::new(FrameStep {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            premise: Premise::new(told, &STEP, &manifest.name, &manifest.spec)?,
+            premise: ConditioningInput::new(told, &STEP, &manifest.name, &manifest.spec)?,
             frame: images::decode("image", message.image, message.format, manifest)?,
             format: message.format,
             is_overtaken: false,
@@ -238,7 +238,7 @@ impl Connection {
     }
 
     /// Answers what was read, in order, until there is no more.
-    async fn answer(&self, mut items: mpsc::Receiver<Item>) {
+    async fn answer(&self, mut items: mpsc::Receiver<PipelinedItem>) {
         // So that who never stops sending hears of the future at times.
         let limit = self.app.config().max_pipelined_frames;
         let (mut following, mut overtaken_in_a_row) = (None, 0);
@@ -250,8 +250,8 @@ impl Connection {
             let Some(item) = item else { return };
             following = items.try_recv().ok();
             let answer = match item {
-                Item::Frame(mut step) => {
-                    let is_behind = matches!(&following, Some(Item::Frame(newer)) if newer.seq > step.seq);
+                PipelinedItem::Frame(mut step) => {
+                    let is_behind = matches!(&following, Some(PipelinedItem::Frame(newer)) if newer.seq > step.seq);
                     step.is_overtaken = is_behind && overtaken_in_a_row < limit;
                     match self.hold.step(self.app.predictor(), *step).await {
                         Ok(answer) => answer,
@@ -260,8 +260,8 @@ impl Connection {
                         Err(error) => self.error(error.code(), bounded(error.to_string())),
                     }
                 }
-                Item::Configure(message) => self.hold.session().configure(message),
-                Item::Refused(code, detail) => self.error(code, detail),
+                PipelinedItem::Configure(message) => self.hold.session().configure(message),
+                PipelinedItem::Refused(code, detail) => self.error(code, detail),
             };
             if let ServerMessage::Overtaken { .. } = answer {
                 self.overtaken.increment(1);
@@ -279,7 +279,7 @@ impl Connection {
     }
 
     /// Sends what waits until the end, which is said; a client that reads nothing for too long is told so and left.
-    async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), Gone> {
+    async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), ClientGone> {
         let limit = Duration::from_millis(self.app.config().stream_send_ms);
         loop {
             let (message, reason) = match self.outbox.next().await {
@@ -287,7 +287,7 @@ impl Connection {
                 Next::Close(reason) => (ServerMessage::Closing { reason }, Some(reason)),
             };
             match timeout(limit, sink.send(self.codec.encode(&message))).await {
-                Ok(sent) => sent.map_err(|_| Gone)?,
+                Ok(sent) => sent.map_err(|_| ClientGone)?,
                 Err(_) => return self.leave(sink, limit).await,
             }
             if let Some(reason) = reason {
@@ -296,27 +296,27 @@ impl Connection {
         }
     }
 
-    async fn leave(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), Gone> {
+    async fn leave(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), ClientGone> {
         debug!("the client reads nothing");
         let reason = ClosingReason::Slow;
         let last = self.codec.encode(&ServerMessage::Closing { reason });
         timeout(limit, sink.send(last))
             .await
-            .map_err(|_| Gone)?
-            .map_err(|_| Gone)?;
+            .map_err(|_| ClientGone)?
+            .map_err(|_| ClientGone)?;
         close(sink, code_of(reason), limit).await
     }
 }
 
 /// Why what came could not be read, if its sender is still there to be told.
-fn unreadable(error: axum::Error) -> Result<Received, Gone> {
+fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
     let error = error.into_inner();
     let reason = match error.downcast_ref::<tungstenite::Error>() {
         Some(tungstenite::Error::Capacity(_)) => ClosingReason::TooLong,
         Some(tungstenite::Error::Utf8(_)) => ClosingReason::NotUtf8,
-        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return Err(Gone),
+        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return Err(ClientGone),
         Some(tungstenite::Error::Protocol(_)) => ClosingReason::Malformed,
-        _ => return Err(Gone),
+        _ => return Err(ClientGone),
     };
     Ok(Received::Unreadable(reason, error.to_string()))
 }
@@ -328,13 +328,13 @@ async fn read_out(stream: &mut SplitStream<WebSocket>) {
     let _ = timeout(LINGER, all).await;
 }
 
-async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), Gone> {
+async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), ClientGone> {
     let frame = CloseFrame {
         code,
         reason: "".into(),
     };
     let sent = timeout(limit, sink.send(Message::Close(Some(frame)))).await;
-    sent.map_err(|_| Gone)?.map_err(|_| Gone)
+    sent.map_err(|_| ClientGone)?.map_err(|_| ClientGone)
 }
 
 fn code_of(reason: ClosingReason) -> u16 {

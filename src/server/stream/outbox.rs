@@ -23,13 +23,13 @@ pub(super) enum Next {
 }
 
 pub(super) struct Outbox {
-    state: Mutex<State>,
+    state: Mutex<OutboxState>,
     changed: Notify,
     limit_bytes: usize,
 }
 
 #[derive(Default)]
-struct State {
+struct OutboxState {
     waiting: VecDeque<ServerMessage>,
     bytes: usize,
     /// Predictions dropped since the last one that was taken.
@@ -91,12 +91,12 @@ impl Outbox {
         }
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, OutboxState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl State {
+impl OutboxState {
     fn push(&mut self, message: ServerMessage) {
         self.bytes += bytes(&message);
         self.waiting.push_back(message);
@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn the_oldest_predictions_make_room_and_the_next_one_sent_says_how_many() {
-        let mut state = State::default();
+        let mut state = OutboxState::default();
         state.push(pong(1));
         for seq in 0..5 {
             state.push_prediction(prediction(seq, 1000), 4000);
@@ -221,9 +221,9 @@ mod tests {
         fn what_waits_stays_within_the_limit_and_every_prediction_is_sent_or_counted(
             pushes in proptest::collection::vec((any::<bool>(), 0usize..3000), 0..60),
         ) {
-            let (mut state, limit) = (State::default(), 8000);
+            let (mut state, limit) = (OutboxState::default(), 8000);
             let (mut pushed, mut accounted) = (0, 0);
-            let mut count = |state: &mut State| {
+            let mut count = |state: &mut OutboxState| {
                 let next = state.pop();
                 if let Some(Next::Message(ServerMessage::Prediction { dropped, .. })) = next {
                     accounted += dropped + 1;
