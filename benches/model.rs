@@ -56,13 +56,17 @@ fn training(c: &mut Criterion) {
     );
     c.bench_function("training step of 64 windows, features only", |b| {
         b.iter(|| {
-            let predicted = frozen.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
+            let predicted = frozen
+                .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
+                .unwrap();
             update(&Loss::Mse.between(&predicted, &ahead).unwrap())
         });
     });
     c.bench_function("training step of 64 windows, features only, both decoders", |b| {
         b.iter(|| {
-            let predicted = frozen.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
+            let predicted = frozen
+                .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
+                .unwrap();
             let again = frozen.reconstruct(&seen).unwrap();
             let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
             update(&(loss + Loss::Mse.between(&again, &seen).unwrap()).unwrap())

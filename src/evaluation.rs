@@ -28,7 +28,7 @@ pub use self::report::EvaluationReport;
 pub use self::samples::figure_inputs;
 
 use self::bootstrap::Bootstrap;
-use self::report::{ModelSummary, SetOutcome, SetReport, SetScores, ReportStamp};
+use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
 use crate::registry::LoadedModel;

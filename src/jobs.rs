@@ -20,11 +20,11 @@ use crate::store::{StoreError, unix_s};
 use crate::versions::VersionError;
 
 pub use job::{Job, JobFilter};
-pub use notes::{Losses, JobProgress};
+pub use notes::{JobProgress, Losses};
 pub use queue::{JobLimits, Jobs};
-pub use runner::{JobExecutor, JobFailure, JobResult, JobReporter};
+pub use runner::{JobExecutor, JobFailure, JobReporter, JobResult};
 pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
-pub use state::{JobTransition, JobState};
+pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]

@@ -30,7 +30,7 @@ pub use input::{InputError, PredictionInput};
 use queue::{ModelLoad, Queue, QueuedTask};
 pub use session::{SessionMemory, SessionState};
 pub use task::{ConditioningInput, Task};
-pub(crate) use task::{STEP, RawConditioning};
+pub(crate) use task::{RawConditioning, STEP};
 
 /// A task of many futures takes that share of a batch, so that those who come meanwhile wait for less than a whole one.
 const PARTS_IN_A_BATCH: usize = 4;

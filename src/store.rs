@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 pub use self::accounts::{JobUpdate, LogRow, LossRow};
 use self::database::Database;
-pub use self::jobs::{JobOutcome, EnqueueResult, JobPage, JobRow, Lease, NewJob};
+pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
 pub use self::models::VersionRow;
 pub use self::objects::Objects;

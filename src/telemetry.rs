@@ -12,7 +12,7 @@ use std::io::IsTerminal as _;
 use serde::{Deserialize, Serialize};
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{EnvFilter, ConfigLayer as _, fmt};
+use tracing_subscriber::{EnvFilter, Layer as _, fmt};
 
 pub use prometheus::{fold, record, render};
 

@@ -21,7 +21,7 @@ pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
-pub use self::observer::{TrainingEvent, Observer, TrainingStage};
+pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::stage::{StageEnd, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};

@@ -55,7 +55,7 @@ pub(super) fn run(args: CollectArgs) -> Result<(), CliError> {
     config.world.camera.noise_std = args.noise;
     config.threads = args.threads.unwrap_or_default().into();
     config.validate()?;
-    let (cancelled, progress) = (interrupt::flag()?, CollectProgress::new("trials"));
+    let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("trials"));
     progress.start(&format!("collecting {}", config.scenario), 0, config.trials);
     let collected = collect(
         &config,

@@ -64,7 +64,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         command: command_line(),
         ..EvaluateConfig::default()
     };
-    let progress = EvaluationProgress::new("windows");
+    let progress = ProgressLine::new("windows");
     let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
         let what = match now.stage {
             EvaluationStage::Scores => "scores",

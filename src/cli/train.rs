@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::{CliError, command_line, interrupt, open_dataset, progress::ProgressLine, say};
-use crate::training::{self, TrainingEvent, TrainingOutcome, TrainingStage, TrainConfig, Training};
+use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
 /// Train a model on a data set.
 ///

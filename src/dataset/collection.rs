@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
 use super::files::{sha256_of_file, write_atomically};
-use super::layout::{ARGUMENTS, INFO, CollectionStamp, shard_path};
+use super::layout::{ARGUMENTS, CollectionStamp, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};

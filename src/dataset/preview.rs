@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::files::verify;
-use super::layout::{EPISODES, CollectionStamp};
+use super::layout::{CollectionStamp, EPISODES};
 use super::shard_reader::{ShardSlot, read};
 use super::store::read_episodes;
 use super::{Dataset, DatasetError, DatasetInfo};

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use arrow_array::{
     ArrayRef, BinaryArray, FixedSizeListArray, Float32Array, Int64Array, RecordBatch, StringArray, StructArray,
 };
-use arrow_schema::{ArrowError, DataType, Field, FieldNames, Schema, SchemaRef};
+use arrow_schema::{ArrowError, DataType, Field, Fields, Schema, SchemaRef};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
 use parquet::errors::ParquetError;
@@ -163,8 +163,8 @@ fn properties() -> WriterProperties {
         .build()
 }
 
-fn image_fields() -> FieldNames {
-    FieldNames::from(vec![
+fn image_fields() -> Fields {
+    Fields::from(vec![
         Field::new("bytes", DataType::Binary, true),
         Field::new("path", DataType::Utf8, true),
     ])

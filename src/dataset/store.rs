@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::check::{Numbers, check_numbers};
 use super::files::{verify, write_atomically};
-use super::layout::{self, EPISODES, INFO, STAMP, STATS, ShardEntry, CollectionStamp, TASKS};
+use super::layout::{self, CollectionStamp, EPISODES, INFO, STAMP, STATS, ShardEntry, TASKS};
 use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
 use super::inference::{self, ActionSource};
 use super::metrics::StepCurve;
-use super::{EvaluationError, EvaluationStage, EvaluationContext};
+use super::{EvaluationContext, EvaluationError, EvaluationStage};
 use crate::dataset::{Dataset, Window};
 use crate::frame::preprocess::scale;
 use crate::frame::quality;
@@ -111,7 +111,11 @@ pub fn compare(
                 Variant::True | Variant::UnconditionedTwin => ActionSource::TargetFrame,
             };
             errors.extend(errors_of(model, dataset, batch, told)?);
-            watched.tell(EvaluationStage::Actions, all.len() * windows.len() + errors.len(), total)?;
+            watched.tell(
+                EvaluationStage::Actions,
+                all.len() * windows.len() + errors.len(),
+                total,
+            )?;
         }
         all.push((variant, errors));
     }

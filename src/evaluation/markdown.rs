@@ -5,8 +5,8 @@ use std::fmt::Write;
 use super::actions::ActionTable;
 use super::baselines::Method;
 use super::bootstrap::{CONFIDENCE, Interval};
-use super::metrics::{StepCurve, MethodScores, PSNR_CAP_DB};
-use super::report::{ModelSummary, SetOutcome, EvaluationReport, SetReport, SetScores, ReportStamp};
+use super::metrics::{MethodScores, PSNR_CAP_DB, StepCurve};
+use super::report::{EvaluationReport, ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;

@@ -25,7 +25,11 @@ pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
 
 /// Writes the figures, `report.md` and, last, `report.json`; gives the paths of both reports. The figures' names go into
 /// the report. Errors: `Io`, `Chart`, `Frame`.
-pub fn write(dir: &Path, report: &mut EvaluationReport, inputs: &FigureInputs) -> Result<[PathBuf; 2], EvaluationError> {
+pub fn write(
+    dir: &Path,
+    report: &mut EvaluationReport,
+    inputs: &FigureInputs,
+) -> Result<[PathBuf; 2], EvaluationError> {
     report.figures = figures::write(dir, inputs)?;
     let markdown = dir.join("report.md");
     save(&markdown, report.to_markdown().as_bytes())?;

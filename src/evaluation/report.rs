@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 use super::actions::ActionTable;
 use super::bootstrap::{Bootstrap, TrialSums};
 use super::figures::FigureFile;
-use super::metrics::{StepCurve, MethodScores, WindowScores, summarize};
+use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::skill::{Skill, skill};
 use super::{EvaluateConfig, markdown};
 use crate::dataset::Dataset;

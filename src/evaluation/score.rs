@@ -2,10 +2,10 @@
 
 use rayon::prelude::*;
 
-use super::baselines::{self, Method, BaselineInput};
+use super::baselines::{self, BaselineInput, Method};
 use super::inference::{Predicted, predict_with_ceiling};
 use super::metrics::{FrameScore, TargetFrame, WindowScores};
-use super::{EvaluationError, EvaluationStage, EvaluationContext};
+use super::{EvaluationContext, EvaluationError, EvaluationStage};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
 use crate::frame::preprocess::scale;

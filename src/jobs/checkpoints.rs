@@ -13,7 +13,10 @@ pub(super) async fn recall(objects: &Objects, run: &str) -> Result<(), StoreErro
         return Ok(());
     }
     let path = format!("{run}/{CHECKPOINT_FILE}");
-    let kept = objects.read(&path).await?.and_then(|bytes| CheckpointPosition::of(&bytes));
+    let kept = objects
+        .read(&path)
+        .await?
+        .and_then(|bytes| CheckpointPosition::of(&bytes));
     let here = std::fs::read(objects.data_dir().join(path)).ok();
     if kept > here.and_then(|bytes| CheckpointPosition::of(&bytes)) {
         objects.pull(run, CHECKPOINT_FILE).await?;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use futures_util::{StreamExt as _, TryStreamExt as _, stream};
 
 use super::JobError;
-use crate::dataset::{self, CollectConfig, DatasetError, DatasetInfo, CollectionStatus};
+use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
 use crate::registry::is_valid_name;
 use crate::store::Objects;
 

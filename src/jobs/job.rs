@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::notes::StoredProgress;
-use super::{JobError, JobSpec, JobState, Losses, JobProgress};
+use super::{JobError, JobProgress, JobSpec, JobState, Losses};
 use crate::store::{JobPage, JobRow};
 
 /// One job as it is now.
@@ -44,7 +44,8 @@ impl Job {
             reason,
         };
         let state: JobState = row.state.parse().map_err(record)?;
-        let standing: StoredProgress = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
+        let standing: StoredProgress =
+            serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
         let mut progress = standing.progress;
         if state != JobState::Running {
             progress.remaining_s = None;

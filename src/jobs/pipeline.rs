@@ -10,14 +10,14 @@ use serde_json::json;
 use tokio::runtime::Handle;
 
 use super::checkpoints::{self, CheckpointSync};
-use super::runner::{JobExecutor, JobFailure, JobResult, JobReporter};
+use super::runner::{JobExecutor, JobFailure, JobReporter, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
 use crate::store::{LossRow, Store};
-use crate::training::{self, CHECKPOINT_FILE, TrainingEvent, TrainingStage, TrainError, Training};
+use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
 use crate::wording;
@@ -86,13 +86,19 @@ impl Pipeline {
         checked.await.unwrap_or(Err(JobError::Stopping))
     }
 
-    fn collect(&self, spec: &CollectSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
+    fn collect(
+        &self,
+        spec: &CollectSpec,
+        report: &JobReporter,
+        cancelled: &AtomicBool,
+    ) -> Result<JobResult, JobFailure> {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
         let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
         self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
-        let on_progress = |progress: dataset::JobProgress| report.progress(progress.done, progress.total, "simulating");
+        let on_progress =
+            |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         let info = once_free(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
@@ -137,8 +143,8 @@ impl Pipeline {
         let train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
         match once_free(train, is_busy, cancelled).map_err(|error| failed(&error))? {
-            training::JobResult::Interrupted { .. } => Err(JobFailure::Cancelled),
-            training::JobResult::Finished { model_dir, manifest } => {
+            training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
+            training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "publishing");
                 let written = self.versions.write(report.lease(), &spec.name, &model_dir);
@@ -165,7 +171,12 @@ impl Pipeline {
         prepared.map_err(|error| failed(&error))
     }
 
-    fn evaluate(&self, spec: &EvaluateSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
+    fn evaluate(
+        &self,
+        spec: &EvaluateSpec,
+        report: &JobReporter,
+        cancelled: &AtomicBool,
+    ) -> Result<JobResult, JobFailure> {
         let loaded = self.model(&spec.model, spec.version)?;
         let twin = spec.twin.as_deref().map(|twin| self.model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
@@ -181,8 +192,8 @@ impl Pipeline {
         };
         let found = evaluation::run(&loaded, &dataset, &config, &|now| {
             let what = match now.stage {
-                evaluation::TrainingStage::Scores => "scores",
-                evaluation::TrainingStage::Actions => "actions",
+                evaluation::EvaluationStage::Scores => "scores",
+                evaluation::EvaluationStage::Actions => "actions",
             };
             report.progress(now.done as u64, now.total as u64, &format!("{} {what}", now.split));
         });

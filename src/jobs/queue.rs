@@ -11,7 +11,7 @@ use super::instance::Instance;
 use super::job::{id_of, number_of};
 use super::notes::StoredProgress;
 use super::runner::{self, JobExecutor};
-use super::{JobTransition, Job, JobError, JobFilter, JobSpec, JobState, unix_s};
+use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition, unix_s};
 use crate::store::{EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// An idempotency key's characters at most.

@@ -15,8 +15,8 @@ use super::instance::Instance;
 use super::job::id_of;
 use super::notes::{JobProgressLog, StoredProgress};
 use super::queue::JobsInner;
-use super::{JobTransition, Job, JobError, JobSpec, JobState, Losses, priority, unix_s};
-use crate::store::{JobUpdate, JobOutcome, JobRow, Lease, LossRow};
+use super::{Job, JobError, JobSpec, JobState, JobTransition, Losses, priority, unix_s};
+use crate::store::{JobOutcome, JobRow, JobUpdate, Lease, LossRow};
 use crate::telemetry::names;
 
 /// How often a job's standing is written, unless the lease asks for more.

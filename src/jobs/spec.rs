@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
-use crate::dataset::{self, CollectConfig, DatasetError, CollectionStatus};
+use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;

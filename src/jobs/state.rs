@@ -56,7 +56,9 @@ impl JobState {
             (Self::Running, JobTransition::Succeed) => Some(Self::Succeeded),
             (Self::Running, JobTransition::Fail) => Some(Self::Failed),
             (Self::Queued | Self::Running, JobTransition::Cancel) => Some(Self::Cancelled),
-            (Self::Running, JobTransition::Leave) | (Self::Failed | Self::Cancelled, JobTransition::Resume) => Some(Self::Queued),
+            (Self::Running, JobTransition::Leave) | (Self::Failed | Self::Cancelled, JobTransition::Resume) => {
+                Some(Self::Queued)
+            }
             _ => None,
         }
     }

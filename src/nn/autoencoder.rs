@@ -104,7 +104,12 @@ impl Model {
     /// Features `[B, horizon, F]` of the frames that follow those with `features` [B, context, F]. The predictor starts
     /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
     /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
-    pub fn predict(&self, features: &Tensor, condition: &ConditioningTensors, feedback: Feedback) -> Result<Tensor, NnError> {
+    pub fn predict(
+        &self,
+        features: &Tensor,
+        condition: &ConditioningTensors,
+        feedback: Feedback,
+    ) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
         if let Feedback::TeacherForcing(truth) = feedback {
             self.check(

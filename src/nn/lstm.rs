@@ -6,7 +6,7 @@ use candle_core::{DType, Tensor};
 use super::NnError;
 use super::dense::{Activation, Dense};
 use super::lstm_cell::{LstmState, PeepholeCell};
-use super::recurrence::{forward_sequence, decode_autoregressive};
+use super::recurrence::{decode_autoregressive, forward_sequence};
 
 /// Runs the cell over a sequence x `[B, T, D]` from `state`: the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
@@ -72,7 +72,11 @@ impl Decoder<'_> {
             };
             state = self.cell.step(&input, &state)?;
             let output = self.output.forward(&state.h)?;
-            features.push(if self.residual { (&features[k] + output)? } else { output });
+            features.push(if self.residual {
+                (&features[k] + output)?
+            } else {
+                output
+            });
         }
         Ok(Tensor::stack(&features[1..], 1)?)
     }

@@ -12,7 +12,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::debug;
 
-use super::listener::{BoundedListener, BoundedConnection};
+use super::listener::{BoundedConnection, BoundedListener};
 use super::{App, router, streams};
 
 /// The open connections; dropping them cuts them off. One that became a stream belongs to the stream's task.
@@ -58,7 +58,12 @@ impl Connections {
 }
 
 /// Answers a connection's requests; once told to stop, those that have been read.
-async fn answer(connection: BoundedConnection, http: http1::Builder, router: Router, mut stopping: watch::Receiver<bool>) {
+async fn answer(
+    connection: BoundedConnection,
+    http: http1::Builder,
+    router: Router,
+    mut stopping: watch::Receiver<bool>,
+) {
     let service = TowerToHyperService::new(router);
     let mut connection = pin!(http.serve_connection(TokioIo::new(connection), service).with_upgrades());
     let result = tokio::select! {

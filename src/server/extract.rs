@@ -118,7 +118,10 @@ mod tests {
 
     #[test]
     fn the_first_form_named_that_there_is_is_taken() {
-        assert_eq!(ResponseFormat::from_accept("text/html, image/gif;q=0.8, */*"), Ok(ResponseFormat::Gif));
+        assert_eq!(
+            ResponseFormat::from_accept("text/html, image/gif;q=0.8, */*"),
+            Ok(ResponseFormat::Gif)
+        );
         assert_eq!(ResponseFormat::from_accept("*/*"), Ok(ResponseFormat::Json));
         assert!(ResponseFormat::from_accept("text/html").is_err());
     }

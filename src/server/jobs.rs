@@ -230,7 +230,10 @@ pub(super) async fn logs(
     params(("id" = String, Path, description = "The job's id")),
     responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
 )]
-pub(super) async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
+pub(super) async fn metrics(
+    State(app): State<App>,
+    Path(id): Path<String>,
+) -> Result<axum::Json<LossCurves>, ApiError> {
     let points = app.jobs().losses(&id).await?;
     Ok(axum::Json(LossCurves {
         points: points.into_iter().map(CurvePoint::from).collect(),

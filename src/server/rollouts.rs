@@ -16,7 +16,7 @@ use super::sessions::AuthorizedSession;
 use super::{App, ServerConfig, blocking, picture};
 use crate::frame::Frame;
 use crate::registry::{LoadedModel, Manifest};
-use crate::serving::{TaskOutput, ConditioningInput, Task};
+use crate::serving::{ConditioningInput, Task, TaskOutput};
 use crate::types::RobotState;
 
 /// A context, and what might be done.

@@ -47,7 +47,11 @@ type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
         (status = 503, description = "Too many streams", body = Problem),
     )
 )]
-pub(super) async fn of_session(State(app): State<App>, session: AuthorizedSession, upgrade: Upgrade) -> Result<Response, ApiError> {
+pub(super) async fn of_session(
+    State(app): State<App>,
+    session: AuthorizedSession,
+    upgrade: Upgrade,
+) -> Result<Response, ApiError> {
     open(app, session.0, true, upgrade)
 }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 
-use super::{PredictionInput, ConditioningInput, ServingError, Task};
+use super::{ConditioningInput, PredictionInput, ServingError, Task};
 use crate::frame::Frame;
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec};

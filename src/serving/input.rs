@@ -1,6 +1,6 @@
 //! What a prediction takes, and whether it fits a model.
 
-use super::task::{ConditioningInput, REQUEST, Task, RawConditioning};
+use super::task::{ConditioningInput, REQUEST, RawConditioning, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};

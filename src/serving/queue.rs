@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
 use super::batch::{self, Candidate};
-use super::{TaskOutput, ServingError, Task, meter};
+use super::{ServingError, Task, TaskOutput, meter};
 use crate::registry::LoadedModel;
 
 /// A full queue of the reference model's predictions is worked off well within this.

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compute::Features;
 use super::input::InputError;
-use super::task::{FieldNames, ConditioningInput, Task, RawConditioning};
+use super::task::{ConditioningInput, FieldNames, RawConditioning, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};

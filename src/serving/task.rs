@@ -47,7 +47,12 @@ pub(crate) const STEP: FieldNames = FieldNames {
 
 impl ConditioningInput {
     /// Of what was told, that which the model takes. Errors name the field, what it is and what it should be.
-    pub(crate) fn new(told: RawConditioning<'_>, fields: &FieldNames, model: &str, spec: &ModelSpec) -> Result<Self, InputError> {
+    pub(crate) fn new(
+        told: RawConditioning<'_>,
+        fields: &FieldNames,
+        model: &str,
+        spec: &ModelSpec,
+    ) -> Result<Self, InputError> {
         if spec.conditioning == Conditioning::None {
             return Ok(Self::default());
         }

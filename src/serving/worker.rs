@@ -8,7 +8,7 @@ use tracing::{error, info};
 
 use super::catalog::Catalog;
 use super::queue::{ModelLoad, Queue, QueuedTask, WorkItem};
-use super::{TaskOutput, PredictionInput, ServingError, Task, compute, meter};
+use super::{PredictionInput, ServingError, Task, TaskOutput, compute, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;

@@ -10,7 +10,7 @@ use rapier3d::parry::shape::Cuboid;
 use rapier3d::prelude::Vector;
 
 use super::cast::UprightCylinder;
-use super::mover::{NearestHit, Mover, MoverView, face};
+use super::mover::{Mover, MoverView, NearestHit, face};
 use super::{PlanarPose, SimError, WorldConfig, arena};
 use crate::frame::Frame;
 
@@ -99,7 +99,10 @@ impl Camera {
 
     /// One ray through each pixel's middle, then more where they disagree.
     fn render(&self, movers: &[Mover]) -> Vec<RaySample> {
-        let seen: Vec<MoverView> = movers.iter().map(|mover| MoverView::new(mover, self.position)).collect();
+        let seen: Vec<MoverView> = movers
+            .iter()
+            .map(|mover| MoverView::new(mover, self.position))
+            .collect();
         let mut middles = Vec::with_capacity(self.width * self.height);
         for row in 0..self.height {
             for column in 0..self.width {

@@ -9,7 +9,7 @@ use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow};
 use sqlx::{
-    AssertSqlSafe, Connection as _, Decode, Encode, Postgres, DatabaseRow as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
+    AssertSqlSafe, Connection as _, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
     Type,
 };
 
@@ -158,7 +158,11 @@ impl Database {
     }
 
     /// The rows that a statement gives.
-    pub(super) async fn fetch(&self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
+    pub(super) async fn fetch(
+        &self,
+        sql: &'static str,
+        values: Vec<DatabaseValue>,
+    ) -> Result<Vec<DatabaseRow>, StoreError> {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(pool) => sqlite_rows(bind::<Sqlite>(sql, values).fetch_all(pool).await?),
@@ -185,12 +189,20 @@ impl Database {
 }
 
 impl Tx {
-    pub(super) async fn fetch(&mut self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
+    pub(super) async fn fetch(
+        &mut self,
+        sql: &'static str,
+        values: Vec<DatabaseValue>,
+    ) -> Result<Vec<DatabaseRow>, StoreError> {
         self.fetch_any(sql.into_sql_str(), values).await
     }
 
     /// As `fetch`, but holds the rows and passes over those that another transaction holds.
-    pub(super) async fn fetch_free(&mut self, sql: &'static str, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
+    pub(super) async fn fetch_free(
+        &mut self,
+        sql: &'static str,
+        values: Vec<DatabaseValue>,
+    ) -> Result<Vec<DatabaseRow>, StoreError> {
         let sql = match self {
             Self::Sqlite(_) => sql.into_sql_str(),
             Self::Postgres(_) => AssertSqlSafe(format!("{sql} FOR UPDATE SKIP LOCKED")).into_sql_str(),

@@ -4,7 +4,7 @@
 //! token it was given, so that one who was thought dead and comes back writes nothing.
 
 use super::accounts::{JobUpdate, write_account};
-use super::database::{DatabaseRow, Tx, DatabaseValue};
+use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::{Store, StoreError};
 
 /// A job as it is kept. Structured values are JSON of the one who wrote them.

@@ -5,8 +5,8 @@ use candle_core::Tensor;
 use super::batches::Shuffle;
 use super::config::TrainConfig;
 use super::observer::TrainingStage;
-use super::stage::{Objective, BatchPart};
-use super::{TrainingPlan, TrainError, window_frames};
+use super::stage::{BatchPart, Objective};
+use super::{TrainError, TrainingPlan, window_frames};
 use crate::nn::loss::Loss;
 use crate::nn::{Model, Parameters};
 

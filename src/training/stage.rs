@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::TrainError;
 use super::checkpoint::{Checkpoint, RunFiles};
 use super::config::RunConfig;
-use super::observer::{TrainingEvent, Observer, TrainingStage};
+use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::{Adam, Gradients, OptimizerError};
 use crate::nn::Parameters;
 

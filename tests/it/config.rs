@@ -114,7 +114,10 @@ fn what_is_no_setting_is_refused_with_where_it_was_given() {
     ] {
         assert_eq!(refused(layers), expected);
     }
-    assert!(matches!(ConfigLayer::setting("max_streams"), Err(ConfigError::Setting(_))));
+    assert!(matches!(
+        ConfigLayer::setting("max_streams"),
+        Err(ConfigError::Setting(_))
+    ));
     let dir = tempfile::tempdir().unwrap();
     assert!(matches!(
         ConfigLayer::file(&dir.path().join("none")),
@@ -141,7 +144,9 @@ fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
 #[test]
 fn a_password_is_not_printed() {
     let url = "database_url=postgres://ada:secret@db/foreframe";
-    let text = LoadedConfig::from_layers([ConfigLayer::setting(url).unwrap()]).unwrap().to_toml();
+    let text = LoadedConfig::from_layers([ConfigLayer::setting(url).unwrap()])
+        .unwrap()
+        .to_toml();
     assert!(
         text.contains("postgres://ada:***@db/foreframe") && !text.contains("secret"),
         "{text}"

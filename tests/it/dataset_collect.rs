@@ -4,7 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use foreframe::dataset::{CollectConfig, Dataset, DatasetError, DatasetInfo, CollectProgress, CollectionStatus, collect};
+use foreframe::dataset::{
+    CollectConfig, CollectProgress, CollectionStatus, Dataset, DatasetError, DatasetInfo, collect,
+};
 use foreframe::sim::{Scenario, World, WorldConfig};
 use foreframe::types::Seed;
 use proptest::prelude::*;
@@ -141,7 +143,10 @@ fn going_on_simulates_only_what_is_missing() {
         error.to_string(),
         "stopped with 6 of 11 trials kept; run the same command again to go on"
     );
-    assert_eq!(CollectionStatus::of(&one_thread).unwrap(), CollectionStatus::PendingStep { trials: 6 });
+    assert_eq!(
+        CollectionStatus::of(&one_thread).unwrap(),
+        CollectionStatus::PendingStep { trials: 6 }
+    );
     let first = AtomicU64::new(u64::MAX);
     let told = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
@@ -187,7 +192,10 @@ fn a_finished_set_is_returned_at_once() {
         &AtomicBool::new(false),
     )
     .unwrap();
-    assert_eq!(CollectionStatus::of(&config(&out)).unwrap(), CollectionStatus::Finished(Box::new(info)));
+    assert_eq!(
+        CollectionStatus::of(&config(&out)).unwrap(),
+        CollectionStatus::Finished(Box::new(info))
+    );
     assert_eq!(contents(&out), before);
 }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use foreframe::dataset::Dataset;
-use foreframe::evaluation::report::{SetOutcome, EvaluationReport};
+use foreframe::evaluation::report::{EvaluationReport, SetOutcome};
 use foreframe::evaluation::{self, EvaluateConfig, EvaluationError};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe::registry::{DatasetStamp, LoadedModel};
@@ -56,7 +56,11 @@ fn config() -> EvaluateConfig<'static> {
     }
 }
 
-fn evaluate(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> Result<EvaluationReport, EvaluationError> {
+fn evaluate(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    config: &EvaluateConfig,
+) -> Result<EvaluationReport, EvaluationError> {
     evaluation::run(loaded, dataset, config, &|_| {})
 }
 

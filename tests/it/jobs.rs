@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::jobs::{JobExecutor, JobFailure, JobError, JobLimits, JobSpec, Jobs, JobResult, JobReporter};
+use foreframe::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
 use foreframe::nn::Conditioning;
 use foreframe::server::{App, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
@@ -103,7 +103,9 @@ async fn a_job_goes_its_way_and_can_be_watched() {
     state_becomes(&app, "job-1", "succeeded").await;
 
     post(&app, JOBS, &collect("b")).await;
-    order.send(Err(JobFailure::Failed("the disk is full".to_owned()))).unwrap();
+    order
+        .send(Err(JobFailure::Failed("the disk is full".to_owned())))
+        .unwrap();
     assert_eq!(
         state_becomes(&app, "job-2", "failed").await["error"],
         "the disk is full"

@@ -1,7 +1,7 @@
 //! Small models and inputs for the tests of the network.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{ChannelScale, ConditioningTensors, Conditioning, ModelSpec, Reconstruction};
+use foreframe::nn::{ChannelScale, Conditioning, ConditioningTensors, ModelSpec, Reconstruction};
 
 pub(crate) fn channel(name: &str, mean: f32, std: f32) -> ChannelScale {
     ChannelScale {

@@ -1,7 +1,7 @@
 //! The whole model: gradients, determinism, conditioning, and what it refuses.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{ConditioningTensors, Conditioning, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
+use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
 use crate::nn_common::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
@@ -199,8 +199,9 @@ fn a_missing_or_misshapen_input_is_named_with_what_would_be_right() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
-    let error =
-        |frames: &Tensor, condition: &ConditioningTensors| model.predict_frames(frames, condition).unwrap_err().to_string();
+    let error = |frames: &Tensor, condition: &ConditioningTensors| {
+        model.predict_frames(frames, condition).unwrap_err().to_string()
+    };
     let full = condition(&spec, 2);
     assert_eq!(
         error(&frames, &ConditioningTensors::none()),

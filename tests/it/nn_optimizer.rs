@@ -60,7 +60,9 @@ fn train(parameters: &Parameters, adam: &mut Adam, steps: std::ops::Range<usize>
     for step in steps {
         let seen = values(&[2, spec.context, spec.features], step as f32);
         let ahead = values(&[2, spec.horizon, spec.features], step as f32 + 0.5);
-        let predicted = model.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
+        let predicted = model
+            .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
+            .unwrap();
         let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
         let gradients = Gradients::of(&loss, parameters, &[]).unwrap();
         adam.update(parameters, &gradients, RATE).unwrap();
@@ -171,7 +173,9 @@ fn gradients_of_halves_join_to_the_gradient_of_the_whole() {
     let (seen, ahead) = (values(&[4, 2, 3], 0.0), values(&[4, 2, 3], 0.5));
     let of = |from: usize, count: usize| {
         let seen = seen.narrow(0, from, count).unwrap();
-        let predicted = model.predict(&seen, &ConditioningTensors::none(), Feedback::Prediction).unwrap();
+        let predicted = model
+            .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
+            .unwrap();
         let loss = Loss::L1
             .between(&predicted, &ahead.narrow(0, from, count).unwrap())
             .unwrap();

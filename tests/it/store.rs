@@ -2,7 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use foreframe::store::{JobUpdate, JobOutcome, EnqueueResult, JobPage, JobRow, Lease, LossRow, NewJob, Store, StoreConfig};
+use foreframe::store::{
+    EnqueueResult, JobOutcome, JobPage, JobRow, JobUpdate, Lease, LossRow, NewJob, Store, StoreConfig,
+};
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
@@ -105,7 +107,10 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
             assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
-        assert_eq!(store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(), Some(true));
+        assert_eq!(
+            store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(),
+            Some(true)
+        );
         assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
         assert_eq!(
@@ -121,7 +126,12 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
         assert_eq!(lines, [(4, "four"), (5, "five")]);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
         assert_eq!(store.job_losses(1).await.unwrap(), account("").losses);
-        assert!(!store.end(lease, ending("succeeded"), JobUpdate::default()).await.unwrap());
+        assert!(
+            !store
+                .end(lease, ending("succeeded"), JobUpdate::default())
+                .await
+                .unwrap()
+        );
     }
 }
 
@@ -142,7 +152,10 @@ async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
         );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
-        assert_eq!(store.renew(fresh, 40.0, JobUpdate::default()).await.unwrap(), Some(false));
+        assert_eq!(
+            store.renew(fresh, 40.0, JobUpdate::default()).await.unwrap(),
+            Some(false)
+        );
         assert_eq!(store.release_leases("slow").await.unwrap(), 0);
         assert_eq!(store.release_leases("quick").await.unwrap(), 1);
         assert_eq!(store.claim("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
@@ -157,7 +170,9 @@ async fn places_keys_and_names_are_given_once() {
             enqueue(job(Some("data set a"), Some("k"))).await,
             EnqueueResult::New(_)
         ));
-        assert!(matches!(enqueue(job(Some("data set b"), Some("k"))).await, EnqueueResult::Same(row) if row.number == 1));
+        assert!(
+            matches!(enqueue(job(Some("data set b"), Some("k"))).await, EnqueueResult::Same(row) if row.number == 1)
+        );
         assert_eq!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::Taken);
         assert!(matches!(enqueue(job(None, None)).await, EnqueueResult::New(_)));
         assert_eq!(enqueue(job(None, None)).await, EnqueueResult::Full);
@@ -275,10 +290,20 @@ async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_end
             published: Some(("m".to_owned(), version, activates)),
             ..ending("succeeded")
         };
-        assert!(store.end(lease, published(5, true), JobUpdate::default()).await.unwrap());
+        assert!(
+            store
+                .end(lease, published(5, true), JobUpdate::default())
+                .await
+                .unwrap()
+        );
         let (lease, version) = reserve(&store, "m").await;
         assert_eq!(version, 6);
-        assert!(store.end(lease, published(6, true), JobUpdate::default()).await.unwrap());
+        assert!(
+            store
+                .end(lease, published(6, true), JobUpdate::default())
+                .await
+                .unwrap()
+        );
         let listed = store.published_versions().await.unwrap();
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
         // The first stays chosen until another is.

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use foreframe::dataset::Dataset;
 use foreframe::registry;
-use foreframe::training::{TrainingEvent, TrainingOutcome, TrainConfig, TrainError, Training, run};
+use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
 
 use crate::fixtures::moving_squares;
 
@@ -39,7 +39,12 @@ fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<Training
 }
 
 /// Trains until so many updates were made in this call.
-fn train_until(config: &TrainConfig, dataset: &Dataset, dir: &Path, updates: usize) -> Result<TrainingOutcome, TrainError> {
+fn train_until(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    dir: &Path,
+    updates: usize,
+) -> Result<TrainingOutcome, TrainError> {
     let cancelled = AtomicBool::new(false);
     let made = Cell::new(0);
     let training = Training {
@@ -76,7 +81,10 @@ fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
         let broken = dir.path().join(name);
         for updates in stops {
             let outcome = train_until(&config, &dataset, &broken, updates).unwrap();
-            assert!(matches!(outcome, TrainingOutcome::Interrupted { .. }), "{name}: {outcome:?}");
+            assert!(
+                matches!(outcome, TrainingOutcome::Interrupted { .. }),
+                "{name}: {outcome:?}"
+            );
         }
         train(&config, &dataset, &broken).unwrap();
         assert_eq!(

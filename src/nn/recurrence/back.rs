@@ -98,7 +98,12 @@ impl Recurrence {
     }
 
     /// Gradients of the weights in the order in which they were joined.
-    pub(super) fn weights_back(&self, trace: &RecurrenceTrace, back: &RecurrenceGradients, sums: &Tensor) -> Result<Tensor> {
+    pub(super) fn weights_back(
+        &self,
+        trace: &RecurrenceTrace,
+        back: &RecurrenceGradients,
+        sums: &Tensor,
+    ) -> Result<Tensor> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = back.h.len() / hidden;
         let past = |values: &[f32], side: usize| matrix(values[..values.len() - batch * side].to_vec(), side);

@@ -6,7 +6,7 @@ use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::server::images::{self, ImageError, ImageFormat};
 use crate::server::protocol::{ErrorCode, OnGap, OnLate, ServerMessage, Timing};
-use crate::serving::{TaskOutput, InputError, ConditioningInput, ServingError, SessionState, Task};
+use crate::serving::{ConditioningInput, InputError, ServingError, SessionState, Task, TaskOutput};
 use crate::types::ValueError;
 
 /// A frame whose values fit the model.
@@ -137,7 +137,13 @@ impl SessionCore {
     }
 
     /// Takes the step, of which this was computed.
-    pub(super) fn commit(&mut self, step: FrameStep, mut computed: TaskOutput, skipped: u64, spec: &ModelSpec) -> CachedAnswer {
+    pub(super) fn commit(
+        &mut self,
+        step: FrameStep,
+        mut computed: TaskOutput,
+        skipped: u64,
+        spec: &ModelSpec,
+    ) -> CachedAnswer {
         if let Some(features) = computed.features.pop() {
             self.state.advance(step.seq, features, step.premise, spec);
         }

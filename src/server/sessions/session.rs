@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-use super::core::{PendingStep, SessionCore, Settings, FrameStep, StepError};
+use super::core::{FrameStep, PendingStep, SessionCore, Settings, StepError};
 use super::token::{Token, TokenHash};
 use crate::registry::LoadedModel;
 use crate::server::images::ImageFormat;
@@ -180,7 +180,11 @@ impl Hold {
     }
 
     /// Answers a frame: from memory if it has been answered, else by a step. Errors leave the session as it was.
-    pub(in crate::server) async fn step(&self, predictor: &Predictor, step: FrameStep) -> Result<ServerMessage, StepError> {
+    pub(in crate::server) async fn step(
+        &self,
+        predictor: &Predictor,
+        step: FrameStep,
+    ) -> Result<ServerMessage, StepError> {
         let (key, model) = (self.session.key, &self.session.model);
         let (format, begun) = {
             let inner = self.inner()?;

@@ -23,7 +23,7 @@ use crate::server::sessions::core::{FrameStep, StepError};
 use crate::server::sessions::limits;
 use crate::server::sessions::session::{Hold, Holder, Session};
 use crate::server::{App, streams};
-use crate::serving::{ConditioningInput, STEP, RawConditioning};
+use crate::serving::{ConditioningInput, RawConditioning, STEP};
 use crate::telemetry::names;
 use crate::types::{Action, RobotState};
 
@@ -135,7 +135,7 @@ impl StreamConnection {
             biased;
             () = streams::told(&mut stopping) => Ok(ClosingReason::Shutdown),
             holder = self.hold.lost() => Ok(match holder {
-                Holder::StreamConnection(_) => ClosingReason::Replaced,
+                Holder::Connection(_) => ClosingReason::Replaced,
                 Holder::Deleted => ClosingReason::Deleted,
             }),
             end = self.read_all(stream, &inbox) => end,
@@ -163,8 +163,10 @@ impl StreamConnection {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
-                    self.checked(frame)
-                        .map_or_else(|error| PipelinedItem::refused(error.code(), error.to_string()), PipelinedItem::Frame)
+                    self.checked(frame).map_or_else(
+                        |error| PipelinedItem::refused(error.code(), error.to_string()),
+                        PipelinedItem::Frame,
+                    )
                 }
                 Ok(ClientMessage::Configure(message)) => PipelinedItem::Configure(message),
                 Ok(ClientMessage::Ping(ping)) => {
