@@ -164,8 +164,13 @@ const IS_COMPLETE: &str =
     && [...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)";
 
 async fn serve(data_dir: &Path) -> (App, Keys, Running) {
+    serve_with(data_dir, ServerConfig::default().max_environments).await
+}
+
+async fn serve_with(data_dir: &Path, max_environments: usize) -> (App, Keys, Running) {
     let app = App::open(ServerConfig {
         data_dir: data_dir.to_owned(),
+        max_environments,
         ..ServerConfig::default()
     })
     .await
@@ -176,7 +181,7 @@ async fn serve(data_dir: &Path) -> (App, Keys, Running) {
 }
 
 #[tokio::test]
-async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
+async fn page_drives_a_simulated_robot_and_shows_predictions() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;
@@ -189,7 +194,12 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
     page.until(IS_COMPLETE).await;
-    assert_eq!(page.value("document.getElementById('model').value").await, "moving");
+    assert_eq!(page.value("document.getElementById('model').value").await, "static");
+    let choose = "const list = document.getElementById('model'); list.value = 'moving'; list.dispatchEvent(new Event('change'))";
+    page.value(choose).await;
+    page.until("document.getElementById('status').textContent.includes('automatic driver')")
+        .await;
+    page.until(IS_COMPLETE).await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     let key = |kind: &str| json!({"type": kind, "key": "w", "code": "KeyW", "windowsVirtualKeyCode": 87});
     page.call("Input.dispatchKeyEvent", key("keyDown")).await;
@@ -204,13 +214,13 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
         page.screenshot("page", width_px, colors).await;
     }
     page.call("Input.dispatchKeyEvent", key("keyUp")).await;
-    page.until("document.getElementById('status').textContent.includes('its own driver')")
+    page.until("document.getElementById('status').textContent.includes('automatic driver')")
         .await;
     server.stop().await;
 }
 
 #[tokio::test]
-async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addresses() {
+async fn page_asks_for_a_key_and_keeps_it_out_of_urls() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;
@@ -225,9 +235,9 @@ async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addr
         .await;
     assert_eq!(page.value("document.getElementById('refused').textContent").await, "");
     page.unlock("let me in").await;
-    page.until(&says("This is no key")).await;
+    page.until(&says("This is not a key")).await;
     page.unlock(&format!("{}x", key.text)).await;
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.until(&says("This key is unknown or was revoked")).await;
     for width_px in [1280, 400] {
         page.screenshot("locked", width_px, "light").await;
     }
@@ -245,10 +255,45 @@ async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addr
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     app.store().revoke_key(&key.id, 2.0).await.unwrap();
     keys.refresh().await.unwrap();
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.until(&says("This key is unknown or was revoked")).await;
     page.unlock(&other.text).await;
     page.until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
         .await;
     page.until(IS_COMPLETE).await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn page_deletes_its_environment_when_it_closes() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let (_app, _, server) = serve_with(dir.path(), 2).await;
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
+    for _ in 0..5 {
+        page.until(IS_COMPLETE).await;
+        page.call("Page.reload", json!({})).await;
+        page.until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn page_says_what_to_do_without_models() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let config = crate::service::with_data(dir.path(), ServerConfig::default());
+    let app = crate::service::start(config, Vec::new());
+    let server = run(app).await;
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
+    page.until("document.getElementById('status').textContent.startsWith('No model is loaded')")
+        .await;
     server.stop().await;
 }
