@@ -82,7 +82,7 @@ fn assert_status(sample: &Sample, answer: &Answer) {
 }
 
 #[test]
-fn every_kept_body_is_answered_with_the_status_in_its_name() {
+fn corpus_bodies_get_the_status_in_their_name() {
     let _alone = alone();
     for sample in samples("bodies") {
         assert_status(&sample, &ask(&sample, sample.bytes.clone()));
@@ -90,7 +90,7 @@ fn every_kept_body_is_answered_with_the_status_in_its_name() {
 }
 
 #[test]
-fn every_kept_state_is_taken_or_refused_as_its_name_says() {
+fn corpus_states_get_the_status_in_their_name() {
     let _alone = alone();
     for sample in samples("states") {
         let text = String::from_utf8(sample.bytes.clone()).unwrap();
@@ -100,7 +100,7 @@ fn every_kept_state_is_taken_or_refused_as_its_name_says() {
 
 proptest! {
     #[test]
-    fn a_mutated_body_is_answered_as_the_contract_says(which: Index, mutations in mutations()) {
+    fn mutated_bodies_get_a_documented_status(which: Index, mutations in mutations()) {
         let _alone = alone();
         let samples = samples("bodies");
         let sample = which.get(&samples);
@@ -108,7 +108,7 @@ proptest! {
     }
 
     #[test]
-    fn a_mutated_state_is_taken_or_refused(which: Index, mutations in mutations()) {
+    fn mutated_states_are_accepted_or_refused(which: Index, mutations in mutations()) {
         let _alone = alone();
         let samples = samples("states");
         let sample = which.get(&samples);
@@ -117,7 +117,7 @@ proptest! {
 }
 
 #[test]
-fn a_body_takes_no_more_memory_than_its_length_allows() {
+fn request_memory_is_bounded_by_the_body_length() {
     let _alone = alone();
     let filled = |head: &str, item: &str, bytes: usize| head.to_owned() + &item.repeat(bytes / item.len());
     let long = 1 << 20;
@@ -150,7 +150,7 @@ fn a_body_takes_no_more_memory_than_its_length_allows() {
 }
 
 #[test]
-fn a_request_for_a_job_over_its_limit_is_refused() {
+fn a_job_over_the_size_limit_is_refused() {
     let _alone = alone();
     let limit = ServerConfig::default().max_job_bytes;
     let settings: Value = (0..limit / 8).map(|number| (format!("s{number}"), json!(0))).collect();

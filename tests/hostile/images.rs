@@ -19,7 +19,7 @@ fn predict(name: &str, image: &[u8]) -> Answer {
 }
 
 #[test]
-fn every_kept_image_is_read_or_refused_as_its_name_says() {
+fn corpus_images_are_accepted_or_refused_as_named() {
     let _alone = alone();
     for sample in samples("images") {
         let answer = predict(&sample.name, &sample.bytes);
@@ -37,7 +37,7 @@ fn every_kept_image_is_read_or_refused_as_its_name_says() {
 }
 
 #[test]
-fn the_size_that_an_image_states_is_refused_before_it_is_allocated() {
+fn a_huge_image_size_is_refused_before_allocation() {
     let _alone = alone();
     for sample in samples("images").iter().filter(|sample| sample.name.contains("65535")) {
         // 4 GiB of pixels.
@@ -51,7 +51,7 @@ fn the_size_that_an_image_states_is_refused_before_it_is_allocated() {
 
 proptest! {
     #[test]
-    fn a_mutated_image_is_read_or_refused(which: Index, mutations in mutations()) {
+    fn mutated_images_are_decoded_or_refused(which: Index, mutations in mutations()) {
         let _alone = alone();
         let samples = samples("images");
         let sample = which.get(&samples);

@@ -43,7 +43,7 @@ fn within<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) -> T {
 }
 
 #[test]
-fn more_than_the_limit_is_noticed() {
+fn the_memory_check_fails_above_its_limit() {
     let _alone = alone();
     let greedy = || within(1 << 20, "a vector", || std::hint::black_box(vec![0u8; 2 << 20]));
     assert!(std::panic::catch_unwind(greedy).is_err());

@@ -38,7 +38,7 @@ fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, St
 }
 
 #[test]
-fn every_kept_message_is_read_or_refused_as_its_name_says() {
+fn corpus_messages_are_accepted_or_refused_as_named() {
     let _alone = alone();
     for sample in samples("messages") {
         let decoded = decode(&sample.name, sample.is("json"), sample.bytes.clone());
@@ -48,7 +48,7 @@ fn every_kept_message_is_read_or_refused_as_its_name_says() {
 
 proptest! {
     #[test]
-    fn a_mutated_message_is_read_or_refused(which: Index, mutations in mutations()) {
+    fn mutated_messages_are_decoded_or_refused(which: Index, mutations in mutations()) {
         let _alone = alone();
         let samples = samples("messages");
         let sample = which.get(&samples);
@@ -57,7 +57,7 @@ proptest! {
 }
 
 #[test]
-fn a_message_takes_no_more_memory_than_its_length_allows() {
+fn decoding_memory_is_bounded_by_the_message_length() {
     let _alone = alone();
     let filled = |head: &[u8], item: &[u8]| [head, &item.repeat((1 << 20) / item.len())].concat();
     for (is_text, bytes) in [

@@ -113,7 +113,7 @@ fn code(text: &str) -> impl Iterator<Item = &str> {
 }
 
 #[test]
-fn a_module_uses_only_those_before_it() {
+fn modules_use_only_earlier_modules() {
     for (file, text) in sources() {
         let Some((_, allowed)) = MAY_USE.iter().find(|(name, _)| *name == module(&file)) else {
             continue;
@@ -129,7 +129,7 @@ fn a_module_uses_only_those_before_it() {
 }
 
 #[test]
-fn a_crate_stays_in_its_rooms() {
+fn dependencies_are_used_only_in_their_modules() {
     for (file, text) in sources() {
         for (name, rooms) in ROOMS.iter().filter(|(_, rooms)| !rooms.contains(&module(&file))) {
             let uses = |line: &str| line.trim_start().starts_with(&format!("use {name}"));

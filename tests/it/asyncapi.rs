@@ -73,7 +73,7 @@ fn replay<T: DeserializeOwned + Serialize + Debug + PartialEq>(contract: &Contra
 }
 
 #[test]
-fn every_message_has_examples_that_the_codec_reads_and_writes() {
+fn every_message_example_round_trips_through_the_codec() {
     let contract = contract();
     replay::<ClientMessage>(&contract);
     replay::<ServerMessage>(&contract);

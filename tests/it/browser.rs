@@ -176,7 +176,7 @@ async fn serve(data_dir: &Path) -> (App, Keys, Running) {
 }
 
 #[tokio::test]
-async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
+async fn the_page_drives_a_robot_and_shows_predictions() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;
@@ -210,7 +210,7 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
 }
 
 #[tokio::test]
-async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addresses() {
+async fn the_page_asks_for_an_api_key_and_hides_it() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;

@@ -49,7 +49,7 @@ fn workplace() -> tempfile::TempDir {
 }
 
 #[test]
-fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
+fn usage_errors_exit_with_2_and_advice() {
     let dir = workplace();
     fs::create_dir(dir.path().join("thesis")).unwrap();
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();
@@ -157,7 +157,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
 }
 
 #[test]
-fn a_prediction_from_files_says_what_its_frames_and_actions_lack() {
+fn predict_reports_invalid_frames_and_actions() {
     let dir = workplace();
     let frames = dir.path().join("look");
     fs::create_dir(&frames).unwrap();
@@ -225,7 +225,7 @@ fn a_prediction_from_files_says_what_its_frames_and_actions_lack() {
 }
 
 #[test]
-fn a_damaged_data_set_or_model_ends_in_1_and_is_told_with_its_cause() {
+fn damaged_files_exit_with_1_and_the_cause() {
     let dir = workplace();
     let shard = dir
         .path()
@@ -271,7 +271,7 @@ fn record_anew(dataset: &Path, shard: &[u8]) {
 /// The system's limit on a file's size stands for a disk without room.
 #[cfg(unix)]
 #[test]
-fn a_file_that_can_not_be_written_is_told_with_its_cause_and_leaves_no_data_set() {
+fn a_failed_write_leaves_no_data_set() {
     let dir = tempfile::tempdir().unwrap();
     let script = format!("trap '' XFSZ; ulimit -f 4; exec '{PROGRAM}' collect --trials 3");
     let (code, text) = ended(Command::new("sh").args(["-c", &script]).current_dir(dir.path()));
@@ -287,7 +287,7 @@ fn a_file_that_can_not_be_written_is_told_with_its_cause_and_leaves_no_data_set(
 }
 
 #[test]
-fn collect_train_and_evaluate_meet_in_one_place_without_being_told() {
+fn collect_train_and_evaluate_share_default_directories() {
     let dir = tempfile::tempdir().unwrap();
     done(dir.path(), "collect --trials 40 --frame-size 8");
     let small = "--set data.windows=40 --set pretrain.steps=1 --set fit.steps=2 --set model.features=4 \

@@ -48,7 +48,7 @@ async fn answer(client: &mut TcpStream) -> String {
 }
 
 #[tokio::test]
-async fn headers_that_come_too_slowly_are_cut_off() {
+async fn slow_headers_time_out() {
     let (_dir, server) = running(ServerConfig {
         header_read_ms: 100,
         ..ServerConfig::default()
@@ -71,7 +71,7 @@ async fn headers_that_come_too_slowly_are_cut_off() {
 }
 
 #[tokio::test]
-async fn an_idle_connection_is_closed_after_its_answers() {
+async fn an_idle_connection_is_closed() {
     let (_dir, server) = running(ServerConfig {
         header_read_ms: 200,
         ..ServerConfig::default()
@@ -89,7 +89,7 @@ async fn an_idle_connection_is_closed_after_its_answers() {
 }
 
 #[tokio::test]
-async fn a_head_over_its_limit_is_refused() {
+async fn headers_over_the_limit_are_answered_431() {
     let (_dir, server) = running(ServerConfig {
         max_header_bytes: 8192,
         ..ServerConfig::default()
@@ -103,7 +103,7 @@ async fn a_head_over_its_limit_is_refused() {
 }
 
 #[tokio::test]
-async fn a_client_that_reads_nothing_loses_its_connection() {
+async fn a_client_that_never_reads_is_disconnected() {
     let (_dir, server) = running(ServerConfig {
         write_stall_ms: 100,
         ..ServerConfig::default()
@@ -118,7 +118,7 @@ async fn a_client_that_reads_nothing_loses_its_connection() {
 }
 
 #[tokio::test]
-async fn a_stopping_server_is_not_ready_first_and_answers_while_it_drains() {
+async fn a_draining_server_is_not_ready_but_answers() {
     let (_dir, server) = running(ServerConfig {
         drain_ms: 2_000,
         ..ServerConfig::default()
@@ -151,7 +151,7 @@ async fn a_stopping_server_is_not_ready_first_and_answers_while_it_drains() {
 }
 
 #[tokio::test]
-async fn an_encoded_body_is_refused() {
+async fn a_compressed_body_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let bomb = Request::post("/v1/models/plain/predict")
@@ -163,7 +163,7 @@ async fn an_encoded_body_is_refused() {
 }
 
 #[tokio::test]
-async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
+async fn other_origins_are_refused_unless_configured() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         cors_origins: vec!["https://robots.example".to_owned()],
@@ -200,7 +200,7 @@ async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
 }
 
 #[tokio::test]
-async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
+async fn without_keys_public_host_names_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         cors_origins: vec!["https://robots.example".to_owned()],
@@ -237,7 +237,7 @@ async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
 }
 
 #[tokio::test]
-async fn the_contract_can_be_browsed_without_the_internet() {
+async fn the_api_documentation_works_offline() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/docs").await.headers[header::LOCATION], "/docs/");

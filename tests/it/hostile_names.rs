@@ -62,7 +62,7 @@ fn files(dir: &Path) -> Vec<(String, u64)> {
 }
 
 #[tokio::test]
-async fn no_name_in_a_path_leaves_the_data_directory() {
+async fn names_in_paths_cannot_leave_the_data_directory() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (app, before) = (scene.app.clone(), files(scene.dir.path()));
     let asking = async {
@@ -86,7 +86,7 @@ async fn no_name_in_a_path_leaves_the_data_directory() {
 }
 
 #[tokio::test]
-async fn a_path_with_dots_is_not_resolved() {
+async fn dots_in_paths_are_not_resolved() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let address = scene.address();
     for path in [
@@ -110,7 +110,7 @@ async fn a_path_with_dots_is_not_resolved() {
 }
 
 #[tokio::test]
-async fn no_name_in_a_job_leaves_the_data_directory_and_a_key_is_only_a_key() {
+async fn names_in_jobs_cannot_leave_the_data_directory() {
     let config = ServerConfig {
         no_jobs: true,
         ..ServerConfig::default()

@@ -41,7 +41,7 @@ fn assert_problem(answer: &str, status: u16, detail: &str) {
 }
 
 #[tokio::test]
-async fn heads_that_never_end_are_cut_off() {
+async fn endless_headers_time_out() {
     let mut scene = Scene::open(ServerConfig {
         header_read_ms: 200,
         ..ServerConfig::default()
@@ -73,7 +73,7 @@ async fn heads_that_never_end_are_cut_off() {
 }
 
 #[tokio::test]
-async fn half_a_body_is_answered_408_and_its_connection_closed() {
+async fn an_incomplete_body_is_answered_408() {
     let mut scene = Scene::open(ServerConfig {
         request_deadline_ms: 200,
         ..ServerConfig::default()
@@ -92,7 +92,7 @@ async fn half_a_body_is_answered_408_and_its_connection_closed() {
 }
 
 #[tokio::test]
-async fn a_packed_body_is_answered_415_and_never_unpacked() {
+async fn a_compressed_body_is_answered_415() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let address = scene.address();
     // As much as a gzip member that unpacks to gigabytes.
@@ -107,7 +107,7 @@ async fn a_packed_body_is_answered_415_and_never_unpacked() {
 }
 
 #[tokio::test]
-async fn a_body_over_the_limit_is_answered_413_however_much_of_it_is_sent() {
+async fn a_body_over_the_limit_is_answered_413() {
     let mut scene = Scene::open(ServerConfig {
         max_body_bytes: 4096,
         ..ServerConfig::default()
@@ -125,7 +125,7 @@ async fn a_body_over_the_limit_is_answered_413_however_much_of_it_is_sent() {
 }
 
 #[tokio::test]
-async fn what_is_no_request_is_refused_and_its_connection_closed() {
+async fn malformed_http_closes_the_connection() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let address = scene.address();
     for bytes in [

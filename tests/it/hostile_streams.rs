@@ -26,7 +26,7 @@ fn kept(name: &str) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009() {
+async fn a_message_over_the_limit_closes_with_1009() {
     let mut scene = Scene::open(ServerConfig {
         max_body_bytes: 4096,
         ..ServerConfig::default()
@@ -59,7 +59,7 @@ async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009
 }
 
 #[tokio::test]
-async fn what_breaks_the_websockets_own_rules_is_told_so_and_closed() {
+async fn websocket_protocol_errors_are_reported_before_closing() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (address, session) = (scene.address(), scene.session().await);
     for (bytes, reason, code) in [
@@ -87,7 +87,7 @@ async fn what_breaks_the_websockets_own_rules_is_told_so_and_closed() {
 }
 
 #[tokio::test]
-async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_goes_on() {
+async fn a_message_of_the_wrong_type_is_refused() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (address, session) = (scene.address(), scene.session().await);
     for (codec, message, kind) in [
@@ -112,7 +112,7 @@ async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_
 }
 
 #[tokio::test]
-async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_goes_on() {
+async fn an_invalid_frame_is_refused_with_the_field() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (address, session) = (scene.address(), scene.session().await);
     let frame = |change: &dyn Fn(&mut FrameMessage)| {
@@ -177,7 +177,7 @@ async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_go
 }
 
 #[tokio::test]
-async fn what_a_client_sent_is_not_quoted_back_at_length() {
+async fn refusals_quote_only_a_short_part_of_a_message() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (address, session) = (scene.address(), scene.session().await);
     let verbose = async {
@@ -198,7 +198,7 @@ async fn what_a_client_sent_is_not_quoted_back_at_length() {
 }
 
 #[tokio::test]
-async fn a_socket_that_ends_in_the_midst_of_a_frame_leaves_its_session_where_it_was() {
+async fn a_partial_message_does_not_change_the_session() {
     let mut scene = Scene::open(ServerConfig::default()).await;
     let (address, session) = (scene.address(), scene.session().await);
     // A binary message of 16 KiB of which ten bytes come; half a header; the first of many fragments.

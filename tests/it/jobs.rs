@@ -84,7 +84,7 @@ async fn state_becomes(app: &App, id: &str, state: &str) -> Value {
 }
 
 #[tokio::test]
-async fn a_job_goes_its_way_and_can_be_watched() {
+async fn a_job_reports_its_progress_and_outcome() {
     let dir = tempfile::tempdir().unwrap();
     let (app, order) = puppet_app(dir.path(), true);
     let taken = post(&app, JOBS, &collect("a")).await;
@@ -116,7 +116,7 @@ async fn a_job_goes_its_way_and_can_be_watched() {
 }
 
 #[tokio::test]
-async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
+async fn queued_jobs_are_limited_and_cancelled_once() {
     let dir = tempfile::tempdir().unwrap();
     let (app, _order) = puppet_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
@@ -154,7 +154,7 @@ async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
 }
 
 #[tokio::test]
-async fn stopping_leaves_jobs_for_the_next_start_and_does_not_wait_for_one_that_will_not_end() {
+async fn a_stopping_server_leaves_jobs_for_the_next_start() {
     for heeds_cancel in [true, false] {
         let dir = tempfile::tempdir().unwrap();
         let (app, order) = puppet_app(dir.path(), heeds_cancel);
@@ -181,7 +181,7 @@ async fn stopping_leaves_jobs_for_the_next_start_and_does_not_wait_for_one_that_
 }
 
 #[tokio::test]
-async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does_not() {
+async fn only_cancelled_or_failed_jobs_can_be_resumed() {
     let dir = tempfile::tempdir().unwrap();
     let (app, order) = puppet_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
@@ -215,7 +215,7 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
 }
 
 #[tokio::test]
-async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
+async fn a_runner_that_lost_its_lease_writes_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let (app, _order) = puppet_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
@@ -233,7 +233,7 @@ async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
 }
 
 #[tokio::test]
-async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
+async fn an_idempotency_key_creates_one_job() {
     let dir = tempfile::tempdir().unwrap();
     let (app, order) = puppet_app(dir.path(), true);
     let ask = async |body: Value, key: &str| {
@@ -259,7 +259,7 @@ async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
 }
 
 #[tokio::test]
-async fn jobs_are_listed_by_kind_and_state_page_by_page() {
+async fn jobs_are_listed_by_kind_and_state_in_pages() {
     let dir = tempfile::tempdir().unwrap();
     let (app, _order) = puppet_app(dir.path(), true);
     for name in ["a", "b", "c"] {
@@ -333,7 +333,7 @@ async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
 }
 
 #[tokio::test]
-async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
+async fn an_invalid_job_is_refused_at_submission() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let train = |more: Value| {

@@ -136,7 +136,7 @@ fn copy_dataset(from: &Path, to: &Path) {
 }
 
 #[test]
-fn a_training_whose_process_is_killed_ends_in_the_weights_of_an_unbroken_one() {
+fn a_killed_training_ends_with_the_same_weights() {
     let (whole, took) = unbroken();
     killed_at_random_points(whole.path(), took);
     taken_over_by_another_machine(whole.path());

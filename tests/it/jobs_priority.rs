@@ -55,7 +55,7 @@ fn collect(name: &str, trials: u64) -> Value {
 }
 
 #[test]
-fn the_threads_of_jobs_stand_back_behind_those_that_serve() {
+fn job_threads_of_a_server_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
     let served = Served::start(dir.path(), &["--set", "job_threads=2"]);
     served.ask("POST", "/v1/jobs", &collect("seen", 40));
@@ -73,7 +73,7 @@ fn the_threads_of_jobs_stand_back_behind_those_that_serve() {
 }
 
 #[test]
-fn so_do_those_of_a_worker() {
+fn job_threads_of_a_worker_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
     let served = Served::start(dir.path(), &["--no-jobs"]);
     let worker = Program::start(dir.path(), &["worker", "--set", "job_threads=2"]);

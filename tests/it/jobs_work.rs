@@ -56,7 +56,7 @@ async fn serves(app: &App, model: &str, version: u32) -> Value {
 }
 
 #[tokio::test]
-async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measured() {
+async fn a_collected_data_set_trains_a_served_model() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let done_collecting = collected(&app).await;
@@ -120,7 +120,7 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
 }
 
 #[tokio::test]
-async fn the_jobs_in_the_readme_run() {
+async fn the_jobs_in_the_readme_succeed() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let readme = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md")).unwrap();
@@ -146,7 +146,7 @@ async fn the_jobs_in_the_readme_run() {
 }
 
 #[tokio::test]
-async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
+async fn a_cancelled_evaluation_leaves_no_report() {
     let dir = tempfile::tempdir().unwrap();
     // The shipped models, which take frames as they are collected.
     let config = ServerConfig {
@@ -181,7 +181,7 @@ async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
 }
 
 #[tokio::test]
-async fn versions_are_swapped_refused_deleted_and_remembered() {
+async fn model_versions_are_activated_refused_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     collected(&app).await;
@@ -284,7 +284,7 @@ fn misshape(model_dir: &Path) {
 }
 
 #[tokio::test]
-async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_that_name() {
+async fn files_of_a_cancelled_collection_can_be_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let collect = |trials: u32| json!({"kind": "collect", "name": "d", "scenario": "crowded", "trials": trials});
@@ -305,7 +305,7 @@ async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_t
 }
 
 #[tokio::test]
-async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
+async fn data_sets_are_described_shown_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/v1/datasets").await.json(), json!({"datasets": []}));

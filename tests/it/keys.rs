@@ -38,7 +38,7 @@ async fn models_with(app: &App, authorization: &str) -> Answer {
 }
 
 #[tokio::test]
-async fn everybody_may_until_the_first_key_is_made_unless_one_is_required() {
+async fn authentication_starts_with_the_first_key() {
     let (_dir, store, keys, app) = guarded(false).await;
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
@@ -52,7 +52,7 @@ async fn everybody_may_until_the_first_key_is_made_unless_one_is_required() {
 }
 
 #[tokio::test]
-async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
+async fn the_api_requires_a_valid_key() {
     let (_dir, store, keys, app) = guarded(true).await;
     let (key, other) = (new_key(&store, &keys).await, NewKey::generate().unwrap());
     let refused = get(&app, "/v1/models").await;
@@ -75,7 +75,7 @@ async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
 }
 
 #[tokio::test]
-async fn a_browser_shows_its_key_as_a_subprotocol() {
+async fn a_websocket_can_send_its_key_as_a_subprotocol() {
     let (_dir, store, keys, app) = guarded(true).await;
     let key = new_key(&store, &keys).await;
     let server = run(app).await;

@@ -59,7 +59,7 @@ fn models(dir: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_program_does_is_counted() {
+async fn every_metric_is_measured() {
     let dir = tempfile::tempdir().unwrap();
     models(&dir.path().join("models"));
     let bounds = [

@@ -30,7 +30,7 @@ fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
 }
 
 #[test]
-fn requests_are_traced_to_a_collector() {
+fn request_traces_reach_the_collector() {
     let (dir, collector) = (tempfile::tempdir().unwrap(), TcpListener::bind("127.0.0.1:0").unwrap());
     let endpoint = format!("otlp_endpoint=http://{}", collector.local_addr().unwrap());
     let server = Served::start(dir.path(), &["--set", &endpoint]);

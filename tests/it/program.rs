@@ -53,7 +53,7 @@ fn is_whole_answer(stream: &mut TcpStream) -> bool {
 }
 
 #[test]
-fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
+fn sigterm_under_load_answers_every_accepted_request() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "slow", slow_spec());
     let served = Served::start(
@@ -84,7 +84,7 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
 }
 
 #[test]
-fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
+fn requests_are_counted_by_route_and_logged_with_ids() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "plain", spec(Conditioning::None));
     let served = Served::start(dir.path(), &["--log-format", "json"]);
@@ -144,7 +144,7 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
 }
 
 #[test]
-fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
+fn the_healthcheck_exit_code_reports_readiness() {
     let dir = tempfile::tempdir().unwrap();
     let served = Served::start(dir.path(), &[]);
     let bind = served.address.to_string();
@@ -165,7 +165,7 @@ fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
 }
 
 #[test]
-fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it() {
+fn a_public_server_requires_an_api_key() {
     let dir = tempfile::tempdir().unwrap();
     let refused = output(dir.path(), &["serve", "--bind", "0.0.0.0:0"]);
     assert_eq!(refused.status.code(), Some(2));
@@ -204,7 +204,7 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
 }
 
 #[test]
-fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
+fn invalid_directories_are_refused_at_startup() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("file"), "").unwrap();
     let none = "; name a directory that holds models, or none to serve those in ./models";
@@ -237,7 +237,7 @@ fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
 }
 
 #[test]
-fn the_configuration_is_printed_with_where_it_comes_from() {
+fn the_configuration_is_printed_with_its_sources() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();
     let printed = foreframe(dir.path())
@@ -264,7 +264,7 @@ fn the_configuration_is_printed_with_where_it_comes_from() {
 }
 
 #[test]
-fn one_thread_for_requests_is_enough_to_check_a_job() {
+fn one_request_thread_is_enough_to_check_a_job() {
     let dir = tempfile::tempdir().unwrap();
     let arguments = ["--objects-url", "objects", "--set", "request_threads=1"];
     let served = Served::start(dir.path(), &arguments);

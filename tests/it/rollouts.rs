@@ -41,7 +41,7 @@ fn difference(a: &Value, b: &Value) -> u8 {
 }
 
 #[tokio::test]
-async fn hundreds_of_candidates_come_to_what_each_would_alone() {
+async fn batched_rollouts_equal_single_predictions() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let raw: Vec<String> = (0..CONTEXT as u8)
@@ -61,7 +61,7 @@ async fn hundreds_of_candidates_come_to_what_each_would_alone() {
 }
 
 #[tokio::test]
-async fn others_are_answered_while_hundreds_of_candidates_are_computed() {
+async fn other_requests_are_answered_during_a_large_rollout() {
     let dir = tempfile::tempdir().unwrap();
     let spec = ModelSpec {
         conditioning: Conditioning::StateAction,
@@ -84,7 +84,7 @@ async fn others_are_answered_while_hundreds_of_candidates_are_computed() {
 }
 
 #[tokio::test]
-async fn rollouts_can_be_looked_at() {
+async fn rollouts_are_answered_as_png_or_gif() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let body = |count| json!({"frames": context(), "state": [0.5], "candidates": candidates(count)}).to_string();
@@ -102,7 +102,7 @@ async fn rollouts_can_be_looked_at() {
 }
 
 #[tokio::test]
-async fn candidates_that_do_not_fit_are_refused_by_field() {
+async fn invalid_candidates_are_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_candidates: 8,
@@ -147,7 +147,7 @@ async fn candidates_that_do_not_fit_are_refused_by_field() {
 }
 
 #[tokio::test]
-async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
+async fn session_rollouts_equal_stateless_rollouts() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -200,7 +200,7 @@ async fn post_form(app: &App, path: &str, parts: &[(&str, &[u8])]) -> Answer {
 }
 
 #[tokio::test]
-async fn image_files_in_a_form_are_predicted_as_the_same_in_json() {
+async fn multipart_and_json_give_the_same_prediction() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_frames: 4,

@@ -12,7 +12,7 @@ use crate::service::{app, get, post, run};
 use crate::sessions::{code, frames, moving};
 
 #[tokio::test]
-async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() {
+async fn on_gap_skip_accepts_a_gap_and_reports_it() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -54,7 +54,7 @@ async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() 
 }
 
 #[tokio::test]
-async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from() {
+async fn on_late_skip_predicts_only_from_the_newest_frame() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -109,7 +109,7 @@ async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from
 }
 
 #[tokio::test]
-async fn frames_sent_ahead_of_their_answers_are_answered_in_order() {
+async fn pipelined_frames_are_answered_in_order() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -219,14 +219,14 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn duplicates_reorders_drops_and_reconnects_end_in_the_state_of_the_reference(
+    fn network_faults_do_not_change_the_session_state(
         mishaps in proptest::collection::vec(mishap(), 1..24),
     ) {
         tokio::runtime::Runtime::new().unwrap().block_on(suffer(&mishaps))?;
     }
 
     #[test]
-    fn no_body_opens_a_session_by_accident_or_breaks_the_server(
+    fn random_session_bodies_never_cause_a_server_error(
         pointer in prop_oneof![
             Just(""), Just("/state"), Just("/state/memory"), Just("/state/memory/features"), Just("/state/memory/features/0"),
             Just("/state/memory/next_seq"), Just("/state/memory/actions"), Just("/state/version"), Just("/model"),
@@ -253,7 +253,7 @@ proptest! {
 }
 
 #[tokio::test]
-async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
+async fn a_truncated_frame_is_ignored() {
     use tokio::io::AsyncWriteExt as _;
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
@@ -283,7 +283,7 @@ async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was() {
+async fn an_invalid_frame_does_not_change_the_session() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;

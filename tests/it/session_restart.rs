@@ -95,7 +95,7 @@ fn images(answer: ServerMessage) -> Vec<ImageBytes> {
 }
 
 #[tokio::test]
-async fn a_killed_servers_last_exported_state_predicts_in_another_as_if_nothing_had_been() {
+async fn an_exported_state_outlives_a_killed_server() {
     let dir = tempfile::tempdir().unwrap();
     let mut first = Server::start(&dir.path().join("first"));
     let open = |server: &Server, body: &Value| Opened::of(&server.ask("POST", "/v1/sessions", body));

@@ -33,7 +33,7 @@ pub(crate) fn code(message: &ServerMessage) -> (ErrorCode, u64) {
 }
 
 #[tokio::test]
-async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
+async fn a_session_continues_after_reconnecting() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -75,7 +75,7 @@ async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
 }
 
 #[tokio::test]
-async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
+async fn a_new_connection_replaces_the_old_one() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -98,7 +98,7 @@ async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
 }
 
 #[tokio::test]
-async fn nothing_is_said_of_a_session_without_its_token() {
+async fn session_state_requires_the_token() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -123,7 +123,7 @@ async fn nothing_is_said_of_a_session_without_its_token() {
 }
 
 #[tokio::test]
-async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_never_was() {
+async fn an_unused_session_expires_and_is_answered_410() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         session_grace_ms: 50,
@@ -162,7 +162,7 @@ async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_neve
 }
 
 #[tokio::test]
-async fn sessions_are_listed_page_by_page() {
+async fn sessions_are_listed_in_pages() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     for _ in 0..5 {
@@ -193,7 +193,7 @@ async fn sessions_are_listed_page_by_page() {
 }
 
 #[tokio::test]
-async fn an_exported_state_goes_on_in_another_server_as_if_nothing_had_been() {
+async fn an_exported_state_continues_on_another_server() {
     let (here, there) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let (first, second) = (
         app(here.path(), ServerConfig::default()),
@@ -225,7 +225,7 @@ async fn an_exported_state_goes_on_in_another_server_as_if_nothing_had_been() {
 }
 
 #[tokio::test]
-async fn a_state_that_does_not_fit_is_refused_by_field() {
+async fn an_invalid_state_is_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;

@@ -50,7 +50,7 @@ async fn delete(app: &App) -> Answer {
 }
 
 #[tokio::test]
-async fn a_data_set_is_described_without_being_fetched_and_shown_after_it_is() {
+async fn describing_a_shared_data_set_does_not_download_it() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (there, other) = machine(objects.path()).await;
@@ -68,7 +68,7 @@ async fn a_data_set_is_described_without_being_fetched_and_shown_after_it_is() {
 }
 
 #[tokio::test]
-async fn a_name_that_another_machine_has_collected_is_taken() {
+async fn data_set_names_are_unique_across_machines() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (_there, other) = machine(objects.path()).await;
@@ -80,7 +80,7 @@ async fn a_name_that_another_machine_has_collected_is_taken() {
 }
 
 #[tokio::test]
-async fn a_data_set_that_was_deleted_and_collected_anew_elsewhere_is_fetched_anew() {
+async fn a_replaced_shared_data_set_is_downloaded_again() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (there, other) = machine(objects.path()).await;
@@ -102,7 +102,7 @@ async fn a_data_set_that_was_deleted_and_collected_anew_elsewhere_is_fetched_ane
 }
 
 #[tokio::test]
-async fn what_is_left_here_of_a_set_that_was_deleted_elsewhere_is_in_no_ones_way() {
+async fn a_stale_copy_does_not_block_a_new_collection() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (_there, other) = machine(objects.path()).await;
@@ -118,7 +118,7 @@ async fn what_is_left_here_of_a_set_that_was_deleted_elsewhere_is_in_no_ones_way
 }
 
 #[tokio::test]
-async fn a_data_set_that_is_not_whole_where_objects_are_kept_is_not_told_of_but_can_be_deleted() {
+async fn an_incomplete_shared_data_set_is_hidden_but_deletable() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, app) = machine(objects.path()).await;
     let half = objects.path().join("datasets/d/data");

@@ -93,7 +93,7 @@ fn account(line: &str) -> JobUpdate {
 }
 
 #[tokio::test]
-async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
+async fn a_job_is_enqueued_claimed_reported_and_ended() {
     for (_dir, store) in stores("way").await {
         let row = enqueued(&store).await;
         assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
@@ -136,7 +136,7 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
 }
 
 #[tokio::test]
-async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
+async fn an_expired_lease_cannot_write() {
     for (_dir, store) in stores("fence").await {
         enqueued(&store).await;
         let (_, stale) = store.claim("slow", 0.0, 10.0).await.unwrap().unwrap();
@@ -163,7 +163,7 @@ async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
 }
 
 #[tokio::test]
-async fn places_keys_and_names_are_given_once() {
+async fn the_queue_limit_keys_and_names_are_enforced() {
     for (_dir, store) in stores("once").await {
         let enqueue = async |new: NewJob| store.enqueue(new, 2, 0.0).await.unwrap();
         assert!(matches!(
@@ -185,7 +185,7 @@ async fn places_keys_and_names_are_given_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
+async fn concurrent_claims_never_get_the_same_job() {
     for (_dir, store) in stores("many").await {
         let enqueueing = (0..30).map(|_| {
             let store = store.clone();
@@ -229,7 +229,7 @@ fn queued() -> JobPage {
 }
 
 #[tokio::test]
-async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
+async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
     for (_dir, store) in stores("list").await {
         for _ in 0..5 {
             enqueued(&store).await;
@@ -278,7 +278,7 @@ async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
 }
 
 #[tokio::test]
-async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_ended() {
+async fn versions_are_numbered_after_the_shipped_one() {
     for (_dir, store) in stores("versions").await {
         let (lease, version) = reserve(&store, "m").await;
         assert_eq!(
@@ -336,7 +336,7 @@ async fn keys_are_found_by_id_and_revoked_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn several_may_open_a_new_store_at_once_and_all_see_the_same() {
+async fn a_new_store_can_be_opened_concurrently() {
     for (_dir, config) in places("open").await {
         let opening = (0..6).map(|_| {
             let config = config.clone();
@@ -353,7 +353,7 @@ async fn several_may_open_a_new_store_at_once_and_all_see_the_same() {
 }
 
 #[tokio::test]
-async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
+async fn an_unknown_url_scheme_is_refused_without_the_password() {
     let dir = tempfile::tempdir().unwrap();
     let refused = async |database: Option<&str>, objects: Option<&str>| {
         let config = StoreConfig {
@@ -374,7 +374,7 @@ async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
 }
 
 #[tokio::test]
-async fn a_postgresql_that_cannot_be_reached_as_asked_is_refused_with_the_reason() {
+async fn an_unreachable_postgresql_is_refused_with_the_reason() {
     let Some(url) = postgres("tls").await else { return };
     let refused = async |url: String| {
         let dir = tempfile::tempdir().unwrap();

@@ -63,7 +63,7 @@ fn status(error: &Error) -> u16 {
 }
 
 #[tokio::test]
-async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
+async fn a_stream_predicts_the_same_as_a_request() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -98,7 +98,7 @@ async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
 }
 
 #[tokio::test]
-async fn a_plan_is_predicted_under_and_without_one_the_action_is_held() {
+async fn without_a_plan_the_last_action_repeats() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut answers = Vec::new();
@@ -157,7 +157,7 @@ async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_n
 }
 
 #[tokio::test]
-async fn what_is_refused_leaves_the_stream_where_it_was() {
+async fn refused_messages_do_not_change_the_stream() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut socket = open(&server, "moving").await;
@@ -216,7 +216,7 @@ async fn what_is_refused_leaves_the_stream_where_it_was() {
 }
 
 #[tokio::test]
-async fn a_stream_that_cannot_be_opened_is_refused_before_the_upgrade() {
+async fn invalid_streams_are_refused_before_the_upgrade() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_streams: 1,
@@ -239,7 +239,7 @@ async fn a_stream_that_cannot_be_opened_is_refused_before_the_upgrade() {
 }
 
 #[tokio::test]
-async fn a_silent_stream_is_ended_with_a_word() {
+async fn an_idle_stream_is_warned_and_closed() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         stream_idle_ms: 20,
@@ -285,7 +285,7 @@ async fn a_client_that_never_reads_loses_its_stream() {
 }
 
 #[tokio::test]
-async fn a_close_of_the_websocket_itself_is_answered() {
+async fn a_websocket_close_is_answered() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut socket = open(&server, "plain").await;
@@ -297,7 +297,7 @@ async fn a_close_of_the_websocket_itself_is_answered() {
 }
 
 #[tokio::test]
-async fn stopping_ends_streams_with_1001_and_is_not_ready() {
+async fn shutdown_closes_streams_with_1001() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;

@@ -119,7 +119,7 @@ async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
 }
 
 #[tokio::test]
-async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_request_does() {
+async fn shipped_models_predict_the_same_in_streams_and_requests() {
     let (dir, trip) = (tempfile::tempdir().unwrap(), Trip::example());
     let models = [shipped("moving"), shipped("paper")];
     let (app, server) = start(dir.path(), &models).await;
@@ -145,7 +145,7 @@ async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_
 }
 
 #[test]
-fn a_batch_of_many_windows_is_predicted_to_1e_5_as_each_alone() {
+fn batched_predictions_equal_single_ones_within_1e_5() {
     for model in [shipped("moving"), shipped("paper")] {
         let spec = &model.manifest.spec;
         let mut rng = Seed(5).rng();
@@ -226,7 +226,7 @@ async fn interleaved(steps: usize) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn sixty_four_interleaved_sessions_predict_what_each_would_alone() {
+async fn sixty_four_interleaved_sessions_equal_single_predictions() {
     interleaved(12).await;
 }
 

@@ -59,7 +59,7 @@ async fn read_nothing_then_all(server: &Running) -> (Option<ClosingReason>, Opti
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_reads_nothing_is_told_so_and_left() {
+async fn a_client_that_never_reads_is_closed_with_1013() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
     // On a busy machine the client may begin to read before the server's patience is over, or after it has hung up.
@@ -69,7 +69,7 @@ async fn a_client_that_reads_nothing_is_told_so_and_left() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
+async fn a_slow_client_is_told_how_many_predictions_were_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
     let mut client = connect(&server).await;
@@ -97,7 +97,7 @@ async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn others_are_answered_while_one_reads_nothing() {
+async fn a_slow_client_does_not_delay_others() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
     let mut stuck = connect(&server).await;
