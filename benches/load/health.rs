@@ -9,11 +9,11 @@ use serde_json::{Value, json};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 
-use crate::figures::{Bounds, Latencies};
-use crate::flight::{Drive, Flight};
+use crate::report::{Bounds, Latencies};
+use crate::robots::{SendMode, RobotLoad};
 use crate::http::{Http, Request};
-use crate::material::Material;
-use crate::pace::{Pace, Tick};
+use crate::workload::Workload;
+use crate::schedule::{Schedule, Tick};
 use crate::server::{Server, Target};
 
 const TRIALS: u64 = 40;
@@ -61,29 +61,29 @@ struct Checks {
 pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut server = Server::start(&args.target, &[("job_threads", args.job_threads.unwrap_or(cores))]).await;
-    let material = Arc::new(Material::of(&args.target.model));
+    let workload = Arc::new(Workload::of(&args.target.model));
     let mut http = Http::new(server.address);
     println!("without a job:");
-    measure(args, &server, &material).await;
+    measure(args, &server, &workload).await;
     let collected = post(&mut http, &collect()).await;
     until(&mut http, &collected, |job| job["state"] == "succeeded").await;
     let training = post(&mut http, &train()).await;
     until(&mut http, &training, |job| job["progress"]["done"].as_u64() > Some(0)).await;
     println!("beside a training:");
-    let (livez_p99_ms, p99_ms, faults) = measure(args, &server, &material).await;
+    let (livez_p99_ms, p99_ms, faults) = measure(args, &server, &workload).await;
     let job = http.expect(200, &Request::get(&training)).await.json();
-    bounds.hold(job["state"] == "running", "the training ran all the time");
+    bounds.check(job["state"] == "running", "the training ran all the time");
     http.expect(202, &Request::json(&format!("{training}/cancel"), &Value::Null))
         .await;
-    bounds.hold(
+    bounds.check(
         livez_p99_ms <= args.livez_p99_ms,
         format!("p99 of /livez within {} ms", args.livez_p99_ms),
     );
-    bounds.hold(
+    bounds.check(
         p99_ms <= args.p99_ms,
         format!("p99 of the streams within {} ms", args.p99_ms),
     );
-    bounds.hold(
+    bounds.check(
         faults.is_empty(),
         format!("every health check and every frame was answered {faults:?}"),
     );
@@ -100,10 +100,10 @@ fn train() -> Value {
     json!({"kind": "train", "name": "endless", "preset": "paper", "dataset": "seen", "settings": settings})
 }
 
-/// The path of the job that was taken.
+/// The path of the job that was usage.
 async fn post(http: &mut Http, job: &Value) -> String {
-    let taken = http.expect(202, &Request::json("/v1/jobs", job)).await.json();
-    format!("/v1/jobs/{}", taken["id"].as_str().expect("a job"))
+    let usage = http.expect(202, &Request::json("/v1/jobs", job)).await.json();
+    format!("/v1/jobs/{}", usage["id"].as_str().expect("a job"))
 }
 
 async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) -> bool) {
@@ -113,35 +113,35 @@ async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) -> bool) {
         if holds(&job) {
             return;
         }
-        let is_on = job["state"] == "queued" || job["state"] == "running";
-        assert!(is_on && since.elapsed() < JOB_LIMIT, "{job}");
+        let is_active = job["state"] == "queued" || job["state"] == "running";
+        assert!(is_active && since.elapsed() < JOB_LIMIT, "{job}");
         tokio::time::sleep(POLL).await;
     }
 }
 
 /// The 99th percentiles of health checks and of streams in milliseconds, and what went wrong.
-async fn measure(args: &Args, server: &Server, material: &Arc<Material>) -> (f64, f64, Vec<String>) {
-    let flight = Flight {
+async fn measure(args: &Args, server: &Server, workload: &Arc<Workload>) -> (f64, f64, Vec<String>) {
+    let load = RobotLoad {
         sessions: args.sessions,
-        drive: Drive::Paced(args.rate_hz),
+        mode: SendMode::Scheduled(args.rate_hz),
         on_late: OnLate::Predict,
         warm_up: WARM_UP,
         measured: Duration::from_secs_f64(args.seconds),
     };
-    let (flown, checks) = tokio::join!(flight.run(server, material), check(args, server.address));
-    let (from_schedule, tally) = (flown.since_schedule(), &flown.tally);
+    let (result, checks) = tokio::join!(load.run(server, workload), check(args, server.address));
+    let (from_schedule, counts) = (result.since_schedule(), &result.counts);
     let (fresh, kept) = (Latencies::of(checks.fresh), Latencies::of(checks.kept));
     println!("  /livez on new connections:  {fresh}");
     println!("  /livez on one that is kept: {kept}");
     println!("  {} streams at {} Hz: {from_schedule}", args.sessions, args.rate_hz);
     println!(
         "  this program was late by:   {}",
-        flown.latencies(|answer| answer.sent - answer.scheduled)
+        result.latencies(|answer| answer.sent - answer.scheduled)
     );
-    println!("  the server takes {:.0} % of a core", flown.server_cpu);
+    println!("  the server takes {:.0} % of a core", result.server_cpu);
     let mut faults = checks.faults;
-    let predicted = tally.answers.len() as u64 + tally.buffering;
-    faults.extend((predicted != tally.sent).then(|| format!("{predicted} of {} frames predicted", tally.sent)));
+    let predicted = counts.answers.len() as u64 + counts.buffering;
+    faults.extend((predicted != counts.sent).then(|| format!("{predicted} of {} frames predicted", counts.sent)));
     (
         fresh.at_ms(0.99).max(kept.at_ms(0.99)),
         from_schedule.at_ms(0.99),
@@ -153,10 +153,10 @@ async fn measure(args: &Args, server: &Server, material: &Arc<Material>) -> (f64
 async fn check(args: &Args, address: SocketAddr) -> Checks {
     let checks = Arc::new(Mutex::new(Checks::default()));
     let time = WARM_UP + Duration::from_secs_f64(args.seconds);
-    let pace = Pace::lasting(Instant::now(), args.checks_hz, time);
-    let (due, mut of_kept) = mpsc::channel::<Tick>(pace.count as usize + 1);
+    let schedule = Schedule::lasting(Instant::now(), args.checks_hz, time);
+    let (due, mut of_kept) = mpsc::channel::<Tick>(schedule.count as usize + 1);
     let (runtime, of_fresh) = (Handle::current(), Arc::clone(&checks));
-    pace.start(move |tick| {
+    schedule.start(move |tick| {
         if tick.index % 2 == 0 {
             due.try_send(tick).expect("room for every tick");
         } else {
@@ -175,7 +175,7 @@ async fn check(args: &Args, address: SocketAddr) -> Checks {
     // The last ones on new connections; those that are not there by then are missed below.
     tokio::time::sleep(WARM_UP).await;
     let mut checks = checks.lock().unwrap().clone();
-    let missing = pace.count as usize - checks.fresh.len() - checks.kept.len() - checks.faults.len();
+    let missing = schedule.count as usize - checks.fresh.len() - checks.kept.len() - checks.faults.len();
     checks
         .faults
         .extend((missing > 0).then(|| format!("{missing} health checks without an answer")));

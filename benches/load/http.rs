@@ -10,7 +10,7 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 /// Whoever has no answer by then gets none: longer than any deadline of the server.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
+pub(crate) const TIMEOUT: Duration = Duration::from_secs(40);
 
 /// A request as it goes over the wire.
 #[derive(Clone)]
@@ -46,7 +46,7 @@ impl Request {
     }
 }
 
-/// What came back.
+/// What received back.
 #[derive(Default)]
 pub(crate) struct Answer {
     pub(crate) status: u16,
@@ -71,7 +71,7 @@ impl Answer {
 }
 
 /// The server closes connections that ask nothing for a while: one that has rested so long is not asked again.
-const REST: Duration = Duration::from_secs(5);
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
 
 /// One connection, opened when it is needed.
 pub(crate) struct Http {
@@ -87,7 +87,7 @@ impl Http {
 
     /// The answer. Errors: the connection ended before it, or it did not come.
     pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Answer> {
-        timeout(PATIENCE, self.exchange(request))
+        timeout(TIMEOUT, self.exchange(request))
             .await
             .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
     }
@@ -101,7 +101,7 @@ impl Http {
 
     async fn exchange(&mut self, request: &Request) -> io::Result<Answer> {
         let mut stream = match self.kept.take() {
-            Some((stream, asked)) if asked.elapsed() < REST => stream,
+            Some((stream, asked)) if asked.elapsed() < KEEP_ALIVE => stream,
             _ => connect(self.address).await?,
         };
         stream.get_mut().write_all(&request.0).await?;

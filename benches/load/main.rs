@@ -4,13 +4,13 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
-mod figures;
-mod flight;
+mod report;
+mod robots;
 mod health;
 mod http;
-mod material;
-mod pace;
-mod process;
+mod workload;
+mod schedule;
+mod process_usage;
 mod robot;
 mod saturate;
 mod server;
@@ -22,9 +22,9 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser as _;
-use figures::Bounds;
+use report::Bounds;
 
-/// Load on the real server over loopback: starts one of its own, prints what came of it, and ends with exit code 1 if a
+/// Load on the real server over loopback: starts one of its own, prints what received of it, and ends with exit code 1 if a
 /// stated bound did not hold.
 #[derive(clap::Parser)]
 #[command(
@@ -89,7 +89,7 @@ fn main() -> ExitCode {
         runtime.block_on(Box::pin(run(&scenario, &mut bounds)));
         println!("in {:.0} s\n", started.elapsed().as_secs_f64());
     }
-    bounds.conclude()
+    bounds.exit_code()
 }
 
 fn short_form(line: &'static str) -> Scenario {

@@ -7,16 +7,16 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, ErrorCode, Server
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 
-use crate::material::{self, Material};
+use crate::workload::{self, Workload};
 use crate::session::{self, Socket};
 
-/// What came of a robot's frames, or of many robots'.
+/// What received of a robot's frames, or of many robots'.
 #[derive(Default)]
-pub(crate) struct Tally {
+pub(crate) struct FrameCounts {
     pub(crate) sent: u64,
     /// Frames that only filled the context.
     pub(crate) buffering: u64,
-    /// Taken in without a prediction, since a newer one waited.
+    /// Usage in without a prediction, since a newer one waited.
     pub(crate) overtaken: u64,
     /// Refused because the server is too busy.
     pub(crate) overloaded: u64,
@@ -35,13 +35,13 @@ pub(crate) struct Answer {
     pub(crate) scheduled: Instant,
     /// When its frame was in fact sent.
     pub(crate) sent: Instant,
-    /// When it came.
-    pub(crate) came: Instant,
+    /// When it received.
+    pub(crate) received: Instant,
     /// Of that the model's computation.
     pub(crate) compute: Duration,
 }
 
-impl Tally {
+impl FrameCounts {
     /// Frames of which nothing was heard again.
     pub(crate) fn unanswered(&self) -> u64 {
         let heard =
@@ -61,63 +61,63 @@ impl Tally {
     }
 }
 
-/// Sends a frame at each cue, which is the time that it was scheduled for, and closes after the last. Calls `answered`
+/// Sends a frame at each send_time, which is the time that it was scheduled for, and closes after the last. Calls `answered`
 /// after each answer.
-pub(crate) async fn fly(
+pub(crate) async fn run(
     socket: Socket,
-    material: Arc<Material>,
-    mut cues: mpsc::Receiver<Instant>,
+    workload: Arc<Workload>,
+    mut send_times: mpsc::Receiver<Instant>,
     mut answered: impl FnMut(),
-) -> Tally {
+) -> FrameCounts {
     let (mut sender, mut receiver) = socket.split();
     // Of every frame when it was to be sent, and when it was.
     let log = Mutex::new(Vec::<(Instant, Instant)>::new());
     let sending = async {
-        while let Some(scheduled) = cues.recv().await {
-            let frame = material.frame(log.lock().unwrap().len() as u64);
+        while let Some(scheduled) = send_times.recv().await {
+            let frame = workload.frame(log.lock().unwrap().len() as u64);
             log.lock().unwrap().push((scheduled, Instant::now()));
             if sender.send(frame).await.is_err() {
                 return;
             }
         }
-        let close = material::message(&ClientMessage::Close(CloseMessage {}));
+        let close = workload::message(&ClientMessage::Close(CloseMessage {}));
         // If it is gone, the receiver knows as well.
         let _ = sender.send(close).await;
     };
     let receiving = async {
-        let mut tally = Tally::default();
-        while let Some((came, message)) = session::receive_timed(&mut receiver).await {
+        let mut counts = FrameCounts::default();
+        while let Some((received, message)) = session::receive_timed(&mut receiver).await {
             match message {
                 ServerMessage::Prediction {
                     seq, timing, dropped, ..
                 } => {
                     let (scheduled, sent) = log.lock().unwrap()[seq as usize];
                     let compute = Duration::from_micros(timing.compute_us);
-                    tally.answers.push(Answer {
+                    counts.answers.push(Answer {
                         scheduled,
                         sent,
-                        came,
+                        received,
                         compute,
                     });
-                    tally.dropped += dropped;
+                    counts.dropped += dropped;
                 }
-                ServerMessage::Buffering { .. } => tally.buffering += 1,
-                ServerMessage::Overtaken { .. } => tally.overtaken += 1,
+                ServerMessage::Buffering { .. } => counts.buffering += 1,
+                ServerMessage::Overtaken { .. } => counts.overtaken += 1,
                 ServerMessage::Error {
                     code: ErrorCode::Overloaded,
                     ..
-                } => tally.overloaded += 1,
+                } => counts.overloaded += 1,
                 ServerMessage::Error { code, detail, .. } => {
-                    tally.refused += 1;
-                    tally.first_refusal.get_or_insert(format!("{code:?}: {detail}"));
+                    counts.refused += 1;
+                    counts.first_refusal.get_or_insert(format!("{code:?}: {detail}"));
                 }
                 _ => continue,
             }
             answered();
         }
-        tally
+        counts
     };
-    let ((), mut tally) = tokio::join!(sending, receiving);
-    tally.sent = log.lock().unwrap().len() as u64;
-    tally
+    let ((), mut counts) = tokio::join!(sending, receiving);
+    counts.sent = log.lock().unwrap().len() as u64;
+    counts
 }

@@ -5,12 +5,12 @@ mod streams;
 
 use std::time::Duration;
 
-use crate::figures::Bounds;
-use crate::process::Process;
+use crate::report::Bounds;
+use crate::process_usage::Process;
 use crate::server::{Server, Target};
 
 /// How often memory is looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(200);
+const SAMPLE_PERIOD: Duration = Duration::from_millis(200);
 /// Memory is compared between the first and the last of so many parts: of five minutes, a minute each.
 const PARTS: usize = 5;
 
@@ -81,17 +81,17 @@ impl Args {
         Duration::from_secs_f64(self.seconds)
     }
 
-    fn hold_goodput(&self, goodput_hz: f64, peak_hz: f64, bounds: &mut Bounds) {
+    fn check_goodput(&self, goodput_hz: f64, peak_hz: f64, bounds: &mut Bounds) {
         let share = goodput_hz / peak_hz;
         let what = format!(
             "goodput is {:.0} % of the peak, at least {:.0} %",
             100.0 * share,
             100.0 * self.goodput_share
         );
-        bounds.hold(share >= self.goodput_share, what);
+        bounds.check(share >= self.goodput_share, what);
     }
 
-    fn hold_memory(&self, memory: &[f64], server: &mut Server, bounds: &mut Bounds) {
+    fn check_memory(&self, memory: &[f64], server: &mut Server, bounds: &mut Bounds) {
         let most: Vec<f64> = memory
             .chunks(memory.len().div_ceil(PARTS).max(1))
             .map(|part| part.iter().copied().fold(0.0, f64::max))
@@ -100,7 +100,7 @@ impl Args {
         println!("the server's memory by fifths of the time: {} MB", list.join(", "));
         let growth = most.last().unwrap_or(&0.0) - most.first().unwrap_or(&0.0);
         let what = format!("memory grew by {growth:.1} MB, at most {} MB", self.growth_mb);
-        bounds.hold(growth <= self.growth_mb, what);
+        bounds.check(growth <= self.growth_mb, what);
         server.check(bounds);
     }
 }
@@ -108,9 +108,9 @@ impl Args {
 /// Memory in MB until the time is over.
 async fn watch_memory(process: Process, time: Duration) -> Vec<f64> {
     let mut memory = Vec::new();
-    for _ in 0..(time.as_secs_f64() / LOOK_EVERY.as_secs_f64()) as usize {
-        memory.push(process.taken().rss_mb);
-        tokio::time::sleep(LOOK_EVERY).await;
+    for _ in 0..(time.as_secs_f64() / SAMPLE_PERIOD.as_secs_f64()) as usize {
+        memory.push(process.usage().rss_mb);
+        tokio::time::sleep(SAMPLE_PERIOD).await;
     }
     memory
 }

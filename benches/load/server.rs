@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::figures::Bounds;
+use crate::report::Bounds;
 use crate::http::{Http, Request};
-use crate::process::Process;
+use crate::process_usage::Process;
 
 /// How long the server may take to get ready.
 const START_LIMIT: Duration = Duration::from_mins(1);
@@ -107,7 +107,7 @@ impl Server {
             "the server lives, and its log tells of no failure ({} lines do)",
             failures.len()
         );
-        bounds.hold(has_ended.is_none() && failures.is_empty(), what);
+        bounds.check(has_ended.is_none() && failures.is_empty(), what);
     }
 }
 

@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::http::{Answer, Http, PATIENCE, Request};
+use crate::http::{Answer, Http, TIMEOUT, Request};
 
 /// Read at once: more than an answer takes. As much is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;
@@ -84,15 +84,15 @@ pub(crate) async fn receive(
     receive_timed(socket).await.map(|(_, message)| message)
 }
 
-/// The same, with when it came: before it was decoded, which is the client's own time.
+/// The same, with when it received: before it was decoded, which is the client's own time.
 pub(crate) async fn receive_timed(
     socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
 ) -> Option<(Instant, ServerMessage)> {
     loop {
-        match timeout(PATIENCE, socket.next()).await {
+        match timeout(TIMEOUT, socket.next()).await {
             Ok(Some(Ok(Message::Binary(bytes)))) => {
-                let came = Instant::now();
-                return Some((came, rmp_serde::from_slice(&bytes).unwrap()));
+                let received = Instant::now();
+                return Some((received, rmp_serde::from_slice(&bytes).unwrap()));
             }
             Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => {}
             _ => return None,

@@ -8,10 +8,10 @@ use foreframe::server::protocol::OnLate;
 use futures_util::SinkExt as _;
 use tokio::net::TcpSocket;
 
-use crate::figures::{Bounds, median};
-use crate::flight::{Drive, Flight};
-use crate::material::Material;
-use crate::process::Process;
+use crate::report::{Bounds, median};
+use crate::robots::{SendMode, RobotLoad};
+use crate::workload::Workload;
+use crate::process_usage::Process;
 use crate::server::{Server, Target};
 use crate::session;
 
@@ -61,12 +61,12 @@ struct Round {
 
 pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[]).await;
-    let material = Arc::new(Material::of(&args.target.model));
+    let workload = Arc::new(Workload::of(&args.target.model));
     let (mut alone, mut beside) = (Vec::new(), Vec::new());
     for _ in 0..args.rounds {
-        alone.push(round(args, &server, &material).await);
-        let stuck = tokio::spawn(never_read(server.address, Arc::clone(&material), args.slow_rate_hz));
-        beside.push(round(args, &server, &material).await);
+        alone.push(round(args, &server, &workload).await);
+        let stuck = tokio::spawn(never_read(server.address, Arc::clone(&workload), args.slow_rate_hz));
+        beside.push(round(args, &server, &workload).await);
         stuck.abort();
     }
     let list = |rounds: &[Round]| {
@@ -85,45 +85,45 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
         - alone.iter().map(|round| round.p99_ms).fold(f64::INFINITY, f64::min);
     let limit_ms = before_ms * (1.0 + args.p99_share) + noise_ms.max(args.noise_ms);
     let what = format!("the p99 in the middle, {before_ms:.2} ms alone, is {after_ms:.2} ms, at most {limit_ms:.2}");
-    bounds.hold(after_ms <= limit_ms, what);
+    bounds.check(after_ms <= limit_ms, what);
     let lost: u64 = alone.iter().chain(&beside).map(|round| round.unanswered).sum();
-    bounds.hold(lost == 0, "every frame of those that read was predicted");
+    bounds.check(lost == 0, "every frame of those that read was predicted");
     let rss_mb = |rounds: &[Round]| rounds.iter().map(|round| round.rss_mb).fold(0.0, f64::max);
     let growth_mb = rss_mb(&beside) - alone.first().map_or(0.0, |round| round.rss_mb);
     let what = format!(
         "the server takes {growth_mb:.1} MB more memory, at most {} MB",
         args.growth_mb
     );
-    bounds.hold(growth_mb <= args.growth_mb, what);
+    bounds.check(growth_mb <= args.growth_mb, what);
     server.check(bounds);
 }
 
-async fn round(args: &Args, server: &Server, material: &Arc<Material>) -> Round {
-    let flight = Flight {
+async fn round(args: &Args, server: &Server, workload: &Arc<Workload>) -> Round {
+    let load = RobotLoad {
         sessions: args.sessions,
-        drive: Drive::Paced(args.rate_hz),
+        mode: SendMode::Scheduled(args.rate_hz),
         on_late: OnLate::Predict,
         warm_up: Duration::from_secs_f64(args.warm_up_s),
         measured: Duration::from_secs_f64(args.seconds),
     };
-    let flown = flight.run(server, material).await;
+    let result = load.run(server, workload).await;
     Round {
-        p99_ms: flown.since_schedule().at_ms(0.99),
-        rss_mb: Process::taken(&server.process).rss_mb,
-        unanswered: flown.tally.sent - flown.tally.buffering - flown.tally.answers.len() as u64,
+        p99_ms: result.since_schedule().at_ms(0.99),
+        rss_mb: Process::usage(&server.process).rss_mb,
+        unanswered: result.counts.sent - result.counts.buffering - result.counts.answers.len() as u64,
     }
 }
 
 /// Sends and never reads; begins anew when the server has enough of it.
-async fn never_read(address: SocketAddr, material: Arc<Material>, rate_hz: f64) {
-    let path = format!("/v1/models/{}/stream", material.model());
+async fn never_read(address: SocketAddr, workload: Arc<Workload>, rate_hz: f64) {
+    let path = format!("/v1/models/{}/stream", workload.model());
     loop {
         let socket = TcpSocket::new_v4().unwrap();
         socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES).unwrap();
         let stream = socket.connect(address).await.unwrap();
         let mut socket = session::over(stream, address, &path).await.expect("a stream");
         let mut seq = 0;
-        while socket.send(material.frame(seq)).await.is_ok() {
+        while socket.send(workload.frame(seq)).await.is_ok() {
             seq += 1;
             if rate_hz > 0.0 {
                 tokio::time::sleep(Duration::from_secs_f64(1.0 / rate_hz)).await;

@@ -1,4 +1,4 @@
-"""Makes the corpora that tests/hostile replays: `python make.py` (needs Pillow). What a file's name begins with is what
+"""Makes the corpora that tests/malformed replays: `python make.py` (needs Pillow). What a file's name begins with is what
 becomes of it: `ok` or `refused`, or the HTTP status. They fit the tests' models: 16×12 px, 3 frames of context, 2 to come,
 8 features, an action of two numbers and a state of one."""
 
@@ -206,7 +206,7 @@ def bodies():
 
 def states():
     memory = {"next_seq": 5, "features": [[0.25] * 8] * 3, "actions": [[0.5, -0.5]] * 2, "state": [1.0]}
-    # tests/hostile puts the model's own hash in the place of WEIGHTS.
+    # tests/malformed puts the model's own hash in the place of WEIGHTS.
     state = {"model": "moving", "version": 1, "weights_sha256": "WEIGHTS", "on_gap": "error", "memory": memory}
     with_memory = lambda **more: state | {"memory": memory | more}
     for name, content in {

@@ -1,4 +1,4 @@
-//! The layout's one direction: a module uses only those before it in reading order, and some crates stay in their rooms.
+//! The layout's one direction: a module uses only those before it in reading order, and some crates stay in their modules.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -67,7 +67,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
 ];
 
 /// Where a crate may be used, by path prefixes under `src/`.
-const ROOMS: &[(&str, &[&str])] = &[
+const USED_IN: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
     ("hyper", &["server"]),
@@ -131,9 +131,9 @@ fn modules_use_only_earlier_modules() {
 #[test]
 fn dependencies_are_used_only_in_their_modules() {
     for (file, text) in sources() {
-        for (name, rooms) in ROOMS.iter().filter(|(_, rooms)| !rooms.contains(&module(&file))) {
+        for (name, modules) in USED_IN.iter().filter(|(_, modules)| !modules.contains(&module(&file))) {
             let uses = |line: &str| line.trim_start().starts_with(&format!("use {name}"));
-            assert!(!code(&text).any(uses), "{file} uses {name}, which belongs to {rooms:?}");
+            assert!(!code(&text).any(uses), "{file} uses {name}, which belongs to {modules:?}");
         }
     }
 }

@@ -16,7 +16,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::keys::new_key;
-use crate::service::{PATIENCE, Running, post, run};
+use crate::service::{TIMEOUT, InProcessServer, post, run};
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -100,7 +100,7 @@ impl Page {
         }
         self.socket.send(Message::text(message.to_string())).await.unwrap();
         loop {
-            let answer = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+            let answer = tokio::time::timeout(TIMEOUT, self.socket.next()).await;
             let Message::Text(text) = answer.unwrap().unwrap().unwrap() else {
                 continue;
             };
@@ -118,11 +118,11 @@ impl Page {
     }
 
     /// Asks the page until the expression is true.
-    async fn until(&mut self, expression: &str) {
+    async fn wait_until(&mut self, expression: &str) {
         let started = Instant::now();
         while self.value(expression).await != json!(true) {
             let page = self.value("document.body.innerText").await;
-            assert!(started.elapsed() < PATIENCE, "never true: {expression}\n{page}");
+            assert!(started.elapsed() < TIMEOUT, "never true: {expression}\n{page}");
             tokio::time::sleep(std::time::Duration::from_millis(50)).await;
         }
     }
@@ -163,7 +163,7 @@ const IS_COMPLETE: &str =
     "[...document.querySelectorAll('#film #error td')].filter(cell => / %$/.test(cell.textContent)).length === 5
     && [...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)";
 
-async fn serve(data_dir: &Path) -> (App, Keys, Running) {
+async fn serve(data_dir: &Path) -> (App, Keys, InProcessServer) {
     let app = App::open(ServerConfig {
         data_dir: data_dir.to_owned(),
         ..ServerConfig::default()
@@ -188,23 +188,23 @@ async fn the_page_drives_a_robot_and_shows_predictions() {
     post(&app, "/v1/jobs", &collect("more", 2000)).await;
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
-    page.until(IS_COMPLETE).await;
+    page.wait_until(IS_COMPLETE).await;
     assert_eq!(page.value("document.getElementById('model').value").await, "moving");
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     let key = |kind: &str| json!({"type": kind, "key": "w", "code": "KeyW", "windowsVirtualKeyCode": 87});
     page.call("Input.dispatchKeyEvent", key("keyDown")).await;
-    page.until("document.getElementById('status').textContent.includes('your keys: 0.35 m/s, 0.00 rad/s')")
+    page.wait_until("document.getElementById('status').textContent.includes('your keys: 0.35 m/s, 0.00 rad/s')")
         .await;
-    page.until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
+    page.wait_until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
         .await;
     // The second job goes on meanwhile.
-    page.until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
+    page.wait_until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
         .await;
     for (width_px, colors) in [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")] {
         page.screenshot("page", width_px, colors).await;
     }
     page.call("Input.dispatchKeyEvent", key("keyUp")).await;
-    page.until("document.getElementById('status').textContent.includes('its own driver')")
+    page.wait_until("document.getElementById('status').textContent.includes('its own driver')")
         .await;
     server.stop().await;
 }
@@ -221,18 +221,18 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
     let says = |text: &str| format!("document.getElementById('refused').textContent.includes('{text}')");
-    page.until("!document.getElementById('unlock').hidden && document.querySelector('main').hidden")
+    page.wait_until("!document.getElementById('unlock').hidden && document.querySelector('main').hidden")
         .await;
     assert_eq!(page.value("document.getElementById('refused').textContent").await, "");
     page.unlock("let me in").await;
-    page.until(&says("This is no key")).await;
+    page.wait_until(&says("This is no key")).await;
     page.unlock(&format!("{}x", key.text)).await;
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.wait_until(&says("This key is not known here, or was revoked")).await;
     for width_px in [1280, 400] {
         page.screenshot("locked", width_px, "light").await;
     }
     page.unlock(&key.text).await;
-    page.until(IS_COMPLETE).await;
+    page.wait_until(IS_COMPLETE).await;
     let addresses = "[location.href, ...performance.getEntriesByType('resource').map(entry => entry.name)].join(' ')";
     let addresses = page.value(addresses).await;
     assert!(
@@ -241,14 +241,14 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
     );
     // The tab keeps it.
     page.call("Page.reload", json!({})).await;
-    page.until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+    page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     app.store().revoke_key(&key.id, 2.0).await.unwrap();
     keys.refresh().await.unwrap();
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.wait_until(&says("This key is not known here, or was revoked")).await;
     page.unlock(&other.text).await;
-    page.until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
+    page.wait_until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
         .await;
-    page.until(IS_COMPLETE).await;
+    page.wait_until(IS_COMPLETE).await;
     server.stop().await;
 }

@@ -10,19 +10,19 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
-use crate::service::{PATIENCE, frame, post};
+use crate::service::{TIMEOUT, frame, post};
 use foreframe::server::{App, ImageFormat};
 
 pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
 /// A session as it was opened.
 #[derive(Clone)]
-pub(crate) struct Opened {
+pub(crate) struct SessionHandle {
     pub(crate) id: String,
     pub(crate) token: String,
 }
 
-impl Opened {
+impl SessionHandle {
     pub(crate) fn path(&self, rest: &str) -> String {
         format!("/v1/sessions/{}{rest}?token={}", self.id, self.token)
     }
@@ -91,7 +91,7 @@ impl Client {
 
     /// The next message, or the code of the close that came in its place; none if the socket just ended.
     pub(crate) async fn receive_or_end(&mut self) -> Result<ServerMessage, Option<u16>> {
-        let message = tokio::time::timeout(PATIENCE, self.socket.next()).await.unwrap();
+        let message = tokio::time::timeout(TIMEOUT, self.socket.next()).await.unwrap();
         match message {
             Some(Ok(Message::Text(text))) => Ok(serde_json::from_str(&text).unwrap()),
             Some(Ok(Message::Binary(bytes))) => Ok(rmp_serde::from_slice(&bytes).unwrap()),
@@ -119,7 +119,7 @@ impl Client {
 }
 
 /// A frame whose image and numbers follow from its number.
-pub(crate) fn step(seq: u64) -> FrameMessage {
+pub(crate) fn numbered_frame(seq: u64) -> FrameMessage {
     let value = (seq % 7) as f32 - 3.0;
     FrameMessage {
         seq,
@@ -132,6 +132,6 @@ pub(crate) fn step(seq: u64) -> FrameMessage {
     }
 }
 
-pub(crate) fn send_frame(seq: u64) -> ClientMessage {
-    ClientMessage::Frame(step(seq))
+pub(crate) fn numbered_message(seq: u64) -> ClientMessage {
+    ClientMessage::Frame(numbered_frame(seq))
 }

@@ -9,11 +9,11 @@ use foreframe::server::ServerConfig;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::service::{PATIENCE, Running, app, get, run, send};
+use crate::service::{TIMEOUT, InProcessServer, app, get, run, send};
 
 const ASK: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
 
-async fn running(config: ServerConfig) -> (tempfile::TempDir, Running) {
+async fn start(config: ServerConfig) -> (tempfile::TempDir, InProcessServer) {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), config)).await;
     (dir, server)
@@ -24,10 +24,10 @@ async fn connect(address: SocketAddr) -> TcpStream {
 }
 
 /// Reads until the server closes.
-async fn rest(client: &mut TcpStream) -> String {
+async fn read_to_end(client: &mut TcpStream) -> String {
     let mut text = Vec::new();
     // A reset is an end as well.
-    let _ = tokio::time::timeout(PATIENCE, client.read_to_end(&mut text))
+    let _ = tokio::time::timeout(TIMEOUT, client.read_to_end(&mut text))
         .await
         .unwrap();
     String::from_utf8_lossy(&text).into_owned()
@@ -37,7 +37,7 @@ async fn answer(client: &mut TcpStream) -> String {
     let mut text = String::new();
     while !text.contains("\r\n\r\n{") || !text.ends_with('}') {
         let mut byte = [0; 256];
-        let count = tokio::time::timeout(PATIENCE, client.read(&mut byte))
+        let count = tokio::time::timeout(TIMEOUT, client.read(&mut byte))
             .await
             .unwrap()
             .unwrap();
@@ -49,14 +49,14 @@ async fn answer(client: &mut TcpStream) -> String {
 
 #[tokio::test]
 async fn slow_headers_time_out() {
-    let (_dir, server) = running(ServerConfig {
+    let (_dir, server) = start(ServerConfig {
         header_read_ms: 100,
         ..ServerConfig::default()
     })
     .await;
     let mut silent = connect(server.address).await;
     let mut slow = connect(server.address).await;
-    let dribble = async {
+    let send_slowly = async {
         // A byte now and then does not put the end off.
         for byte in ASK.iter().cycle() {
             if slow.write_all(&[*byte | 0x40]).await.is_err() {
@@ -65,14 +65,14 @@ async fn slow_headers_time_out() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, dribble).await.unwrap();
-    assert!(!rest(&mut silent).await.contains("200"));
+    tokio::time::timeout(TIMEOUT, send_slowly).await.unwrap();
+    assert!(!read_to_end(&mut silent).await.contains("200"));
     server.stop().await;
 }
 
 #[tokio::test]
 async fn an_idle_connection_is_closed() {
-    let (_dir, server) = running(ServerConfig {
+    let (_dir, server) = start(ServerConfig {
         header_read_ms: 200,
         ..ServerConfig::default()
     })
@@ -83,14 +83,14 @@ async fn an_idle_connection_is_closed() {
         assert!(answer(&mut client).await.starts_with("HTTP/1.1 200"));
     }
     let idle = Instant::now();
-    assert_eq!(rest(&mut client).await, "");
+    assert_eq!(read_to_end(&mut client).await, "");
     assert!(idle.elapsed() >= Duration::from_millis(150));
     server.stop().await;
 }
 
 #[tokio::test]
 async fn headers_over_the_limit_are_answered_431() {
-    let (_dir, server) = running(ServerConfig {
+    let (_dir, server) = start(ServerConfig {
         max_header_bytes: 8192,
         ..ServerConfig::default()
     })
@@ -98,13 +98,13 @@ async fn headers_over_the_limit_are_answered_431() {
     let mut client = connect(server.address).await;
     let head = format!("GET /livez HTTP/1.1\r\nhost: a\r\nx: {}\r\n\r\n", "y".repeat(9000));
     client.write_all(head.as_bytes()).await.unwrap();
-    assert!(rest(&mut client).await.starts_with("HTTP/1.1 431"));
+    assert!(read_to_end(&mut client).await.starts_with("HTTP/1.1 431"));
     server.stop().await;
 }
 
 #[tokio::test]
 async fn a_client_that_never_reads_is_disconnected() {
-    let (_dir, server) = running(ServerConfig {
+    let (_dir, server) = start(ServerConfig {
         write_stall_ms: 100,
         ..ServerConfig::default()
     })
@@ -113,13 +113,13 @@ async fn a_client_that_never_reads_is_disconnected() {
     // Until both sides' buffers are full of answers that nobody reads.
     let contract = b"GET /openapi.json HTTP/1.1\r\nhost: a\r\n\r\n".repeat(500);
     let flood = async { while client.write_all(&contract).await.is_ok() {} };
-    tokio::time::timeout(PATIENCE, flood).await.unwrap();
+    tokio::time::timeout(TIMEOUT, flood).await.unwrap();
     server.stop().await;
 }
 
 #[tokio::test]
 async fn a_draining_server_is_not_ready_but_answers() {
-    let (_dir, server) = running(ServerConfig {
+    let (_dir, server) = start(ServerConfig {
         drain_ms: 2_000,
         ..ServerConfig::default()
     })
@@ -146,7 +146,7 @@ async fn a_draining_server_is_not_ready_but_answers() {
         last.starts_with("HTTP/1.1 200") && last.contains("connection: close"),
         "{last}"
     );
-    tokio::time::timeout(PATIENCE, server.task).await.unwrap().unwrap();
+    tokio::time::timeout(TIMEOUT, server.task).await.unwrap().unwrap();
     assert!(TcpStream::connect(server.address).await.is_err());
 }
 

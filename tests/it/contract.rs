@@ -5,7 +5,7 @@ use axum::http::Request;
 use foreframe::server::{ServerConfig, openapi};
 use serde_json::{Value, json};
 
-use crate::service::{app, get, post, post_text, send, until};
+use crate::service::{app, get, post, post_text, send, poll_until};
 
 const PLAIN: &str = "/v1/models/plain/predict";
 
@@ -68,7 +68,7 @@ async fn the_server_is_ready_after_warming_its_models() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/livez").await.status, 200);
-    until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
+    poll_until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
     let models = get(&app, "/v1/models").await.json();
     let names: Vec<&Value> = models["models"]
         .as_array()

@@ -148,10 +148,10 @@ fn resuming_simulates_only_missing_trials() {
         CollectionStatus::PendingStep { trials: 6 }
     );
     let first = AtomicU64::new(u64::MAX);
-    let told = |progress: CollectProgress| {
+    let on_progress = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
     };
-    collect(&one_thread, &told, &AtomicBool::new(false)).unwrap();
+    collect(&one_thread, &on_progress, &AtomicBool::new(false)).unwrap();
     assert_eq!(first.into_inner(), 6);
 }
 

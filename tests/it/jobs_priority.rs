@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use crate::process::{Program, Served};
-use crate::service::PATIENCE;
+use crate::process::{Program, RunningServer};
+use crate::service::TIMEOUT;
 
 /// Name and niceness of a process's threads.
 fn threads(process: u32) -> Vec<(String, i64)> {
@@ -24,7 +24,7 @@ fn threads(process: u32) -> Vec<(String, i64)> {
 }
 
 /// Whether all of a job's threads are there, below the others; and the others where the process began.
-fn stands_back(process: u32) -> bool {
+fn has_lower_priority(process: u32) -> bool {
     let threads = threads(process);
     // Threads that candle shares would have predictions wait for the training.
     assert!(
@@ -42,9 +42,9 @@ fn stands_back(process: u32) -> bool {
     jobs.len() >= 3 && jobs.iter().all(|(_, niceness)| *niceness == low)
 }
 
-fn wait_until_it_stands_back(process: u32) {
-    let deadline = Instant::now() + PATIENCE;
-    while !stands_back(process) {
+fn wait_for_lower_priority(process: u32) {
+    let deadline = Instant::now() + TIMEOUT;
+    while !has_lower_priority(process) {
         assert!(Instant::now() < deadline, "{:?}", threads(process));
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -57,27 +57,27 @@ fn collect(name: &str, trials: u64) -> Value {
 #[test]
 fn job_threads_of_a_server_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
-    let served = Served::start(dir.path(), &["--set", "job_threads=2"]);
-    served.ask("POST", "/v1/jobs", &collect("seen", 40));
-    served.job_until("job-1", |job| job["state"] == "succeeded");
+    let server = RunningServer::start(dir.path(), &["--set", "job_threads=2"]);
+    server.ask("POST", "/v1/jobs", &collect("seen", 40));
+    server.wait_for_job("job-1", |job| job["state"] == "succeeded");
     let settings = json!({"data": {"windows": 64, "validation_windows": 8}});
     let train = json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings});
     for job in [&train, &collect("more", 100_000)] {
-        let id = served.ask("POST", "/v1/jobs", job)["id"].as_str().unwrap().to_owned();
-        served.job_until(&id, |job| job["progress"]["done"].as_u64() > Some(0));
-        wait_until_it_stands_back(served.program.id());
-        served.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
+        let id = server.ask("POST", "/v1/jobs", job)["id"].as_str().unwrap().to_owned();
+        server.wait_for_job(&id, |job| job["progress"]["done"].as_u64() > Some(0));
+        wait_for_lower_priority(server.program.id());
+        server.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
     }
-    let names: Vec<String> = threads(served.program.id()).into_iter().map(|(name, _)| name).collect();
+    let names: Vec<String> = threads(server.program.id()).into_iter().map(|(name, _)| name).collect();
     assert!(names.iter().any(|name| name == "inference"), "{names:?}");
 }
 
 #[test]
 fn job_threads_of_a_worker_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
-    let served = Served::start(dir.path(), &["--no-jobs"]);
+    let server = RunningServer::start(dir.path(), &["--no-jobs"]);
     let worker = Program::start(dir.path(), &["worker", "--set", "job_threads=2"]);
-    served.ask("POST", "/v1/jobs", &collect("seen", 100_000));
-    served.job_until("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
-    wait_until_it_stands_back(worker.id());
+    server.ask("POST", "/v1/jobs", &collect("seen", 100_000));
+    server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
+    wait_for_lower_priority(worker.id());
 }

@@ -10,7 +10,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 
 use crate::service::{Answer, app, get, run, send};
 
-async fn guarded(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
+async fn app_with_keys(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig {
         data_dir: dir.path().to_owned(),
@@ -39,7 +39,7 @@ async fn models_with(app: &App, authorization: &str) -> Answer {
 
 #[tokio::test]
 async fn authentication_starts_with_the_first_key() {
-    let (_dir, store, keys, app) = guarded(false).await;
+    let (_dir, store, keys, app) = app_with_keys(false).await;
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
@@ -47,13 +47,13 @@ async fn authentication_starts_with_the_first_key() {
     keys.refresh().await.unwrap();
     // That a key was taken away opens the server to nobody.
     assert_eq!(get(&app, "/v1/models").await.status, 401);
-    let (_dir, _store, _keys, app) = guarded(true).await;
+    let (_dir, _store, _keys, app) = app_with_keys(true).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
 }
 
 #[tokio::test]
 async fn the_api_requires_a_valid_key() {
-    let (_dir, store, keys, app) = guarded(true).await;
+    let (_dir, store, keys, app) = app_with_keys(true).await;
     let (key, other) = (new_key(&store, &keys).await, NewKey::generate().unwrap());
     let refused = get(&app, "/v1/models").await;
     assert!(refused.detail(401).contains("Authorization: Bearer KEY"));
@@ -76,7 +76,7 @@ async fn the_api_requires_a_valid_key() {
 
 #[tokio::test]
 async fn a_websocket_can_send_its_key_as_a_subprotocol() {
-    let (_dir, store, keys, app) = guarded(true).await;
+    let (_dir, store, keys, app) = app_with_keys(true).await;
     let key = new_key(&store, &keys).await;
     let server = run(app).await;
     let connect = async |protocols: String| {

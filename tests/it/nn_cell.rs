@@ -6,7 +6,7 @@ use candle_core::{Device, Tensor};
 use foreframe::nn::lstm::unroll;
 use foreframe::nn::lstm_cell::{LstmState, PeepholeCell};
 
-use crate::nn_common::largest_difference;
+use crate::nn_fixtures::largest_difference;
 
 type Tensors = HashMap<String, Tensor>;
 

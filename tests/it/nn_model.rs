@@ -4,7 +4,7 @@ use candle_core::{DType, Device, Tensor};
 use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
-use crate::nn_common::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
+use crate::nn_fixtures::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
 
 /// A loss that every tensor of the model has a part in.
 fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {

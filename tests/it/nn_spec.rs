@@ -6,7 +6,7 @@ use candle_core::{DType, Tensor};
 use foreframe::nn::{Conditioning, Loss, ModelSpec, NnError, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
-use crate::nn_common::{all_kinds, bits, channel, tiny, values};
+use crate::nn_fixtures::{all_kinds, bits, channel, tiny, values};
 
 #[test]
 fn specifications_out_of_bounds_are_refused() {

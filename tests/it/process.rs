@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::service::PATIENCE;
+use crate::service::TIMEOUT;
 
 /// The program in a directory, with no setting from the environment, as users start it.
 pub(crate) fn foreframe(dir: &Path) -> Command {
@@ -63,8 +63,8 @@ impl Program {
     }
 
     /// Waits for the end; gives its log.
-    pub(crate) fn ended(mut self) -> String {
-        let deadline = Instant::now() + PATIENCE;
+    pub(crate) fn wait_for_exit(mut self) -> String {
+        let deadline = Instant::now() + TIMEOUT;
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
@@ -87,26 +87,26 @@ impl Drop for Program {
 }
 
 /// A server that is ready.
-pub(crate) struct Served {
+pub(crate) struct RunningServer {
     pub(crate) program: Program,
     pub(crate) address: SocketAddr,
 }
 
-impl Served {
+impl RunningServer {
     pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
         let program = Program::start(dir, &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat());
         let line = &program.line;
         let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
-        let served = Self {
+        let server = Self {
             address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
             program,
         };
-        let deadline = Instant::now() + PATIENCE;
-        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
+        let deadline = Instant::now() + TIMEOUT;
+        while !server.get("/readyz").starts_with("HTTP/1.1 200") {
             assert!(Instant::now() < deadline, "the server did not get ready");
             std::thread::sleep(Duration::from_millis(10));
         }
-        served
+        server
     }
 
     /// The whole answer.
@@ -136,11 +136,11 @@ impl Served {
     }
 
     /// Asks for a job until that has come.
-    pub(crate) fn job_until(&self, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
-        let deadline = Instant::now() + PATIENCE;
+    pub(crate) fn wait_for_job(&self, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let job = self.ask("GET", &format!("/v1/jobs/{id}"), &Value::Null);
-            if has_come(&job) {
+            if is_reached(&job) {
                 return job;
             }
             assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
@@ -153,7 +153,7 @@ impl Served {
     }
 
     /// Waits for the end; gives its log.
-    pub(crate) fn ended(self) -> String {
-        self.program.ended()
+    pub(crate) fn wait_for_exit(self) -> String {
+        self.program.wait_for_exit()
     }
 }

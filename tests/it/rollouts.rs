@@ -12,7 +12,7 @@ use foreframe::server::protocol::Codec;
 use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened, send_frame, step};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
 use crate::service::{
     Answer, CONTEXT, HEIGHT, WIDTH, app, context, frame, model, post, post_text, run, send, slow_spec, start, with_data,
 };
@@ -33,7 +33,7 @@ fn pixels(image: &Value) -> Vec<u8> {
 }
 
 /// The greatest difference of any two pixels.
-fn difference(a: &Value, b: &Value) -> u8 {
+fn largest_pixel_difference(a: &Value, b: &Value) -> u8 {
     let (a, b) = (a.as_array().unwrap(), b.as_array().unwrap());
     assert_eq!(a.len(), b.len());
     let pairs = a.iter().zip(b).flat_map(|(a, b)| pixels(a).into_iter().zip(pixels(b)));
@@ -55,9 +55,9 @@ async fn batched_rollouts_equal_single_predictions() {
     for index in [0, 1, 150, 299] {
         let body = json!({"frames": raw, "format": "raw", "state": [0.5], "future_actions": candidates[index]});
         let alone = post(&app, "/v1/models/moving/predict", &body).await.json();
-        assert!(difference(&futures[index], &alone["frames"]) <= 1);
+        assert!(largest_pixel_difference(&futures[index], &alone["frames"]) <= 1);
     }
-    assert!(difference(&futures[0], &futures[299]) > 0);
+    assert!(largest_pixel_difference(&futures[0], &futures[299]) > 0);
 }
 
 #[tokio::test]
@@ -91,9 +91,9 @@ async fn rollouts_are_answered_as_png_or_gif() {
     let sheet = post_text(&app, ROLLOUTS, body(4), "image/png").await;
     let sheet = codec::decode(&sheet.body).unwrap();
     assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 5 * HEIGHT);
-    let film = post_text(&app, ROLLOUTS, body(4), "image/gif").await;
-    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, ROLLOUTS, body(4), "image/gif").await;
+    assert_eq!(gif.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(gif.body.starts_with(b"GIF89a"));
     let many = post_text(&app, ROLLOUTS, body(400), "image/png").await;
     assert_eq!(
         many.detail(406),
@@ -140,10 +140,10 @@ async fn invalid_candidates_are_refused_with_the_field() {
     ] {
         assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
     }
-    let untold = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
+    let unconditioned = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
         .await
         .detail(422);
-    assert!(untold.starts_with("model \"plain\" takes no actions"), "{untold}");
+    assert!(unconditioned.starts_with("model \"plain\" takes no actions"), "{unconditioned}");
 }
 
 #[tokio::test]
@@ -151,7 +151,7 @@ async fn session_rollouts_equal_stateless_rollouts() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &json!({"model": "moving"})).await;
+    let session = SessionHandle::open(&app, &json!({"model": "moving"})).await;
     let path = session.path("/rollouts");
     let body = json!({"candidates": candidates(20), "format": "raw"});
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
@@ -163,13 +163,13 @@ async fn session_rollouts_equal_stateless_rollouts() {
             early,
             format!("the session has {seq} frames of the 3 that a prediction takes; send it more")
         );
-        client.ask(&send_frame(seq)).await;
+        client.ask(&numbered_message(seq)).await;
     }
     let futures = post(&app, &path, &body).await.json();
     let raw: Vec<String> = (0..CONTEXT as u64)
-        .map(|seq| STANDARD.encode(&step(seq).image.0))
+        .map(|seq| STANDARD.encode(&numbered_frame(seq).image.0))
         .collect();
-    let state = step(CONTEXT as u64 - 1).state;
+    let state = numbered_frame(CONTEXT as u64 - 1).state;
     let stateless = json!({"frames": raw, "format": "raw", "state": state, "candidates": candidates(20)});
     let stateless = post(&app, ROLLOUTS, &stateless).await.json();
     for (found, expected) in futures["futures"]
@@ -178,10 +178,10 @@ async fn session_rollouts_equal_stateless_rollouts() {
         .iter()
         .zip(stateless["futures"].as_array().unwrap())
     {
-        assert!(difference(found, expected) <= 1);
+        assert!(largest_pixel_difference(found, expected) <= 1);
     }
-    let film = post_text(&app, &path, body.to_string(), "image/gif").await;
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, &path, body.to_string(), "image/gif").await;
+    assert!(gif.body.starts_with(b"GIF89a"));
     drop(client);
     server.stop().await;
 }
@@ -215,12 +215,12 @@ async fn multipart_and_json_give_the_same_prediction() {
     let by_json = post(&app, plain, &json!({"frames": context()})).await.json();
     assert_eq!(post_form(&app, plain, &parts).await.json()["frames"], by_json["frames"]);
 
-    let told = json!({"state": [0.5], "actions": [[1.0, 2.0]]});
-    let mut body = told.clone();
+    let inputs = json!({"state": [0.5], "actions": [[1.0, 2.0]]});
+    let mut body = inputs.clone();
     body["frames"] = json!(context());
     let by_json = post(&app, "/v1/models/moving/predict", &body).await.json();
-    let told = told.to_string();
-    parts.push(("request", told.as_bytes()));
+    let inputs = inputs.to_string();
+    parts.push(("request", inputs.as_bytes()));
     let by_form = post_form(&app, "/v1/models/moving/predict", &parts).await.json();
     assert_eq!(by_form["frames"], by_json["frames"]);
 

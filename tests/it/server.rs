@@ -92,9 +92,9 @@ async fn the_accept_header_selects_png_or_gif() {
     assert_eq!(sheet.headers[header::CONTENT_TYPE], "image/png");
     let sheet = codec::decode(&sheet.body).unwrap();
     assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 2 * HEIGHT);
-    let film = post_text(&app, PLAIN, body.clone(), "image/gif").await;
-    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, PLAIN, body.clone(), "image/gif").await;
+    assert_eq!(gif.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(gif.body.starts_with(b"GIF89a"));
     let refused = post_text(&app, PLAIN, body, "text/csv").await.detail(406);
     assert!(
         refused.contains("application/json, image/png and image/gif"),
@@ -293,16 +293,16 @@ async fn an_accepted_request_is_answered_during_shutdown() {
     );
     let mut client = TcpStream::connect(server.address).await.unwrap();
     client.write_all(head.as_bytes()).await.unwrap();
-    let mut go_on = [0; 25];
-    client.read_exact(&mut go_on).await.unwrap();
-    assert_eq!(&go_on, b"HTTP/1.1 100 Continue\r\n\r\n");
+    let mut interim = [0; 25];
+    client.read_exact(&mut interim).await.unwrap();
+    assert_eq!(&interim, b"HTTP/1.1 100 Continue\r\n\r\n");
     // The request has been taken; only its body is missing.
     server.shutdown.send(()).unwrap();
     client.write_all(body.as_bytes()).await.unwrap();
     let mut answer = String::new();
     client.read_to_string(&mut answer).await.unwrap();
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    tokio::time::timeout(crate::service::PATIENCE, server.task)
+    tokio::time::timeout(crate::service::TIMEOUT, server.task)
         .await
         .unwrap()
         .unwrap();

@@ -27,7 +27,7 @@ pub(crate) const HEIGHT: u32 = 12;
 pub(crate) const CONTEXT: usize = 3;
 pub(crate) const HORIZON: usize = 2;
 /// Longer than anything here takes.
-pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
+pub(crate) const TIMEOUT: Duration = Duration::from_mins(1);
 
 pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
@@ -173,41 +173,41 @@ pub(crate) async fn post_text(app: &App, path: &str, body: String, accept: &str)
 }
 
 /// A server on a port of its own.
-pub(crate) struct Running {
+pub(crate) struct InProcessServer {
     pub(crate) address: std::net::SocketAddr,
     pub(crate) shutdown: oneshot::Sender<()>,
     pub(crate) task: JoinHandle<()>,
 }
 
-pub(crate) async fn run(app: App) -> Running {
+pub(crate) async fn run(app: App) -> InProcessServer {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let (shutdown, asked) = oneshot::channel();
     let task = tokio::spawn(server::serve(listener, app, async move {
         let _ = asked.await;
     }));
-    Running {
+    InProcessServer {
         address,
         shutdown,
         task,
     }
 }
 
-impl Running {
+impl InProcessServer {
     pub(crate) async fn stop(self) {
         let _ = self.shutdown.send(());
-        tokio::time::timeout(PATIENCE, self.task).await.unwrap().unwrap();
+        tokio::time::timeout(TIMEOUT, self.task).await.unwrap().unwrap();
     }
 }
 
 /// Asks again and again until the answer is `Some`.
-pub(crate) async fn until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + PATIENCE;
+pub(crate) async fn poll_until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + TIMEOUT;
     loop {
         if let Some(answer) = ask().await {
             return answer;
         }
-        assert!(Instant::now() < deadline, "nothing within {PATIENCE:?}");
+        assert!(Instant::now() < deadline, "nothing within {TIMEOUT:?}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }

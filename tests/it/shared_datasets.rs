@@ -8,7 +8,7 @@ use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::service::{Answer, get, post, send, until};
+use crate::service::{Answer, get, post, send, poll_until};
 
 const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";
@@ -37,7 +37,7 @@ async fn collected(app: &App, trials: u32) {
     let taken = post(app, JOBS, &collect(trials)).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
-    until(async || {
+    poll_until(async || {
         let job = get(app, &path).await.json();
         assert!(job["state"] != "failed", "{job}");
         (job["state"] == "succeeded").then_some(())

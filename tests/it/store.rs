@@ -9,13 +9,13 @@ use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
 /// Where to open a store of each kind, empty. `name` is the test's.
-async fn places(name: &str) -> Vec<(TempDir, StoreConfig)> {
-    let mut places = vec![place(None)];
-    places.extend(postgres(name).await.map(|url| place(Some(url))));
-    places
+async fn configs(name: &str) -> Vec<(TempDir, StoreConfig)> {
+    let mut configs = vec![config(None)];
+    configs.extend(postgres(name).await.map(|url| config(Some(url))));
+    configs
 }
 
-fn place(database: Option<String>) -> (TempDir, StoreConfig) {
+fn config(database: Option<String>) -> (TempDir, StoreConfig) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig {
         data_dir: dir.path().to_owned(),
@@ -45,7 +45,7 @@ pub(crate) async fn postgres(name: &str) -> Option<String> {
 
 async fn stores(name: &str) -> Vec<(TempDir, Store)> {
     let mut stores = Vec::new();
-    for (dir, config) in places(name).await {
+    for (dir, config) in configs(name).await {
         stores.push((dir, Store::open(&config).await.unwrap()));
     }
     stores
@@ -68,7 +68,7 @@ async fn enqueued(store: &Store) -> JobRow {
     }
 }
 
-fn ending(state: &'static str) -> JobOutcome {
+fn outcome(state: &'static str) -> JobOutcome {
     JobOutcome {
         state,
         error: None,
@@ -78,7 +78,7 @@ fn ending(state: &'static str) -> JobOutcome {
     }
 }
 
-fn account(line: &str) -> JobUpdate {
+fn update(line: &str) -> JobUpdate {
     JobUpdate {
         progress: "{\"done\":1}".to_owned(),
         lines: vec![(2.0, line.to_owned())],
@@ -104,14 +104,14 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         );
         assert_eq!(store.claim("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
-            assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
+            assert_eq!(store.renew(lease, 20.0, update(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
         assert_eq!(
             store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(),
             Some(true)
         );
-        assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
+        assert!(store.end(lease, outcome("cancelled"), update("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.cancelling, row.ended_s),
@@ -125,10 +125,10 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
         assert_eq!(lines, [(4, "four"), (5, "five")]);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
-        assert_eq!(store.job_losses(1).await.unwrap(), account("").losses);
+        assert_eq!(store.job_losses(1).await.unwrap(), update("").losses);
         assert!(
             !store
-                .end(lease, ending("succeeded"), JobUpdate::default())
+                .end(lease, outcome("succeeded"), JobUpdate::default())
                 .await
                 .unwrap()
         );
@@ -143,10 +143,10 @@ async fn an_expired_lease_cannot_write() {
         assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
         let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
-        assert_eq!(store.renew(stale, 99.0, account("from the dead")).await.unwrap(), None);
+        assert_eq!(store.renew(stale, 99.0, update("from the dead")).await.unwrap(), None);
         assert!(
             !store
-                .end(stale, ending("failed"), account("from the dead"))
+                .end(stale, outcome("failed"), update("from the dead"))
                 .await
                 .unwrap()
         );
@@ -288,7 +288,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
         assert_eq!(store.published_versions().await.unwrap(), []);
         let published = |version, activates| JobOutcome {
             published: Some(("m".to_owned(), version, activates)),
-            ..ending("succeeded")
+            ..outcome("succeeded")
         };
         assert!(
             store
@@ -337,7 +337,7 @@ async fn keys_are_found_by_id_and_revoked_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_new_store_can_be_opened_concurrently() {
-    for (_dir, config) in places("open").await {
+    for (_dir, config) in configs("open").await {
         let opening = (0..6).map(|_| {
             let config = config.clone();
             tokio::spawn(async move { Store::open(&config).await.unwrap() })

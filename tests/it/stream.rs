@@ -14,12 +14,12 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::service::{
-    CONTEXT, PATIENCE, Running, app, context, frame, get, model, png, post, run, spec, start, until, with_data,
+    CONTEXT, TIMEOUT, InProcessServer, app, context, frame, get, model, png, post, run, spec, start, poll_until, with_data,
 };
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
-async fn connect(server: &Running, model: &str, subprotocol: &str) -> Result<Socket, Box<Error>> {
+async fn connect(server: &InProcessServer, model: &str, subprotocol: &str) -> Result<Socket, Box<Error>> {
     let mut request = format!("ws://{}/v1/models/{model}/stream", server.address)
         .into_client_request()
         .unwrap();
@@ -30,7 +30,7 @@ async fn connect(server: &Running, model: &str, subprotocol: &str) -> Result<Soc
     Ok(socket)
 }
 
-async fn open(server: &Running, model: &str) -> Socket {
+async fn open(server: &InProcessServer, model: &str) -> Socket {
     let mut socket = connect(server, model, "foreframe.v1.json").await.unwrap();
     let ready = receive(&mut socket).await;
     assert_eq!((&ready["type"], &ready["next_seq"]), (&json!("ready"), &json!(0)));
@@ -38,7 +38,7 @@ async fn open(server: &Running, model: &str) -> Socket {
 }
 
 async fn receive(socket: &mut Socket) -> Value {
-    let message = tokio::time::timeout(PATIENCE, socket.next())
+    let message = tokio::time::timeout(TIMEOUT, socket.next())
         .await
         .unwrap()
         .unwrap()
@@ -234,7 +234,7 @@ async fn invalid_streams_are_refused_before_the_upgrade() {
         503
     );
     drop(socket);
-    until(async || connect(&server, "plain", "foreframe.v1.json").await.ok()).await;
+    poll_until(async || connect(&server, "plain", "foreframe.v1.json").await.ok()).await;
     server.stop().await;
 }
 
@@ -279,7 +279,7 @@ async fn a_client_that_never_reads_loses_its_stream() {
     // Each small message is answered by a large one, the kept answer; nothing is read.
     let flood = async { while socket.send(Message::text(message.clone())).await.is_ok() {} };
     let _ = tokio::time::timeout(Duration::from_secs(20), flood).await;
-    until(async || connect(&server, "large", "foreframe.v1.json").await.ok()).await;
+    poll_until(async || connect(&server, "large", "foreframe.v1.json").await.ok()).await;
     drop(socket);
     server.stop().await;
 }
@@ -302,7 +302,7 @@ async fn shutdown_closes_streams_with_1001() {
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
     let mut socket = open(&server, "plain").await;
-    let Running { shutdown, task, .. } = server;
+    let InProcessServer { shutdown, task, .. } = server;
     shutdown.send(()).unwrap();
     assert_eq!(
         receive(&mut socket).await,
@@ -313,5 +313,5 @@ async fn shutdown_closes_streams_with_1001() {
     };
     assert_eq!(close.code, CloseCode::Away);
     assert_eq!(get(&app, "/readyz").await.detail(503), "the server is stopping");
-    tokio::time::timeout(PATIENCE, task).await.unwrap().unwrap();
+    tokio::time::timeout(TIMEOUT, task).await.unwrap().unwrap();
 }

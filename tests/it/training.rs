@@ -70,30 +70,30 @@ fn weights(dir: &Path) -> Vec<u8> {
 fn a_stopped_and_resumed_run_has_the_same_bits() {
     let (dataset, config) = (squares(20), small_config(&[]));
     let dir = tempfile::tempdir().unwrap();
-    let unbroken = dir.path().join("unbroken");
-    train(&config, &dataset, &unbroken).unwrap();
+    let uninterrupted = dir.path().join("uninterrupted");
+    train(&config, &dataset, &uninterrupted).unwrap();
     for (name, stops) in [
         ("early", vec![1, 12]),
         ("codec", vec![30]),
         ("late", vec![25, 20, 14]),
         ("often", vec![9; 5]),
     ] {
-        let broken = dir.path().join(name);
+        let resumed = dir.path().join(name);
         for updates in stops {
-            let outcome = train_until(&config, &dataset, &broken, updates).unwrap();
+            let outcome = train_until(&config, &dataset, &resumed, updates).unwrap();
             assert!(
                 matches!(outcome, TrainingOutcome::Interrupted { .. }),
                 "{name}: {outcome:?}"
             );
         }
-        train(&config, &dataset, &broken).unwrap();
+        train(&config, &dataset, &resumed).unwrap();
         assert_eq!(
-            weights(&broken),
-            weights(&unbroken),
+            weights(&resumed),
+            weights(&uninterrupted),
             "{name}: the last checkpoints differ"
         );
         let model = |run: &Path| std::fs::read(run.join("model").join(registry::WEIGHTS_FILE)).unwrap();
-        assert_eq!(model(&broken), model(&unbroken), "{name}: the published weights differ");
+        assert_eq!(model(&resumed), model(&uninterrupted), "{name}: the published weights differ");
     }
 }
 

@@ -6,31 +6,31 @@ use proptest::prelude::*;
 use proptest::sample::Index;
 use serde_json::json;
 
-use crate::corpus::samples;
+use crate::corpus::files;
 use crate::mutation::{mutated, mutations};
 use crate::service::Answer;
-use crate::world::WORLD;
-use crate::{alone, within};
+use crate::test_service::SERVICE;
+use crate::{exclusive, within_memory};
 
 fn predict(name: &str, image: &[u8]) -> Answer {
     let image = STANDARD.encode(image);
     let body = json!({"frames": [image, image, image]}).to_string();
-    WORLD.json(name, "/v1/models/plain/predict", body.into())
+    SERVICE.json(name, "/v1/models/plain/predict", body.into())
 }
 
 #[test]
 fn corpus_images_are_accepted_or_refused_as_named() {
-    let _alone = alone();
-    for sample in samples("images") {
-        let answer = predict(&sample.name, &sample.bytes);
+    let _alone = exclusive();
+    for file in files("images") {
+        let answer = predict(&file.name, &file.bytes);
         let text = String::from_utf8_lossy(&answer.body);
-        let expected = if sample.part(0) == "ok" { 200 } else { 422 };
-        assert_eq!(answer.status, expected, "{}: {text}", sample.name);
+        let expected = if file.part(0) == "ok" { 200 } else { 422 };
+        assert_eq!(answer.status, expected, "{}: {text}", file.name);
         if expected == 422 {
             assert!(
                 answer.detail(422).starts_with("frames[0] is "),
                 "{}: {text}",
-                sample.name
+                file.name
             );
         }
     }
@@ -38,10 +38,10 @@ fn corpus_images_are_accepted_or_refused_as_named() {
 
 #[test]
 fn a_huge_image_size_is_refused_before_allocation() {
-    let _alone = alone();
-    for sample in samples("images").iter().filter(|sample| sample.name.contains("65535")) {
+    let _alone = exclusive();
+    for file in files("images").iter().filter(|file| file.name.contains("65535")) {
         // 4 GiB of pixels.
-        let refused = within(3 << 20, &sample.name, || predict(&sample.name, &sample.bytes));
+        let refused = within_memory(3 << 20, &file.name, || predict(&file.name, &file.bytes));
         assert_eq!(
             refused.detail(422),
             "frames[0] is 65535×65535 px; model \"plain\" takes 16×12"
@@ -52,9 +52,9 @@ fn a_huge_image_size_is_refused_before_allocation() {
 proptest! {
     #[test]
     fn mutated_images_are_decoded_or_refused(which: Index, mutations in mutations()) {
-        let _alone = alone();
-        let samples = samples("images");
-        let sample = which.get(&samples);
-        predict(&sample.name, &mutated(&sample.bytes, &mutations));
+        let _alone = exclusive();
+        let files = files("images");
+        let file = which.get(&files);
+        predict(&file.name, &mutated(&file.bytes, &mutations));
     }
 }

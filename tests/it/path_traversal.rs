@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::neighbour::Scene;
+use crate::healthy_robot::ServerWithRobot;
 use crate::service::{get, post, send};
 
 const NAMES: [&str; 8] = [
@@ -63,8 +63,8 @@ fn files(dir: &Path) -> Vec<(String, u64)> {
 
 #[tokio::test]
 async fn names_in_paths_cannot_leave_the_data_directory() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (app, before) = (scene.app.clone(), files(scene.dir.path()));
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (app, before) = (setup.app.clone(), files(setup.dir.path()));
     let asking = async {
         for (method, path) in PATHS {
             for name in NAMES {
@@ -80,15 +80,15 @@ async fn names_in_paths_cannot_leave_the_data_directory() {
             }
         }
     };
-    scene.beside(asking).await;
-    assert_eq!(files(scene.dir.path()), before);
-    scene.close().await;
+    setup.while_robot_streams(asking).await;
+    assert_eq!(files(setup.dir.path()), before);
+    setup.close().await;
 }
 
 #[tokio::test]
 async fn dots_in_paths_are_not_resolved() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let address = scene.address();
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let address = setup.address();
     for path in [
         "/../../etc/passwd",
         "/v1/../livez",
@@ -103,10 +103,10 @@ async fn dots_in_paths_are_not_resolved() {
             client.read_to_string(&mut answer).await.unwrap();
             answer
         };
-        let answer = scene.beside(asking).await;
+        let answer = setup.while_robot_streams(asking).await;
         assert!(answer.starts_with("HTTP/1.1 404"), "{path}: {answer}");
     }
-    scene.close().await;
+    setup.close().await;
 }
 
 #[tokio::test]
@@ -115,8 +115,8 @@ async fn names_in_jobs_cannot_leave_the_data_directory() {
         no_jobs: true,
         ..ServerConfig::default()
     };
-    let mut scene = Scene::open(config).await;
-    let (app, before) = (scene.app.clone(), files(scene.dir.path()));
+    let mut setup = ServerWithRobot::open(config).await;
+    let (app, before) = (setup.app.clone(), files(setup.dir.path()));
     let collect = json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 1});
     let train = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "a"});
     let evaluate = json!({"kind": "evaluate", "model": "plain", "dataset": "a", "twin": "plain"});
@@ -147,7 +147,7 @@ async fn names_in_jobs_cannot_leave_the_data_directory() {
         }
         get(&app, "/v1/jobs/job-1/files/..%2fforeframe.db").await.detail(404);
     };
-    scene.beside(asking).await;
-    assert_eq!(files(scene.dir.path()), before);
-    scene.close().await;
+    setup.while_robot_streams(asking).await;
+    assert_eq!(files(setup.dir.path()), before);
+    setup.close().await;
 }

@@ -12,7 +12,7 @@ pub(crate) struct Bounds {
 
 impl Bounds {
     /// Prints whether a bound holds, and remembers it if not.
-    pub(crate) fn hold(&mut self, holds: bool, what: impl Into<String>) {
+    pub(crate) fn check(&mut self, holds: bool, what: impl Into<String>) {
         let what = what.into();
         println!("{} {what}", if holds { "  holds: " } else { "  BROKEN:" });
         if !holds {
@@ -21,7 +21,7 @@ impl Bounds {
     }
 
     /// The exit code.
-    pub(crate) fn conclude(self) -> ExitCode {
+    pub(crate) fn exit_code(self) -> ExitCode {
         if self.broken.is_empty() {
             return ExitCode::SUCCESS;
         }

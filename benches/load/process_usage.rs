@@ -18,7 +18,7 @@ pub(crate) struct Process(pub(crate) String);
 /// What a process takes at a time. Of descriptors and threads without those of the connections to its database: they are
 /// a bounded number, and come when they are needed.
 #[derive(Clone, Copy)]
-pub(crate) struct Taken {
+pub(crate) struct Usage {
     pub(crate) rss_mb: f64,
     pub(crate) peak_rss_mb: f64,
     pub(crate) descriptors: usize,
@@ -31,14 +31,14 @@ impl Process {
         fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path}: {error}; has the server ended?"))
     }
 
-    pub(crate) fn taken(&self) -> Taken {
+    pub(crate) fn usage(&self) -> Usage {
         let status = self.read("status");
         let field = |name: &str| {
             let line = status.lines().find_map(|line| line.strip_prefix(name));
             let number = line.and_then(|line| line.split_whitespace().next());
             number.and_then(|number| number.parse::<f64>().ok()).unwrap()
         };
-        Taken {
+        Usage {
             rss_mb: field("VmRSS:") / 1024.0,
             peak_rss_mb: field("VmHWM:") / 1024.0,
             descriptors: self.count("fd", |entry| {

@@ -12,26 +12,26 @@ use foreframe::types::{Action, RobotState, Seed};
 use rand::Rng as _;
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened};
-use crate::service::{self, Running, get, run, with_data};
+use crate::client::{Client, SessionHandle};
+use crate::service::{self, InProcessServer, get, run, with_data};
 
 fn shipped(name: &str) -> LoadedModel {
     registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
 }
 
 /// What one robot saw and did.
-struct Trip {
+struct Recording {
     frames: Vec<Frame>,
     actions: Vec<Vec<f32>>,
     states: Vec<Vec<f32>>,
 }
 
-impl Trip {
+impl Recording {
     /// The frames that come with the program.
     fn example() -> Self {
         let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/frames");
-        let told: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
-        let numbers = |field: &str| serde_json::from_value::<Vec<Vec<f32>>>(told[field].clone()).unwrap();
+        let recorded: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
+        let numbers = |field: &str| serde_json::from_value::<Vec<Vec<f32>>>(recorded[field].clone()).unwrap();
         let frame = |index| codec::decode(&std::fs::read(dir.join(format!("frame-{index:03}.png"))).unwrap()).unwrap();
         Self {
             frames: (0..15).map(frame).collect(),
@@ -112,7 +112,7 @@ impl Trip {
     }
 }
 
-async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
+async fn start(dir: &Path, models: &[LoadedModel]) -> (App, InProcessServer) {
     let app = service::start(with_data(dir, ServerConfig::default()), models.to_vec());
     let server = run(app.clone()).await;
     (app, server)
@@ -120,7 +120,7 @@ async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
 
 #[tokio::test]
 async fn shipped_models_predict_the_same_in_streams_and_requests() {
-    let (dir, trip) = (tempfile::tempdir().unwrap(), Trip::example());
+    let (dir, recording) = (tempfile::tempdir().unwrap(), Recording::example());
     let models = [shipped("moving"), shipped("paper")];
     let (app, server) = start(dir.path(), &models).await;
     for (model, codec) in models
@@ -128,18 +128,18 @@ async fn shipped_models_predict_the_same_in_streams_and_requests() {
         .flat_map(|model| [(model, Codec::Json), (model, Codec::Msgpack)])
     {
         let name = &model.manifest.name;
-        let session = Opened::open(&app, &json!({"model": name})).await;
+        let session = SessionHandle::open(&app, &json!({"model": name})).await;
         let mut client = Client::connect(server.address, &session.path("/stream"), codec)
             .await
             .unwrap();
-        for seq in 0..trip.frames.len() {
-            match client.ask(&trip.message(seq)).await {
+        for seq in 0..recording.frames.len() {
+            match client.ask(&recording.message(seq)).await {
                 ServerMessage::Buffering { have, .. } => assert_eq!(have, seq + 1),
-                ServerMessage::Prediction { frames, .. } => trip.check(model, seq, &frames),
+                ServerMessage::Prediction { frames, .. } => recording.check(model, seq, &frames),
                 other => panic!("{other:?}"),
             }
         }
-        trip.check_state(model, &get(&app, &session.path("/state")).await.json());
+        recording.check_state(model, &get(&app, &session.path("/state")).await.json());
     }
     server.stop().await;
 }
@@ -182,8 +182,8 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
 
 /// A robot that sends when it likes, some frames ahead of their answers; every prediction is held against the stateless.
 async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, robot: u64, steps: usize) {
-    let trip = Trip::noise(model, robot, steps);
-    let session = Opened::open(app, &json!({"model": "moving"})).await;
+    let recording = Recording::noise(model, robot, steps);
+    let session = SessionHandle::open(app, &json!({"model": "moving"})).await;
     let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
@@ -192,7 +192,7 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
     for answered in 0..steps {
         let ahead = rng.random_range(1..8usize);
         while sent < steps && sent < answered + ahead {
-            client.send(&trip.message(sent)).await;
+            client.send(&recording.message(sent)).await;
             sent += 1;
         }
         for _ in 0..rng.random_range(0..4u8) {
@@ -209,14 +209,14 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
         // In one go, so that the robots keep the server busy together.
         if unchecked.len() == 50 || answered + 1 == steps {
             for (seq, frames) in unchecked.drain(..) {
-                trip.check(model, seq, &frames);
+                recording.check(model, seq, &frames);
             }
         }
     }
-    trip.check_state(model, &get(app, &session.path("/state")).await.json());
+    recording.check_state(model, &get(app, &session.path("/state")).await.json());
 }
 
-async fn interleaved(steps: usize) {
+async fn run_interleaved(steps: usize) {
     let dir = tempfile::tempdir().unwrap();
     let model = shipped("moving");
     let (app, server) = start(dir.path(), std::slice::from_ref(&model)).await;
@@ -227,12 +227,12 @@ async fn interleaved(steps: usize) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn sixty_four_interleaved_sessions_equal_single_predictions() {
-    interleaved(12).await;
+    run_interleaved(12).await;
 }
 
 /// `cargo test --release --test it -- --ignored sixty_four_interleaved_sessions_for_a_thousand_steps`
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "64,000 predictions twice over: minutes"]
 async fn sixty_four_interleaved_sessions_for_a_thousand_steps() {
-    interleaved(1000).await;
+    run_interleaved(1000).await;
 }

@@ -17,7 +17,7 @@ const FRAMES: usize = 15;
 const BOUNDARY: &str = "frame-by-frame";
 
 /// Frames and requests for one model.
-pub(crate) struct Material {
+pub(crate) struct Workload {
     model: String,
     spec: ModelSpec,
     /// The frames' files.
@@ -26,7 +26,7 @@ pub(crate) struct Material {
     images: Vec<Vec<u8>>,
 }
 
-impl Material {
+impl Workload {
     pub(crate) fn of(model: &str) -> Self {
         let project = Path::new(env!("CARGO_MANIFEST_DIR"));
         let manifest = manifest::read(&project.join("models").join(model)).expect("a shipped model");
@@ -65,7 +65,7 @@ impl Material {
 
     /// A prediction with images as base64.
     pub(crate) fn predict_json(&self) -> Request {
-        let mut body = self.premise();
+        let mut body = self.conditioning();
         let images = self.files.iter().take(self.spec.context);
         body["frames"] = images.map(|file| json!(ImageBytes(file.clone()))).collect();
         Request::json(&self.predict_path(), &body)
@@ -78,7 +78,7 @@ impl Material {
         for file in self.files.iter().take(self.spec.context) {
             body.extend([head("frames").as_bytes(), file, b"\r\n"].concat());
         }
-        let end = format!("{}{}\r\n--{BOUNDARY}--\r\n", head("request"), self.premise());
+        let end = format!("{}{}\r\n--{BOUNDARY}--\r\n", head("request"), self.conditioning());
         body.extend(end.as_bytes());
         let content_type = format!("multipart/form-data; boundary={BOUNDARY}");
         Request::post(&self.predict_path(), &content_type, &body)
@@ -88,15 +88,15 @@ impl Material {
         format!("/v1/models/{}/predict", self.model)
     }
 
-    fn premise(&self) -> Value {
-        let mut premise = json!({});
+    fn conditioning(&self) -> Value {
+        let mut conditioning = json!({});
         if let Some(count) = self.spec.action_inputs() {
-            premise["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
+            conditioning["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
         }
         if let Some(count) = self.spec.state_inputs() {
-            premise["state"] = json!(vec![0.1; count]);
+            conditioning["state"] = json!(vec![0.1; count]);
         }
-        premise
+        conditioning
     }
 }
 

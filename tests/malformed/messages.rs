@@ -5,13 +5,13 @@ use foreframe::server::protocol::{ClientMessage, Codec};
 use proptest::prelude::*;
 use proptest::sample::Index;
 
-use crate::corpus::samples;
+use crate::corpus::files;
 use crate::mutation::{mutated, mutations};
-use crate::{alone, within};
+use crate::{exclusive, within_memory};
 
 /// Bytes of memory for each byte of a message at most, and beside them: what it holds, and a list of lists of numbers.
-const PER_BYTE: usize = 4;
-const BESIDE: usize = 1 << 20;
+const BYTES_PER_BYTE: usize = 4;
+const BASE_BYTES: usize = 1 << 20;
 
 fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     if is_text {
@@ -26,9 +26,9 @@ fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
 
 /// What becomes of a message; an error names the sub-protocol.
 fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, String> {
-    let limit = BESIDE + PER_BYTE * bytes.len();
+    let limit = BASE_BYTES + BYTES_PER_BYTE * bytes.len();
     let (codec, message) = message(is_text, bytes);
-    let decoded = within(limit, name, || {
+    let decoded = within_memory(limit, name, || {
         codec.decode(&message).map_err(|error| error.to_string())
     });
     if let Err(error) = &decoded {
@@ -39,26 +39,26 @@ fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, St
 
 #[test]
 fn corpus_messages_are_accepted_or_refused_as_named() {
-    let _alone = alone();
-    for sample in samples("messages") {
-        let decoded = decode(&sample.name, sample.is("json"), sample.bytes.clone());
-        assert_eq!(decoded.is_ok(), sample.part(0) == "ok", "{}: {decoded:?}", sample.name);
+    let _alone = exclusive();
+    for file in files("messages") {
+        let decoded = decode(&file.name, file.is("json"), file.bytes.clone());
+        assert_eq!(decoded.is_ok(), file.part(0) == "ok", "{}: {decoded:?}", file.name);
     }
 }
 
 proptest! {
     #[test]
     fn mutated_messages_are_decoded_or_refused(which: Index, mutations in mutations()) {
-        let _alone = alone();
-        let samples = samples("messages");
-        let sample = which.get(&samples);
-        let _ = decode(&sample.name, sample.is("json"), mutated(&sample.bytes, &mutations));
+        let _alone = exclusive();
+        let files = files("messages");
+        let file = which.get(&files);
+        let _ = decode(&file.name, file.is("json"), mutated(&file.bytes, &mutations));
     }
 }
 
 #[test]
 fn decoding_memory_is_bounded_by_the_message_length() {
-    let _alone = alone();
+    let _alone = exclusive();
     let filled = |head: &[u8], item: &[u8]| [head, &item.repeat((1 << 20) / item.len())].concat();
     for (is_text, bytes) in [
         (true, filled(br#"{"type":"frame","plan":["#, b"[],")),

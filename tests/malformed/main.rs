@@ -1,5 +1,5 @@
 //! Bad input through the real entry points: every file of `tests/corpus`, and mutations of each. Nothing panics, every answer
-//! is the contract's, and memory stays within what [`within`] is told. A binary of its own, since its allocator counts.
+//! is the contract's, and memory stays within the limit given to [`within_memory`]. A binary of its own, since its allocator counts.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod bodies;
@@ -13,7 +13,7 @@ mod mutation;
 #[path = "../it/service.rs"]
 #[allow(dead_code)]
 mod service;
-mod world;
+mod test_service;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -23,14 +23,14 @@ use peak_alloc::PeakAlloc;
 static ALLOCATOR: PeakAlloc = PeakAlloc;
 
 /// What is allocated is counted for the whole process, so one test runs at a time.
-static ALONE: Mutex<()> = Mutex::new(());
+static EXCLUSIVE: Mutex<()> = Mutex::new(());
 
-fn alone() -> MutexGuard<'static, ()> {
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+fn exclusive() -> MutexGuard<'static, ()> {
+    EXCLUSIVE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Runs what shall take at most that many bytes of memory at a time, beyond what is held already.
-fn within<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) -> T {
+fn within_memory<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) -> T {
     ALLOCATOR.reset_peak_usage();
     let before = ALLOCATOR.current_usage();
     let result = work();
@@ -44,7 +44,7 @@ fn within<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) -> T {
 
 #[test]
 fn the_memory_check_fails_above_its_limit() {
-    let _alone = alone();
-    let greedy = || within(1 << 20, "a vector", || std::hint::black_box(vec![0u8; 2 << 20]));
+    let _alone = exclusive();
+    let greedy = || within_memory(1 << 20, "a vector", || std::hint::black_box(vec![0u8; 2 << 20]));
     assert!(std::panic::catch_unwind(greedy).is_err());
 }

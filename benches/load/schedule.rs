@@ -12,13 +12,13 @@ pub(crate) struct Tick {
 
 /// When ticks come: evenly from `begin` on.
 #[derive(Clone, Copy)]
-pub(crate) struct Pace {
+pub(crate) struct Schedule {
     pub(crate) begin: Instant,
     pub(crate) rate_hz: f64,
     pub(crate) count: u64,
 }
 
-impl Pace {
+impl Schedule {
     pub(crate) fn lasting(begin: Instant, rate_hz: f64, time: Duration) -> Self {
         Self {
             begin,
