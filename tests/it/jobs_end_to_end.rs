@@ -1,7 +1,6 @@
 //! The real work of jobs over HTTP: what is collected trains models, whose versions serve, are measured and deleted.
 
 use std::path::Path;
-use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::Request;
@@ -117,32 +116,6 @@ async fn a_collected_data_set_trains_a_served_model() {
     let body = json!({"kind": "evaluate", "model": "fresh", "version": 9, "dataset": "seen"});
     let unknown = post(&app, JOBS, &body).await.detail(422);
     assert_eq!(unknown, "version: there is no version \"9\"; there are: 1");
-}
-
-#[tokio::test]
-async fn the_jobs_in_the_readme_succeed() {
-    let dir = tempfile::tempdir().unwrap();
-    let app = app(dir.path(), ServerConfig::default());
-    let readme = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md")).unwrap();
-    let bodies = readme
-        .lines()
-        .filter_map(|line| line.trim().strip_prefix("-d '")?.strip_suffix('\''));
-    let jobs: Vec<Value> = bodies
-        .map(|body| serde_json::from_str(body).unwrap())
-        .filter(|body: &Value| body["kind"].is_string())
-        .collect();
-    assert!(jobs.len() >= 2, "{jobs:?}");
-    for job in jobs {
-        // Longer than the others: it trains in earnest.
-        tokio::time::timeout(Duration::from_mins(10), async {
-            let taken = post(&app, JOBS, &job).await;
-            let path = format!("{JOBS}/{}/events", taken.json()["id"].as_str().unwrap());
-            let events = get(&app, &path).await;
-            assert!(String::from_utf8_lossy(&events.body).contains("\"state\":\"succeeded\""));
-        })
-        .await
-        .unwrap();
-    }
 }
 
 #[tokio::test]

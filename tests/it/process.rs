@@ -94,7 +94,14 @@ pub(crate) struct RunningServer {
 
 impl RunningServer {
     pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
-        let program = Program::start(dir, &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat());
+        Self::of(Program::start(
+            dir,
+            &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat(),
+        ))
+    }
+
+    /// Waits until a program that serves is ready.
+    pub(crate) fn of(program: Program) -> Self {
         let line = &program.line;
         let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
         let server = Self {
@@ -103,7 +110,7 @@ impl RunningServer {
         };
         let deadline = Instant::now() + TIMEOUT;
         while !server.get("/readyz").starts_with("HTTP/1.1 200") {
-            assert!(Instant::now() < deadline, "the server did not get ready");
+            assert!(Instant::now() < deadline, "the server did not become ready");
             std::thread::sleep(Duration::from_millis(10));
         }
         server
