@@ -1,4 +1,4 @@
-//! Sessions and requests that come and go.
+//! Many short sessions and requests, to find leaks.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -17,42 +17,42 @@ use crate::process_usage::Usage;
 use crate::server::{Server, Target};
 use crate::session::{self, Session};
 
-/// Parts of the load, after each of which memory is told.
+/// Number of parts of the load; memory is printed after each.
 const PARTS: u64 = 5;
-/// What comes before it counts is a tenth, at most so many sessions; of requests ten times that.
+/// The warm-up is a tenth of the load, at most this many sessions, and ten times as many requests.
 const MAX_WARM_UP: u64 = 1000;
-/// How long the server may take to notice that connections ended, and to let idle threads go.
+/// How long the server may take to notice closed connections and to end idle threads.
 const SETTLE_LIMIT: Duration = Duration::from_secs(20);
-/// How long memory is left alone before it is looked at.
+/// Idle time before memory is measured.
 const IDLE_TIME: Duration = Duration::from_secs(1);
 
 #[derive(clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
     target: Target,
-    /// Sessions to open, to stream on, to close and to delete
+    /// Sessions to open, stream on, close and delete
     #[arg(long, default_value_t = 500)]
     sessions: u64,
-    /// Requests of many kinds after that, a fifth of them predictions
+    /// Requests of many kinds after the sessions, a fifth of them predictions
     #[arg(long, default_value_t = 5000)]
     requests: u64,
-    /// Frames of each session
+    /// Frames per session
     #[arg(long, default_value_t = 6)]
     frames: u64,
-    /// How many do so at a time, each on a kept connection
+    /// Concurrent clients, each with a kept-alive connection
     #[arg(long, default_value_t = 8)]
     workers: usize,
-    /// Bound: growth of the server's memory after the warm-up
+    /// Bound: growth of the server's memory in MB after the warm-up
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
 }
 
-/// What is done again and again.
+/// The repeated work.
 #[derive(Clone)]
 enum Task {
-    /// A session from its opening to its deletion, with so many frames.
+    /// A session from opening to deletion, with this many frames.
     Session(u64),
-    /// Requests by turns, each with the status that it shall have.
+    /// Requests in turn, each with its expected status.
     Requests(Arc<[(Request, u16)]>),
 }
 
@@ -82,7 +82,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     tokio::time::sleep(IDLE_TIME).await;
     let before = server.process.usage();
     println!("after the warm-up: {}", list(&before));
-    // What starting took is given back in time: the first part may find less than the warm-up left.
+    // The server returns memory of its start with a delay: after the first part it may use less than after the warm-up.
     let mut least_mb = before.rss_mb;
     for (task, count, _, name) in &tasks {
         let (since, part) = (Instant::now(), count / PARTS);
@@ -98,26 +98,26 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     }
     bounds.check(
         faults.is_empty(),
-        format!("every request and every frame was answered as it should {faults:?}"),
+        format!("every request and every frame was answered as expected; faults: {faults:?}"),
     );
     let after = settled(&server, &before).await;
     println!("at the end: {}", list(&after));
     let growth_mb = after.rss_mb - least_mb;
-    let what = format!("memory grew by {growth_mb:.1} MB, at most {} MB", args.growth_mb);
+    let what = format!("memory grew by {growth_mb:.1} MB; limit {} MB", args.growth_mb);
     bounds.check(growth_mb <= args.growth_mb, what);
-    bounds.check(after.descriptors <= before.descriptors, "no descriptor was lost");
-    bounds.check(after.threads <= before.threads, "no thread was lost");
+    bounds.check(after.descriptors <= before.descriptors, "no file descriptor leaked");
+    bounds.check(after.threads <= before.threads, "no thread leaked");
     server.check(bounds);
 }
 
 fn list(usage: &Usage) -> String {
     format!(
-        "{:.1} MB, {} descriptors, {} threads",
+        "{:.1} MB, {} file descriptors, {} threads",
         usage.rss_mb, usage.descriptors, usage.threads
     )
 }
 
-/// What the server takes when it rests: no more than before, or what it is after a while.
+/// The idle server's usage, once it is no more than before or the time limit has passed.
 async fn settled(server: &Server, before: &Usage) -> Usage {
     let since = Instant::now();
     loop {
@@ -130,7 +130,7 @@ async fn settled(server: &Server, before: &Usage) -> Usage {
     }
 }
 
-/// Cheap ones and middling ones, predictions and refusals among them.
+/// Cheap and expensive requests, among them predictions and refusals.
 fn kinds(workload: &Workload) -> Arc<[(Request, u16)]> {
     let get = |path: &str, status| (Request::get(path), status);
     Arc::new([
@@ -147,7 +147,7 @@ fn kinds(workload: &Workload) -> Arc<[(Request, u16)]> {
     ])
 }
 
-/// Does so many tasks, several at a time; what went wrong.
+/// Repeats a task `count` times with several workers, and returns the faults.
 async fn many(
     workers: usize,
     address: SocketAddr,
@@ -185,11 +185,11 @@ async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::h
     if answer.status == status {
         Ok(answer)
     } else {
-        Err(format!("{} for {status}: {}", answer.status, answer.text()))
+        Err(format!("status {} instead of {status}: {}", answer.status, answer.text()))
     }
 }
 
-/// Opens a session and its stream, has a prediction of each frame that fills the context, closes and deletes.
+/// Opens a session and its stream, sends frames, checks each answer, closes the stream and deletes the session.
 async fn session(http: &mut Http, address: SocketAddr, workload: &Workload, frames: u64) -> Result<(), String> {
     let session = Session::of(&ask(http, &Session::request(workload.model(), OnLate::Predict), 201).await?);
     let socket = session::connect(address, &session.stream_path()).await;
@@ -212,7 +212,7 @@ async fn session(http: &mut Http, address: SocketAddr, workload: &Workload, fram
         Some(ServerMessage::Closing { .. }) => {}
         other => return Err(format!("the close was answered with {other:?}")),
     }
-    // The rest of the closing, so that no socket is cut off.
+    // Read until the end, so that the closing handshake completes.
     while session::receive(&mut socket).await.is_some() {}
     ask(http, &session.deletion(), 204).await.map(drop)
 }

@@ -1,4 +1,4 @@
-//! A robot: sends frames when it is told to, and notes what comes back.
+//! A robot: sends frames at given times, and records the answers.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -10,20 +10,20 @@ use tokio::sync::mpsc;
 use crate::workload::{self, Workload};
 use crate::session::{self, Socket};
 
-/// What received of a robot's frames, or of many robots'.
+/// Answers to the frames of one robot or of many.
 #[derive(Default)]
 pub(crate) struct FrameCounts {
     pub(crate) sent: u64,
     /// Frames that only filled the context.
     pub(crate) buffering: u64,
-    /// Usage in without a prediction, since a newer one waited.
+    /// Answered with `overtaken`: a newer frame was waiting.
     pub(crate) overtaken: u64,
-    /// Refused because the server is too busy.
+    /// Refused because the server is overloaded.
     pub(crate) overloaded: u64,
-    /// Refused for other reasons, and why the first was.
+    /// Refused for other reasons.
     pub(crate) refused: u64,
     pub(crate) first_refusal: Option<String>,
-    /// Left out because they were read too slowly.
+    /// Predictions that the server dropped because this client read too slowly.
     pub(crate) dropped: u64,
     pub(crate) answers: Vec<Answer>,
 }
@@ -31,22 +31,22 @@ pub(crate) struct FrameCounts {
 /// A prediction.
 #[derive(Clone, Copy)]
 pub(crate) struct Answer {
-    /// When its frame was to be sent.
+    /// When its frame was scheduled.
     pub(crate) scheduled: Instant,
-    /// When its frame was in fact sent.
+    /// When its frame was sent.
     pub(crate) sent: Instant,
-    /// When it received.
+    /// When the prediction was received.
     pub(crate) received: Instant,
-    /// Of that the model's computation.
+    /// Time that the model computed.
     pub(crate) compute: Duration,
 }
 
 impl FrameCounts {
-    /// Frames of which nothing was heard again.
+    /// Frames without an answer.
     pub(crate) fn unanswered(&self) -> u64 {
-        let heard =
+        let answered =
             self.answers.len() as u64 + self.buffering + self.overtaken + self.overloaded + self.refused + self.dropped;
-        self.sent.saturating_sub(heard)
+        self.sent.saturating_sub(answered)
     }
 
     pub(crate) fn add(&mut self, other: Self) {
@@ -61,8 +61,8 @@ impl FrameCounts {
     }
 }
 
-/// Sends a frame at each send_time, which is the time that it was scheduled for, and closes after the last. Calls `answered`
-/// after each answer.
+/// Sends a frame for each scheduled time that it receives, and closes the stream after the last. Calls `answered` after
+/// each answer.
 pub(crate) async fn run(
     socket: Socket,
     workload: Arc<Workload>,
@@ -70,7 +70,7 @@ pub(crate) async fn run(
     mut answered: impl FnMut(),
 ) -> FrameCounts {
     let (mut sender, mut receiver) = socket.split();
-    // Of every frame when it was to be sent, and when it was.
+    // When each frame was scheduled, and when it was sent.
     let log = Mutex::new(Vec::<(Instant, Instant)>::new());
     let sending = async {
         while let Some(scheduled) = send_times.recv().await {
@@ -81,7 +81,7 @@ pub(crate) async fn run(
             }
         }
         let close = workload::message(&ClientMessage::Close(CloseMessage {}));
-        // If it is gone, the receiver knows as well.
+        // If the stream has ended, the receiver notices it as well.
         let _ = sender.send(close).await;
     };
     let receiving = async {

@@ -1,4 +1,4 @@
-//! Many robots at once.
+//! Many robots that stream at the same time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,37 +18,36 @@ use crate::robot::{self, Answer, FrameCounts};
 use crate::server::Server;
 use crate::session::{self, Session};
 
-/// Between the last robot's being ready and the first frame.
+/// Time between the last robot's connection and the first frame.
 const START_DELAY: Duration = Duration::from_millis(100);
 
 /// When robots send.
 #[derive(Clone, Copy)]
 pub(crate) enum SendMode {
-    /// At times, this many frames a second and robot, however late the socket takes them.
+    /// At a fixed rate in frames per second and robot, however late the socket accepts them.
     Scheduled(f64),
-    /// The same, but a frame that the socket has no room for when the next one is due is never sent: robots want the
-    /// present.
+    /// At a fixed rate, but a frame is dropped if the socket is still busy when it is due: a robot wants predictions from
+    /// new frames.
     ScheduledOrDropped(f64),
-    /// This many frames ahead of the answers.
+    /// Always this many frames ahead of the answers.
     ClosedLoop(usize),
 }
 
-/// What robots do: some time that does not count, for a hundred sockets that open at once are another question, and
-/// some that does.
+/// A load of streaming robots. The warm-up is not measured, so that opening many sockets does not influence the latencies.
 #[derive(Clone, Copy)]
 pub(crate) struct RobotLoad {
     pub(crate) sessions: usize,
     pub(crate) mode: SendMode,
-    /// What frames mean that newer ones have overtaken.
+    /// What the server does with frames that newer ones have overtaken.
     pub(crate) on_late: OnLate,
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
 }
 
-/// What received of it.
+/// Measurements of a load.
 pub(crate) struct RobotLoadResult {
     pub(crate) counts: FrameCounts,
-    /// Frames that were never sent, since the socket had no room.
+    /// Frames that were not sent because the socket was busy.
     pub(crate) not_sent: u64,
     /// Percent of a core.
     pub(crate) server_cpu: f64,
@@ -64,7 +63,7 @@ impl RobotLoad {
         for _ in 0..self.sessions {
             let session = Session::open(&mut http, workload.model(), self.on_late).await;
             let socket = session::connect(server.address, &session.stream_path()).await;
-            sockets.push(socket.expect("a stream"));
+            sockets.push(socket.expect("the stream opens"));
             sessions.push(session);
         }
         let begin = Instant::now() + START_DELAY;
@@ -111,26 +110,26 @@ impl RobotLoad {
         }
     }
 
-    /// What a robot does after an answer: in a closed loop, the next frame.
+    /// Called after each answer. In a closed loop it sends the next frame.
     fn answered(&self, send_time: mpsc::Sender<Instant>, to: Instant) -> impl FnMut() + Send + use<> {
         let mut send_time = matches!(self.mode, SendMode::ClosedLoop(_)).then_some(send_time);
         move || {
             let now = Instant::now();
             send_time = send_time.take().filter(|_| now < to);
             if let Some(send_time) = &send_time {
-                // Full only if the socket has no room either; then there are send_times enough.
+                // The channel is full only if the socket is busy; then enough frames are waiting.
                 let _ = send_time.try_send(now);
             }
         }
     }
 
-    /// Starts the robots, in turn, as robots are; counts the frames that are passed back.
+    /// Starts sending, one robot after the other, and counts the frames that are not sent.
     fn start(&self, begin: Instant, send_times: Vec<mpsc::Sender<Instant>>) -> Arc<AtomicU64> {
         let not_sent = Arc::new(AtomicU64::new(0));
         match self.mode {
             SendMode::ClosedLoop(ahead) => {
                 for send_time in send_times.iter().flat_map(|send_time| std::iter::repeat_n(send_time, ahead)) {
-                    send_time.try_send(begin).expect("room for the first send_times");
+                    send_time.try_send(begin).expect("the channel has room for the first frames");
                 }
             }
             SendMode::Scheduled(rate_hz) | SendMode::ScheduledOrDropped(rate_hz) => {
@@ -149,7 +148,7 @@ impl RobotLoad {
 }
 
 impl RobotLoadResult {
-    /// Of the predictions whose frames were due in the time that counts.
+    /// Latencies of the predictions whose frames were scheduled in the measured time.
     pub(crate) fn latencies(&self, of: impl Fn(&Answer) -> Duration) -> Latencies {
         let counted = self.counts.answers.iter();
         Latencies::of(
@@ -163,12 +162,12 @@ impl RobotLoadResult {
         self.latencies(|answer| answer.received - answer.scheduled)
     }
 
-    /// The server's processor time for each of the predictions that received in the time that counts, in microseconds.
+    /// Microseconds of the server's processor time per prediction in the measured time.
     pub(crate) fn each_us(&self) -> f64 {
         1e4 * self.server_cpu / self.goodput_hz()
     }
 
-    /// Predictions a second that received in the time that counts.
+    /// Predictions per second received in the measured time.
     pub(crate) fn goodput_hz(&self) -> f64 {
         let received = |answer: &&Answer| (self.from..self.to).contains(&answer.received);
         self.counts.answers.iter().filter(received).count() as f64 / (self.to - self.from).as_secs_f64()

@@ -1,4 +1,4 @@
-//! Robots at a fixed rate.
+//! Robots that stream at a fixed frame rate.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,32 +10,32 @@ use crate::robots::{SendMode, RobotLoad, RobotLoadResult};
 use crate::workload::Workload;
 use crate::server::{Server, Target};
 
-/// A search ends when the answer is known to this share.
+/// Relative precision of the search.
 const FIND_PRECISION: f64 = 0.05;
 
 #[derive(clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
     target: Target,
-    /// Sessions at a time; with --find, the number to begin with, which has to hold
+    /// Concurrent sessions; with --find, the number to start with, which must keep the bound
     #[arg(long, default_value_t = 16)]
     sessions: usize,
-    /// Frames a second of each session
+    /// Frames per second of each session
     #[arg(long, default_value_t = 30.0)]
     rate_hz: f64,
-    /// How long to measure
+    /// Seconds to measure
     #[arg(long, default_value_t = 10.0)]
     seconds: f64,
-    /// How long to send before that; frames of that time are not counted
+    /// Seconds of warm-up before the measurement
     #[arg(long, default_value_t = 2.0)]
     warm_up_s: f64,
-    /// Bound of the 99th percentile of the latency from schedule to prediction
+    /// Bound: 99th percentile of the latency from schedule to prediction
     #[arg(long, default_value_t = 33.0)]
     p99_ms: f64,
     /// Search for the largest number of sessions that keeps the bound
     #[arg(long)]
     find: bool,
-    /// The search's end
+    /// Largest number of sessions to try
     #[arg(long, default_value_t = 512, requires = "find")]
     find_max: usize,
 }
@@ -63,7 +63,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
         bounds.check(all_predicted(&result), "every frame was predicted");
     }
     println!(
-        "the server's memory: {:.0} MB at most",
+        "peak memory of the server: {:.0} MB",
         server.process.usage().peak_rss_mb
     );
     server.check(bounds);
@@ -89,7 +89,7 @@ fn all_predicted(result: &RobotLoadResult) -> bool {
 fn report(args: &Args, result: &RobotLoadResult) {
     let (counts, from_schedule) = (&result.counts, result.since_schedule());
     println!(
-        "{} sessions at {} Hz for {} s: {} frames sent, {} predicted, of these {} counted; {} refused, {} dropped, {} \
+        "{} sessions at {} Hz for {} s: {} frames sent, {} predicted, {} of them measured; {} refused, {} dropped, {} \
          unanswered",
         args.sessions,
         args.rate_hz,
@@ -105,18 +105,18 @@ fn report(args: &Args, result: &RobotLoadResult) {
     let from_sending = result.latencies(|answer| answer.received - answer.sent);
     println!("from sending to prediction:  {from_sending}");
     println!(
-        "of it the model's own time:  {}",
+        "time in the model:           {}",
         result.latencies(|answer| answer.compute)
     );
     let beyond = result.latencies(|answer| (answer.received - answer.sent).saturating_sub(answer.compute));
-    println!("beyond the model's own time: {beyond}");
+    println!("time outside the model:      {beyond}");
     println!(
-        "the server takes {:.0} % of a core, this program {:.0} %",
+        "the server uses {:.0} % of a core, this program {:.0} %",
         result.server_cpu, result.own_cpu
     );
 }
 
-/// Doubles until the bound breaks, then halves the way between; what breaks it has a second try.
+/// Doubles the number of sessions until the bound fails, then bisects. A failed number is tried a second time.
 async fn find(args: &Args, server: &Server, workload: &Arc<Workload>, bounds: &mut Bounds) {
     let (mut passed, mut failed, mut sessions) = (0, None, args.sessions.clamp(1, args.find_max));
     loop {
@@ -134,7 +134,7 @@ async fn find(args: &Args, server: &Server, workload: &Arc<Workload>, bounds: &m
         };
     }
     println!(
-        "{passed} sessions at {} Hz with p99 within {} ms",
+        "{passed} sessions at {} Hz keep p99 within {} ms",
         args.rate_hz, args.p99_ms
     );
     bounds.check(passed >= args.sessions, format!("at least {} sessions", args.sessions));
@@ -144,7 +144,7 @@ async fn passes(args: &Args, sessions: usize, server: &Server, workload: &Arc<Wo
     let result = args.load(sessions).run(server, workload).await;
     let latencies = result.since_schedule();
     println!(
-        "{sessions} sessions: {latencies}; {} of {} frames not predicted; the server takes {:.0} % of a core",
+        "{sessions} sessions: {latencies}; {} of {} frames not predicted; the server uses {:.0} % of a core",
         result.counts.sent - result.counts.buffering - result.counts.answers.len() as u64,
         result.counts.sent,
         result.server_cpu

@@ -1,4 +1,4 @@
-//! What is sent: the frames in `examples`, as a model takes them.
+//! Frames and requests made from the frames in `examples`, in the form that a model takes.
 
 use std::fs;
 use std::path::Path;
@@ -16,20 +16,20 @@ use crate::http::Request;
 const FRAMES: usize = 15;
 const BOUNDARY: &str = "frame-by-frame";
 
-/// Frames and requests for one model.
+/// The frames of `examples` and the model that they are sent to.
 pub(crate) struct Workload {
     model: String,
     spec: ModelSpec,
-    /// The frames' files.
+    /// The frames as PNG files.
     files: Vec<Vec<u8>>,
-    /// Their pixels.
+    /// The frames as raw pixels.
     images: Vec<Vec<u8>>,
 }
 
 impl Workload {
     pub(crate) fn of(model: &str) -> Self {
         let project = Path::new(env!("CARGO_MANIFEST_DIR"));
-        let manifest = manifest::read(&project.join("models").join(model)).expect("a shipped model");
+        let manifest = manifest::read(&project.join("models").join(model)).expect("the model is shipped");
         let file = |index| fs::read(project.join(format!("examples/frames/frame-{index:03}.png"))).unwrap();
         let files: Vec<Vec<u8>> = (0..FRAMES).map(file).collect();
         let pixels = |file: &Vec<u8>| codec::decode(file).unwrap().pixels().to_vec();
@@ -45,12 +45,12 @@ impl Workload {
         &self.model
     }
 
-    /// Frames that a session takes before it predicts, and one more.
+    /// Frames that a session takes before its first prediction.
     pub(crate) fn context(&self) -> u64 {
         self.spec.context as u64
     }
 
-    /// A frame of a stream.
+    /// The stream message with frame `seq`.
     pub(crate) fn frame(&self, seq: u64) -> Message {
         message(&ClientMessage::Frame(FrameMessage {
             seq,
@@ -63,7 +63,7 @@ impl Workload {
         }))
     }
 
-    /// A prediction with images as base64.
+    /// A prediction request in JSON with base64 images.
     pub(crate) fn predict_json(&self) -> Request {
         let mut body = self.conditioning();
         let images = self.files.iter().take(self.spec.context);
@@ -71,7 +71,7 @@ impl Workload {
         Request::json(&self.predict_path(), &body)
     }
 
-    /// The same with images as files.
+    /// The same request as a multipart form.
     pub(crate) fn predict_form(&self) -> Request {
         let mut body = Vec::new();
         let head = |name: &str| format!("--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n");

@@ -1,4 +1,4 @@
-//! Too many requests for predictions.
+//! Overload by prediction requests.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,17 +16,17 @@ use crate::schedule::Schedule;
 use crate::process_usage::CpuShare;
 use crate::server::Server;
 
-/// Connections that ask again and again, in search of the peak.
+/// Numbers of connections tried to find the peak.
 const LEVELS: [usize; 3] = [16, 64, 128];
 
-/// What received of requests.
+/// Outcomes of requests.
 #[derive(Default)]
 struct RequestCounts {
     sent: u64,
     answered: Vec<Duration>,
     /// 429 and 503 that say when to try again.
     refused: u64,
-    /// All that should not be: other answers, or none.
+    /// Other answers, or none, with their counts.
     faults: BTreeMap<String, u64>,
 }
 
@@ -39,8 +39,8 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
         let answered = closed(level, &server, &request, args.peak_time()).await.answered.len();
         let (goodput_hz, each_us) = (answered as f64 / args.peak_s, cpu.each_us(answered));
         println!(
-            "requests: {goodput_hz:.0} predictions/s of {level} connections that ask again and again, for {each_us:.0} µs \
-             of the server's processor time each"
+            "requests: {goodput_hz:.0} predictions/s with {level} connections in a closed loop; {each_us:.0} µs of server \
+             processor time per prediction"
         );
         peak_hz = peak_hz.max(goodput_hz);
     }
@@ -51,20 +51,20 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
     let latencies = Latencies::of(counts.answered);
     let (goodput_hz, each_us) = (latencies.len() as f64 / args.seconds, cpu.each_us(latencies.len()));
     println!(
-        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s for {each_us:.0} µs each, {} of {} \
-         refused with Retry-After, {not_sent} not sent for want of a connection; predictions {latencies}",
+        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s, {each_us:.0} µs each; {} of {} \
+         refused with Retry-After; {not_sent} not sent because no connection was free; latency {latencies}",
         args.seconds, counts.refused, counts.sent
     );
     args.check_goodput(goodput_hz, peak_hz, bounds);
     let faults = counts.faults;
     bounds.check(
         faults.is_empty(),
-        format!("every request was predicted or refused with Retry-After {faults:?}"),
+        format!("every request was predicted or refused with Retry-After; faults: {faults:?}"),
     );
     args.check_memory(&memory.await.unwrap(), &mut server, bounds);
 }
 
-/// So many connections that ask again and again.
+/// Sends requests in a closed loop on each connection.
 async fn closed(connections: usize, server: &Server, request: &Request, time: Duration) -> RequestCounts {
     let until = Instant::now() + time;
     let mut asking = JoinSet::new();
@@ -80,7 +80,7 @@ async fn closed(connections: usize, server: &Server, request: &Request, time: Du
     sum(asking).await
 }
 
-/// Requests at times, each on a connection that is free; and how many found none.
+/// Sends scheduled requests on free connections. Returns also how many found no free connection.
 async fn open(args: &Args, rate_hz: f64, server: &Server, request: &Request) -> (RequestCounts, u64) {
     let begin = Instant::now();
     let (until, limit) = (begin + args.time(), args.connections);
@@ -125,7 +125,7 @@ async fn sum(asking: JoinSet<RequestCounts>) -> RequestCounts {
 }
 
 impl RequestCounts {
-    /// Asks and notes what received; a prediction counts if it received in time.
+    /// Sends a request and records the outcome. A prediction counts if it is received before `until`.
     async fn ask(&mut self, http: &mut Http, request: &Request, until: Instant) {
         self.sent += 1;
         let asked = Instant::now();

@@ -1,4 +1,4 @@
-//! Too many frames.
+//! Overload by frames of streams.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,9 +14,9 @@ use crate::server::Server;
 use crate::session;
 
 const WARM_UP: Duration = Duration::from_millis(500);
-/// Frames that a robot of the peak is ahead of the answers.
+/// Frames that each robot is ahead of its answers when the peak is measured.
 const AHEAD: usize = 2;
-/// How often one stream more than there may be is tried.
+/// Period of the attempts to open a stream over the limit.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
 pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
@@ -35,8 +35,8 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
         let result = load.run(&server, &workload).await;
         let goodput_hz = result.goodput_hz();
         println!(
-            "streams: {goodput_hz:.0} predictions/s of {sessions} sessions that keep {AHEAD} frames ahead, for {:.0} µs of \
-             the server's processor time each",
+            "streams: {goodput_hz:.0} predictions/s with {sessions} sessions in a closed loop, {AHEAD} frames ahead; {:.0} µs of \
+             server processor time per prediction",
             result.each_us()
         );
         peak_hz = peak_hz.max(goodput_hz);
@@ -53,8 +53,8 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
     let (result, (refused_streams, unexpected)) = tokio::join!(load.run(&server, &workload), open_over_limit(args, &server));
     let (goodput_hz, counts) = (result.goodput_hz(), &result.counts);
     println!(
-        "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s for {:.0} µs each; of {} frames {} \
-         overtaken, {} refused, {} dropped, {} not sent for want of room in the socket; {refused_streams} streams over the limit refused; predictions {}",
+        "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s, {:.0} µs each; of {} frames {} \
+         overtaken, {} refused, {} dropped, {} not sent because the socket was busy; {refused_streams} streams over the limit refused; latency {}",
         args.seconds,
         result.each_us(),
         counts.sent + result.not_sent,
@@ -74,21 +74,21 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
     let first = counts.first_refusal.as_deref().unwrap_or_default();
     bounds.check(
         lost == 0,
-        format!("every frame that was sent was predicted, overtaken or refused as one too many {first}"),
+        format!("every sent frame was predicted, overtaken or refused as overload {first}"),
     );
     bounds.check(
         unexpected == 0 && refused_streams > 0,
-        "every stream over the limit was told when to try again",
+        "every stream over the limit was refused with Retry-After",
     );
     args.check_memory(&memory.await.unwrap(), &mut server, bounds);
 }
 
-/// Tries to open a stream while there are as many as there may be: how often it was refused, and how often without
-/// being told when to try again.
+/// Tries to open streams while the limit is reached. Returns how many were refused with `Retry-After`, and how many had
+/// another outcome.
 async fn open_over_limit(args: &Args, server: &Server) -> (u64, u64) {
     let path = format!("/v1/models/{}/stream", args.target.model);
     let (mut refused, mut unexpected) = (0, 0);
-    // When all have been opened, and none has closed yet.
+    // At this time all streams are open, and none has closed yet.
     tokio::time::sleep(WARM_UP + args.time() / 4).await;
     for _ in 0..(args.seconds / 2.0 / RETRY_PERIOD.as_secs_f64()) as usize {
         match session::connect(server.address, &path).await.map_err(|error| *error) {
