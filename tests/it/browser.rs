@@ -28,7 +28,7 @@ fn chromium() -> Option<PathBuf> {
     paths.find(|path| path.is_file())
 }
 
-/// A page in a browser.
+/// A page in a headless browser.
 struct Page {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
     session: String,
@@ -36,7 +36,7 @@ struct Page {
     _browser: Browser,
 }
 
-/// A browser that ends with the test.
+/// A browser process. Dropping it kills the process.
 struct Browser(Child);
 
 impl Drop for Browser {
@@ -70,12 +70,12 @@ impl Page {
         let mut lines = BufReader::new(browser.stderr.take().unwrap()).lines();
         let browser = Browser(browser);
         let endpoint = loop {
-            let line = lines.next().expect("Chromium ended at its start").unwrap();
+            let line = lines.next().expect("Chromium starts").unwrap();
             if let Some(endpoint) = line.strip_prefix("DevTools listening on ") {
                 break endpoint.to_owned();
             }
         };
-        // A full pipe would hold the browser up.
+        // A full pipe would block the browser.
         std::thread::spawn(move || lines.for_each(drop));
         let (socket, _) = tokio_tungstenite::connect_async(endpoint).await.unwrap();
         let mut page = Self {
@@ -117,7 +117,7 @@ impl Page {
         self.call("Runtime.evaluate", params).await["result"]["value"].take()
     }
 
-    /// Asks the page until the expression is true.
+    /// Evaluates the expression repeatedly until it is true.
     async fn wait_until(&mut self, expression: &str) {
         let started = Instant::now();
         while self.value(expression).await != json!(true) {
@@ -127,7 +127,7 @@ impl Page {
         }
     }
 
-    /// The whole page as on a screen of that width, which it must fit.
+    /// Saves a screenshot of the whole page and checks that the page is not wider than the screen.
     async fn screenshot(&mut self, name: &str, width_px: u32, colors: &str) {
         let screen = json!({"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 600});
         self.call("Emulation.setDeviceMetricsOverride", screen).await;
@@ -145,7 +145,7 @@ impl Page {
         );
     }
 
-    /// Types a key into the form and sends it.
+    /// Types an API key into the form and submits it.
     async fn unlock(&mut self, key: &str) {
         let focus = "document.getElementById('key').focus(); document.getElementById('key').select()";
         self.value(focus).await;
@@ -158,7 +158,7 @@ impl Page {
     }
 }
 
-/// Every step has its error, and every picture is there.
+/// True if every step has its error and every image is loaded.
 const IS_COMPLETE: &str =
     "[...document.querySelectorAll('#film #error td')].filter(cell => / %$/.test(cell.textContent)).length === 5
     && [...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)";
@@ -197,7 +197,7 @@ async fn the_page_drives_a_robot_and_shows_predictions() {
         .await;
     page.wait_until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
         .await;
-    // The second job goes on meanwhile.
+    // The second job is still running.
     page.wait_until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
         .await;
     for (width_px, colors) in [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")] {
@@ -239,7 +239,7 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
         addresses.as_str().unwrap().contains("/v1/models") && !addresses.as_str().unwrap().contains("ffk_"),
         "{addresses}"
     );
-    // The tab keeps it.
+    // The tab keeps the key.
     page.call("Page.reload", json!({})).await;
     page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);

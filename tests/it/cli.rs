@@ -1,4 +1,4 @@
-//! The program itself: exit codes and what it says where it can't do what was asked.
+//! The command line: exit codes and error messages.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +12,7 @@ use crate::service;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_foreframe");
 
-/// Exit code and standard error of a command line, run in a directory.
+/// Runs a command line in a directory; returns the exit code and standard error.
 fn run(dir: &Path, line: &str) -> (i32, String) {
     exit_of(Command::new(PROGRAM).args(line.split_whitespace()).current_dir(dir))
 }
@@ -38,7 +38,7 @@ fn succeed(dir: &Path, line: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A small data set under its default name, and models `plain` and `moving` of another frame size.
+/// A directory with a small data set under its default name, and models `plain` and `moving` of another frame size.
 fn working_dir() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     succeed(dir.path(), "collect --trials 3 --frame-size 8");
@@ -152,7 +152,7 @@ fn usage_errors_exit_with_2_and_advice() {
         assert!(code == 2 && text.contains(expected), "{line} ended in {code}: {text}");
     }
     assert_eq!(fs::read_dir(dir.path().join("thesis")).unwrap().count(), 1);
-    // What was refused left nothing that the next try would stumble over.
+    // Refused commands leave no files behind.
     assert!(!dir.path().join("runs").exists() && !dir.path().join("a").exists());
 }
 
@@ -258,7 +258,7 @@ fn damaged_files_exit_with_1_and_the_cause() {
     );
 }
 
-/// Records the shard's bytes as those that were collected.
+/// Changes the recorded hash so that the shard's bytes count as valid.
 fn record_hash(dataset: &Path, shard: &[u8]) {
     let path = dataset.join("meta/foreframe.json");
     let mut stamp: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
@@ -268,7 +268,7 @@ fn record_hash(dataset: &Path, shard: &[u8]) {
     fs::write(&path, stamp.to_string()).unwrap();
 }
 
-/// The system's limit on a file's size stands for a disk without room.
+/// A limit on the file size simulates a full disk.
 #[cfg(unix)]
 #[test]
 fn a_failed_write_leaves_no_data_set() {

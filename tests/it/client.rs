@@ -1,4 +1,4 @@
-//! A client of the service over real sockets, in both sub-protocols, as robots would write one.
+//! A client of the stream over real sockets, in both sub-protocols.
 
 use axum::http::HeaderValue;
 use foreframe::server::ImageBytes;
@@ -15,7 +15,7 @@ use foreframe::server::{App, ImageFormat};
 
 pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
-/// A session as it was opened.
+/// Id and token of an opened session.
 #[derive(Clone)]
 pub(crate) struct SessionHandle {
     pub(crate) id: String,
@@ -62,7 +62,7 @@ impl Client {
             next_seq: 0,
         };
         let ServerMessage::Ready { next_seq, .. } = client.receive().await else {
-            panic!("no ready");
+            panic!("the first message is not `ready`");
         };
         client.next_seq = next_seq;
         Ok(client)
@@ -72,7 +72,7 @@ impl Client {
         self.try_send(message).await.unwrap();
     }
 
-    /// Text, whatever the sub-protocol.
+    /// Sends text in either sub-protocol.
     pub(crate) async fn send_text(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
     }
@@ -89,7 +89,7 @@ impl Client {
         self.receive_or_end().await.unwrap()
     }
 
-    /// The next message, or the code of the close that came in its place; none if the socket just ended.
+    /// The next message, or the code of the close frame; no code if the socket ended without one.
     pub(crate) async fn receive_or_end(&mut self) -> Result<ServerMessage, Option<u16>> {
         let message = tokio::time::timeout(TIMEOUT, self.socket.next()).await.unwrap();
         match message {
@@ -105,20 +105,20 @@ impl Client {
         self.receive().await
     }
 
-    /// Reads until the end: why, and the code.
+    /// Reads to the end; returns the reason and the close code.
     pub(crate) async fn end(&mut self) -> (Option<ClosingReason>, Option<u16>) {
-        let mut why = None;
+        let mut last_reason = None;
         loop {
             match self.receive_or_end().await {
-                Ok(ServerMessage::Closing { reason }) => why = Some(reason),
+                Ok(ServerMessage::Closing { reason }) => last_reason = Some(reason),
                 Ok(_) => {}
-                Err(code) => return (why, code),
+                Err(code) => return (last_reason, code),
             }
         }
     }
 }
 
-/// A frame whose image and numbers follow from its number.
+/// A frame whose image, action and state are derived from its `seq`.
 pub(crate) fn numbered_frame(seq: u64) -> FrameMessage {
     let value = (seq % 7) as f32 - 3.0;
     FrameMessage {

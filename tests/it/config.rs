@@ -1,4 +1,4 @@
-//! The configuration: what goes over what, where values come from, and how wrong ones are refused.
+//! The configuration: precedence, sources of values, and refusals.
 
 use foreframe::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
 use foreframe::telemetry::LogFormat;

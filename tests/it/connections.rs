@@ -1,4 +1,4 @@
-//! What happens to connections that are slow, silent, foreign, or open while the server stops.
+//! Connections that are slow, idle, from other origins, or open during shutdown.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -23,10 +23,10 @@ async fn connect(address: SocketAddr) -> TcpStream {
     TcpStream::connect(address).await.unwrap()
 }
 
-/// Reads until the server closes.
+/// Reads until the server closes the connection.
 async fn read_to_end(client: &mut TcpStream) -> String {
     let mut text = Vec::new();
-    // A reset is an end as well.
+    // A reset counts as the end as well.
     let _ = tokio::time::timeout(TIMEOUT, client.read_to_end(&mut text))
         .await
         .unwrap();
@@ -57,7 +57,7 @@ async fn slow_headers_time_out() {
     let mut silent = connect(server.address).await;
     let mut slow = connect(server.address).await;
     let send_slowly = async {
-        // A byte now and then does not put the end off.
+        // Single bytes do not extend the time limit.
         for byte in ASK.iter().cycle() {
             if slow.write_all(&[*byte | 0x40]).await.is_err() {
                 return;
@@ -110,7 +110,7 @@ async fn a_client_that_never_reads_is_disconnected() {
     })
     .await;
     let mut client = connect(server.address).await;
-    // Until both sides' buffers are full of answers that nobody reads.
+    // Until unread answers fill the buffers of both sides.
     let contract = b"GET /openapi.json HTTP/1.1\r\nhost: a\r\n\r\n".repeat(500);
     let flood = async { while client.write_all(&contract).await.is_ok() {} };
     tokio::time::timeout(TIMEOUT, flood).await.unwrap();
@@ -209,7 +209,7 @@ async fn without_keys_public_host_names_are_refused() {
     let app = app(dir.path(), config);
     let asked = |host: &str| {
         let request = Request::get("/v1/models").header(header::HOST, host);
-        // As a page of that host would.
+        // As a page of this host sends it.
         let request = request.header(header::ORIGIN, format!("http://{host}"));
         send(&app, request.body(Body::empty()).unwrap())
     };

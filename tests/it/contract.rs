@@ -1,4 +1,4 @@
-//! What all answers of the service have in common: its contract, one shape of refusals, ids, readiness.
+//! Common to all responses of the service: the API contract, problem details, request ids, readiness.
 
 use axum::body::Body;
 use axum::http::Request;
@@ -98,7 +98,7 @@ fn the_committed_openapi_document_is_current() {
     let committed = std::fs::read_to_string(path).unwrap_or_default();
     assert!(
         committed == document,
-        "openapi/openapi.json differs from the code; write it anew by\n  \
+        "openapi/openapi.json differs from the code; update it with\n  \
          UPDATE_OPENAPI=1 cargo test --release --test it the_committed_openapi_document_is_current"
     );
 }

@@ -1,4 +1,4 @@
-//! Collecting into a directory: what is written, going on after interruptions, and what is refused.
+//! Collecting into a directory: the written files, resuming, and refusals.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ fn run(config: &CollectConfig) -> Result<DatasetInfo, DatasetError> {
     collect(config, &|_| {}, &AtomicBool::new(false))
 }
 
-/// Collects, and cancels once that many trials are simulated.
+/// Collects, and cancels after this many trials.
 fn run_until(config: &CollectConfig, trials: u64) -> Result<DatasetInfo, DatasetError> {
     let cancelled = AtomicBool::new(false);
     let seen = AtomicU64::new(0);

@@ -20,7 +20,7 @@ fn info() -> DatasetInfo {
     }
 }
 
-/// An episode of that many frames; the clock jumps by 10 s before each frame in `jumps`.
+/// An episode of `frames` frames. The clock jumps by 10 s before each frame in `jumps`.
 fn episode(frames: usize, jumps: &[usize], trial: Option<TrialParameters>) -> EpisodeData {
     let mut time_s = 0.0;
     let timestamps_s = (0..frames)
@@ -73,7 +73,7 @@ proptest! {
         let shape = WindowShape { context, horizon };
         let mut taken = BTreeSet::new();
         for split in Split::ALL {
-            // A split can be too short for the window; what matters is what the others give.
+            // A split can be too short for a window; the others are still checked.
             let Ok(windows) = splits.windows(&dataset, split, shape, stride) else { continue };
             for window in &windows {
                 let frames = dataset.episodes()[window.episode].frames();

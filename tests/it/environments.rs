@@ -95,7 +95,7 @@ async fn invalid_environment_requests_are_refused_with_the_field() {
     let id = body["id"].as_str().unwrap();
     let detail = step(&app, id, json!([0.1])).await.detail(422);
     assert!(detail.starts_with("action:"), "{detail}");
-    // Beyond f32.
+    // Too large for f32.
     step(&app, id, json!([0.1, 1e39])).await.detail(400);
     step(&app, "env-99", json!([0, 0])).await.detail(404);
 }

@@ -1,4 +1,4 @@
-//! Evaluation: a whole run on a small scene, what it leaves on disk, what it refuses.
+//! Evaluation: a whole run on a small scene, its files, and refusals.
 
 use std::collections::BTreeSet;
 
@@ -34,7 +34,7 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
     }
 }
 
-/// A model that was never trained, whose data set is said to have been this one.
+/// An untrained model whose manifest names this data set as its training data.
 fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
     let trained_on = DatasetStamp {
         name: dataset.info().name.clone(),
@@ -192,13 +192,13 @@ fn the_markdown_report_matches_its_snapshot() {
     "a processor".clone_into(&mut report.stamp.cpu);
     report.stamp.threads = 2;
     report.stamp.program.git_commit = Some("0123abc".to_owned());
-    // Figures differ from one processor to the next in their last digits; their places don't.
+    // The last digits depend on the processor, so numbers are masked.
     let markdown = report.to_markdown();
     let masked: String = markdown.lines().map(|line| mask_numbers(line) + "\n").collect();
     insta::assert_snapshot!(masked);
 }
 
-/// Replaces every number of three digits or more, every fraction and every hash by a mark.
+/// Replaces numbers of three or more characters and hashes by `#`.
 fn mask_numbers(line: &str) -> String {
     let is_measured = |word: &str| {
         let digits = word.trim_matches(|c: char| !c.is_ascii_alphanumeric());

@@ -1,4 +1,4 @@
-//! A robot that streams beside bad clients, and is answered as if there were none.
+//! A robot that streams while bad clients misbehave. Its predictions must not change.
 
 use std::cell::Cell;
 use std::net::SocketAddr;
@@ -16,7 +16,7 @@ use serde_json::json;
 use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
 use crate::service::{CONTEXT, HEIGHT, InProcessServer, WIDTH, app, model, run, spec};
 
-/// From one frame to the next.
+/// Time between two frames.
 const PERIOD: Duration = Duration::from_millis(5);
 
 /// A running server with a robot that streams.
@@ -55,12 +55,12 @@ impl ServerWithRobot {
         self.server.address
     }
 
-    /// A session of its own for a bad client.
+    /// Opens a session for a bad client.
     pub(crate) async fn session(&self) -> SessionHandle {
         SessionHandle::open(&self.app, &json!({"model": "moving"})).await
     }
 
-    /// Does the bad thing while the robot streams; the robot notices nothing, neither meanwhile nor afterwards.
+    /// Runs the bad client while the robot streams. Checks the robot's predictions during that time and once afterwards.
     pub(crate) async fn while_robot_streams<T>(&mut self, bad_client: impl Future<Output = T>) -> T {
         let is_done = Cell::new(false);
         let bad_client = async {
@@ -78,7 +78,7 @@ impl ServerWithRobot {
         tokio::join!(bad_client, robot).0
     }
 
-    /// Sends the robot's next frame; the answer is what the model predicts when it is asked alone.
+    /// Sends the robot's next frame and compares the answer with a direct prediction of the model.
     async fn step(&mut self) {
         let seq = self.robot.next_seq;
         self.robot.next_seq += 1;

@@ -1,4 +1,4 @@
-//! Jobs over HTTP: with work that the test holds in its hand, and with the real collection and training.
+//! Jobs over HTTP, most with an executor that the test controls.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -18,7 +18,7 @@ use crate::service::{app, get, model, post, run, send, spec, store, poll_until, 
 
 const JOBS: &str = "/v1/jobs";
 
-/// Work that does what the test says, and looks at its flag.
+/// An executor whose jobs end as the test says, or when they are cancelled.
 struct ScriptedExecutor {
     results: Mutex<Receiver<Result<(), JobFailure>>>,
     obeys_cancel: bool,
@@ -221,11 +221,11 @@ async fn a_runner_that_lost_its_lease_writes_nothing() {
     post(&app, JOBS, &collect("a")).await;
     let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
     poll_until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
-    // To another process whose clock says that the lease has long run out.
+    // Another process claims the job; by its clock the lease has expired.
     let (row, other_lease) = app.store().claim("another", 1e12, 2e12).await.unwrap().unwrap();
     assert_eq!((row.number, other_lease.token), (1, 2));
     post(&app, JOBS, &collect("b")).await;
-    // The runner is free for the next job once it has seen that it lost this one.
+    // The runner starts the next job after it has noticed that it lost the lease.
     wait_for_state(&app, "job-2", "running").await;
     let job = get(&app, "/v1/jobs/job-1").await.json();
     assert_eq!((&job["state"], &job["attempts"]), (&json!("running"), &json!(2)));
@@ -303,7 +303,7 @@ async fn jobs_are_listed_by_kind_and_state_in_pages() {
 }
 
 #[tokio::test]
-async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
+async fn job_events_last_until_the_job_ends() {
     let dir = tempfile::tempdir().unwrap();
     let (app, finish) = scripted_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
@@ -322,11 +322,16 @@ async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
         "{text}"
     );
     assert_eq!(get(&app, "/v1/jobs/job-9/events").await.status, 404);
+}
 
-    post(&app, JOBS, &collect("b")).await;
+#[tokio::test]
+async fn open_job_events_do_not_delay_shutdown() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, _finish) = scripted_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
     let watched = app.clone();
-    let watcher = tokio::spawn(async move { get(&watched, "/v1/jobs/job-2/events").await });
-    wait_for_state(&app, "job-2", "running").await;
+    let watcher = tokio::spawn(async move { get(&watched, "/v1/jobs/job-1/events").await });
+    wait_for_state(&app, "job-1", "running").await;
     run(app.clone()).await.stop().await;
     let text = String::from_utf8(watcher.await.unwrap().body).unwrap();
     assert!(!text.contains("succeeded"), "{text}");

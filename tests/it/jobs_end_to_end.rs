@@ -1,4 +1,4 @@
-//! The real work of jobs over HTTP: what is collected trains models, whose versions serve, are measured and deleted.
+//! Real jobs over HTTP: collection, training, evaluation, and the model versions and data sets that they create.
 
 use std::path::Path;
 
@@ -23,7 +23,7 @@ fn train(name: &str, steps: usize) -> Value {
     json!({"kind": "train", "name": name, "preset": "paper", "dataset": "seen", "settings": settings})
 }
 
-/// Asks for a job and waits until it has succeeded.
+/// Creates a job and waits until it has succeeded.
 async fn run_job(app: &App, body: &Value) -> Value {
     let taken = post(app, JOBS, body).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
@@ -121,14 +121,14 @@ async fn a_collected_data_set_trains_a_served_model() {
 #[tokio::test]
 async fn a_cancelled_evaluation_leaves_no_report() {
     let dir = tempfile::tempdir().unwrap();
-    // The shipped models, which take frames as they are collected.
+    // The shipped models take frames of the collected size.
     let config = ServerConfig {
         data_dir: dir.path().to_owned(),
         job_lease_ms: 1000,
         ..ServerConfig::default()
     };
     let app = App::open(config).await.unwrap();
-    // So many that it takes longer than the job's standing is written and looked at.
+    // Enough trials that the evaluation is still running when it is cancelled.
     let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 100});
     run_job(&app, &seen).await;
     let body =
@@ -158,7 +158,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     collect_data_set(&app).await;
-    // "plain" was shipped as version 1 and goes on serving until told otherwise.
+    // "plain" was shipped as version 1, which stays active until another version is activated.
     for (name, steps, version) in [("plain", 2, 2), ("plain", 4, 3), ("plain", 6, 4)] {
         let job = run_job(&app, &train(name, steps)).await;
         assert_eq!(job["result"]["version"], version);
@@ -181,7 +181,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
         (&swapped["active_version"], &swapped["spec"]["frame_width_px"]),
         (&json!(2), &json!(64))
     );
-    // Who asks and goes is obeyed all the same.
+    // The activation completes even if the client disconnects.
     let and_gone = post(&app, "/v1/models/plain/versions/1/activate", &Value::Null).now_or_never();
     assert!(and_gone.is_none());
     wait_for_version(&app, "plain", 1).await;
@@ -238,7 +238,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
         (&description["versions"], &description["active_version"]),
         (&json!([1, 2, 3]), &json!(2))
     );
-    // What another server activates is followed, and what it activated in vain is not server after a restart either.
+    // A version that another server activates is loaded. If it is invalid, the previous one is served, also after a restart.
     store(dir.path()).set_active("plain", 1, 0.0).await.unwrap();
     wait_for_version(&next, "plain", 1).await;
     store(dir.path()).set_active("plain", 3, 0.0).await.unwrap();
@@ -247,7 +247,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
     assert_eq!(run_job(&third, &train("plain", 2)).await["result"]["version"], 5);
 }
 
-/// Has a manifest promise other shapes than the weights have.
+/// Changes a manifest so that its shapes differ from the weights'.
 fn change_spec(model_dir: &Path) {
     let path = model_dir.join("manifest.json");
     let text = std::fs::read_to_string(&path).unwrap();

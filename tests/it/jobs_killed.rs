@@ -1,4 +1,4 @@
-//! Jobs of processes that are killed without warning: the real program, `kill -9`, and the weights in the end.
+//! Jobs of processes that are killed with SIGKILL: the final weights are those of an uninterrupted training.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
@@ -11,12 +11,12 @@ use rand::Rng as _;
 use serde_json::{Value, json};
 
 const KILLS: u32 = 10;
-/// Longer than anything here takes, even where other programs keep the machine busy.
+/// Time limit of every wait: longer than any step takes, even on a busy machine.
 const TIMEOUT: Duration = Duration::from_mins(3);
-/// The program's default.
+/// The default lease duration.
 const LEASE: Duration = Duration::from_secs(30);
 
-/// A running program that is killed when it is dropped.
+/// A running program. Dropping it kills the process.
 struct KillOnDrop(Child);
 
 impl Drop for KillOnDrop {
@@ -27,7 +27,7 @@ impl Drop for KillOnDrop {
     }
 }
 
-/// Starts the program with a data directory and no shipped models; returns the first line that it writes too.
+/// Starts the program with a data directory and no shipped models. Returns also its first line of output.
 fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String) {
     let no_models = data_dir.join("none-shipped");
     std::fs::create_dir_all(&no_models).unwrap();
@@ -53,7 +53,7 @@ fn serve(data_dir: &Path, more: &[&str]) -> (KillOnDrop, String) {
     (program, address.to_owned())
 }
 
-/// Asks and gives the JSON of the answer.
+/// Sends a request and returns the JSON body of the response.
 fn ask(address: &str, request: &str, body: &Value) -> Value {
     let body = if body.is_null() {
         String::new()
@@ -108,7 +108,7 @@ fn weights(data_dir: &Path) -> Vec<u8> {
     std::fs::read(data_dir.join("models/m/1/model.safetensors")).unwrap()
 }
 
-/// A data directory in which the collection and the training ran through, and how long the training took.
+/// A data directory after an uninterrupted collection and training, and the duration of the training.
 fn uninterrupted() -> (tempfile::TempDir, Duration) {
     let dir = tempfile::tempdir().unwrap();
     let (_server, address) = serve(dir.path(), &[]);
@@ -143,7 +143,8 @@ fn a_killed_training_ends_with_the_same_weights() {
 }
 
 fn killed_at_random_points(whole: &Path, took: Duration) {
-    // Where the machine got quicker since `took` was measured, the training ends before its last kill: then they come sooner.
+    // If the machine is faster now than when `took` was measured, the training ends before the last kill. Then try again with
+    // shorter intervals.
     let killed = [0.06, 0.03, 0.015, 0.007]
         .into_iter()
         .find_map(|share| kill_repeatedly(whole, took.mul_f64(share)));
@@ -158,8 +159,8 @@ fn killed_at_random_points(whole: &Path, took: Duration) {
     assert_eq!(killed.len(), 4 + 12);
 }
 
-/// A data directory whose training was killed again and again, each time at most that long after it was taken up; none if
-/// it came to its end all the same.
+/// A data directory whose training was killed repeatedly, each time at most `at_most` after it was claimed; none if the
+/// training ended before the last kill.
 fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir> {
     let dir = tempfile::tempdir().unwrap();
     copy_dataset(whole, dir.path());
@@ -173,7 +174,7 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
         let job = wait_until(&address, "job-1", |job| job["attempts"] == kill + 1);
         assert!(
             started.elapsed() < LEASE,
-            "it was taken up only when the lease had run out: {job}"
+            "the job was claimed only after its lease expired: {job}"
         );
         std::thread::sleep(at_most.mul_f64(rng.random_range(0.1..1.0)));
         if ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"] != "running" {
@@ -183,7 +184,7 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
     Some(dir)
 }
 
-/// The points of the loss curves at which the validation windows were predicted.
+/// The points of the loss curves that have a validation loss.
 fn validations(address: &str, id: &str) -> Vec<Value> {
     let curves = ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
     let points = curves["points"].as_array().unwrap().iter();
@@ -193,7 +194,7 @@ fn validations(address: &str, id: &str) -> Vec<Value> {
         .collect()
 }
 
-/// Data directories of their own, one database, one shared_settings for objects.
+/// Machines with separate data directories, one database and one object store.
 fn claimed_by_another_machine(whole: &Path) {
     let (of_server, first, second) = (
         tempfile::tempdir().unwrap(),
@@ -235,7 +236,7 @@ fn claimed_by_another_machine(whole: &Path) {
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], 2);
     assert!(weights(second.path()) == weights(whole), "the weights differ");
-    // The server, which never saw the files, loads the new model by itself.
+    // The server has no copy of the files, but loads the new model.
     let deadline = Instant::now() + TIMEOUT;
     while ask(&address, "GET /v1/models", &Value::Null)["models"][0]["name"] != "m" {
         assert!(Instant::now() < deadline);
@@ -247,7 +248,7 @@ fn claimed_by_another_machine(whole: &Path) {
         .unwrap()
         .iter()
         .filter_map(|line| line["line"].as_str());
-    // What the first worker said in its last half second died with it.
+    // Log lines of the first worker's last half second are lost.
     let resumed = lines.rfind(|line| line.contains(" from step ")).unwrap();
     assert!(!resumed.starts_with("pretrain from step 0,"), "{resumed}");
 }

@@ -1,4 +1,4 @@
-//! The priorities of the real program's threads while it serves and works on a job; Linux has them for each thread.
+//! Thread priorities of the real program while a job runs. Only Linux has a priority per thread.
 #![cfg(target_os = "linux")]
 
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::process::{Program, RunningServer};
 use crate::service::TIMEOUT;
 
-/// Name and niceness of a process's threads.
+/// Name and nice value of each thread of a process.
 fn threads(process: u32) -> Vec<(String, i64)> {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
     let stats = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("stat")).ok());
@@ -16,17 +16,17 @@ fn threads(process: u32) -> Vec<(String, i64)> {
         .map(|stat| {
             let (head, rest) = stat.rsplit_once(") ").unwrap();
             let (_, name) = head.split_once('(').unwrap();
-            // The 19th field of all; the third is the first after the name.
+            // Field 19 of the file; the first field after the name is field 3.
             let niceness = rest.split(' ').nth(16).unwrap().parse().unwrap();
             (name.to_owned(), niceness)
         })
         .collect()
 }
 
-/// Whether all of a job's threads are there, below the others; and the others where the process began.
+/// Whether all job threads exist and have a lower priority, and all others have the priority of the process.
 fn has_lower_priority(process: u32) -> bool {
     let threads = threads(process);
-    // Threads that candle shares would have predictions wait for the training.
+    // With threads shared by candle, predictions would wait for the training.
     assert!(
         !threads.iter().any(|(name, _)| name.starts_with("candle")),
         "{threads:?}"
@@ -38,7 +38,7 @@ fn has_lower_priority(process: u32) -> bool {
         "{threads:?}"
     );
     let low = (of_process + 10).min(19);
-    // One that waits for the work, and two of the pool.
+    // One thread that waits for the work, and two of the pool.
     jobs.len() >= 3 && jobs.iter().all(|(_, niceness)| *niceness == low)
 }
 

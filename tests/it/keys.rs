@@ -1,4 +1,4 @@
-//! API keys: who is asked for one, and what a revoked one is worth.
+//! API keys: when a key is required, and what happens after it is revoked.
 
 use axum::body::Body;
 use axum::http::{Request, header};
@@ -45,7 +45,7 @@ async fn authentication_starts_with_the_first_key() {
     assert_eq!(get(&app, "/v1/models").await.status, 401);
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
     keys.refresh().await.unwrap();
-    // That a key was taken away opens the server to nobody.
+    // Revoking the last key does not switch authentication off.
     assert_eq!(get(&app, "/v1/models").await.status, 401);
     let (_dir, _store, _keys, app) = app_with_keys(true).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);

@@ -1,4 +1,4 @@
-//! Requests that come slowly, in half, packed, or too long, beside a robot that streams.
+//! Slow, incomplete, compressed, too long and malformed requests, while a healthy robot streams.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -16,7 +16,7 @@ async fn connect(address: SocketAddr) -> TcpStream {
     TcpStream::connect(address).await.unwrap()
 }
 
-/// Writes all, then reads until the server closes; the client itself keeps the connection open.
+/// Sends all parts, then reads until the server closes the connection.
 async fn send_and_read(address: SocketAddr, parts: &[&[u8]]) -> String {
     let mut client = connect(address).await;
     for part in parts {
@@ -31,7 +31,7 @@ async fn send_and_read(address: SocketAddr, parts: &[&[u8]]) -> String {
     text
 }
 
-/// A problem of that status, whole, and after it the connection's end.
+/// Checks that the answer is a complete problem response with this status.
 fn assert_problem(answer: &str, status: u16, detail: &str) {
     assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{answer}");
     let (_, body) = answer.split_once("\r\n\r\n").unwrap();
@@ -59,7 +59,7 @@ async fn endless_headers_time_out() {
             clients.push(client);
         }
         for client in &mut clients {
-            // A byte now and then does not put the end off.
+            // Single bytes do not extend the time limit.
             let send_slowly = async {
                 while client.write_all(b"y").await.is_ok() {
                     tokio::time::sleep(Duration::from_millis(5)).await;
@@ -95,7 +95,7 @@ async fn an_incomplete_body_is_answered_408() {
 async fn a_compressed_body_is_answered_415() {
     let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
     let address = setup.address();
-    // As much as a gzip member that unpacks to gigabytes.
+    // The size of a gzip file that expands to gigabytes.
     let compressed = [b"\x1f\x8b\x08".as_slice(), &vec![0; 4 << 20]].concat();
     let length = compressed.len();
     for encoding in ["gzip", "br, gzip", "zstd"] {

@@ -1,4 +1,4 @@
-//! Clients whose streams break the rules, beside one whose does not.
+//! Malformed messages on streams, while a healthy robot streams.
 
 use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, ErrorCode, FrameMessage, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
@@ -63,13 +63,13 @@ async fn websocket_protocol_errors_are_reported_before_closing() {
     let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
     let (address, session) = (setup.address(), setup.session().await);
     for (bytes, reason, code) in [
-        // Text that is not masked.
+        // A text frame without a mask.
         (&b"\x81\x01x"[..], ClosingReason::Malformed, 1002),
-        // An operation that there is not.
+        // An unknown opcode.
         (b"\x83\x80\0\0\0\0", ClosingReason::Malformed, 1002),
-        // The rest of nothing.
+        // A continuation frame without a first frame.
         (b"\x80\x80\0\0\0\0", ClosingReason::Malformed, 1002),
-        // A reserved bit, as of compression, which is not spoken here.
+        // A reserved bit, as set by compression, which was not negotiated.
         (b"\xC1\x80\0\0\0\0", ClosingReason::Malformed, 1002),
         (b"\x81\x82\0\0\0\0\xFF\xFE", ClosingReason::NotUtf8, 1007),
     ] {
@@ -201,7 +201,7 @@ async fn refusals_quote_only_a_short_part_of_a_message() {
 async fn a_partial_message_does_not_change_the_session() {
     let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
     let (address, session) = (setup.address(), setup.session().await);
-    // A binary message of 16 KiB of which ten bytes come; half a header; the first of many fragments.
+    // Part of a binary message of 16 KiB; half a header; the first of several fragments.
     for part in [
         &b"\x82\xFE\x40\0\0\0\0\0half a mess"[..],
         b"\x82",

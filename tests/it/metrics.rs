@@ -1,4 +1,4 @@
-//! What the real program measures, after each thing that it measures has been done.
+//! Every metric of the real program, checked after the events that it counts.
 
 use std::io::Read as _;
 use std::net::TcpStream;
@@ -18,7 +18,7 @@ use crate::service::{TIMEOUT, context, model, slow_spec, spec};
 const SIDE: u32 = 256;
 const CONNECTIONS: usize = 24;
 
-/// The value of a series, as it is scraped.
+/// The scraped value of a series.
 fn metric(server: &RunningServer, series: &str) -> Option<f64> {
     let text = server.get("/metrics");
     let line = text
@@ -45,7 +45,7 @@ fn assert_metric(server: &RunningServer, series: &str, value: f64) {
 fn models(dir: &Path) {
     model(dir, "plain", spec(Conditioning::None));
     model(dir, "slow", slow_spec());
-    // One whose answers soon fill a socket.
+    // A model whose answers soon fill a socket.
     let large = ModelSpec {
         frame_width_px: SIDE,
         frame_height_px: SIDE,
@@ -105,7 +105,7 @@ async fn sessions(server: &RunningServer) {
     for seq in 0..3 {
         clients[0].ask(&numbered_message(seq)).await;
     }
-    // One that is refused has come all the same.
+    // A refused frame counts as well.
     let refused = clients[1].ask(&numbered_message(9)).await;
     assert!(matches!(refused, ServerMessage::Error { .. }), "{refused:?}");
     assert_metric(server, "foreframe_sessions_active", 2.0);
@@ -152,7 +152,7 @@ async fn a_slow_reader(server: &RunningServer) {
     client.ask(&frame).await;
     let sent = 100;
     for _ in 0..sent {
-        // The kept answer is sent again for each.
+        // The server sends the cached answer for each.
         client.send(&frame).await;
     }
     let (mut dropped_total, mut read) = (0, 0);
@@ -171,7 +171,7 @@ async fn a_slow_reader(server: &RunningServer) {
     );
 }
 
-/// Asks for predictions at once until one finds the queue full.
+/// Sends concurrent requests until one finds the queue full.
 fn a_full_queue(server: &RunningServer) {
     let body = json!({"frames": context()});
     let (mut computed, mut refused) = (0, 0);
@@ -256,7 +256,7 @@ fn post_cancel(server: &RunningServer, id: &str) {
 }
 
 fn connections(server: &RunningServer) {
-    // The one that asks.
+    // The connection that asks for the metrics.
     wait_for_metric(server, "foreframe_http_connections_open", 1.0);
     let mut held: Vec<TcpStream> = (0..CONNECTIONS + 4)
         .map(|_| TcpStream::connect(server.address).unwrap())

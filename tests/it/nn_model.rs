@@ -1,4 +1,4 @@
-//! The whole model: gradients, determinism, conditioning, and what it refuses.
+//! The whole model: gradients, determinism, conditioning, and errors.
 
 use candle_core::{DType, Device, Tensor};
 use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
@@ -6,7 +6,7 @@ use foreframe::types::Seed;
 
 use crate::nn_fixtures::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
 
-/// A loss that every tensor of the model has a part in.
+/// A loss that depends on every tensor of the model.
 fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
     let spec = model.spec();
     let batch = frames.dim(0).unwrap();

@@ -1,4 +1,4 @@
-//! Adam: the closed form, resumption, clipping, and what it refuses.
+//! Adam: the closed form, resuming, clipping, and errors.
 
 use candle_core::{Device, Tensor};
 use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
@@ -143,7 +143,7 @@ fn a_non_finite_gradient_or_loss_changes_nothing() {
         Gradients::of(&infinite, &parameters, &[]),
         Err(OptimizerError::LossNotFinite { .. })
     ));
-    // √0 is finite, its slope isn't.
+    // √0 is finite, but its derivative is not.
     let edge = slope(&parameters, &[0.0; 12]).sqrt().unwrap();
     let gradients = Gradients::of(&edge, &parameters, &[]).unwrap();
     let error = adam.update(&parameters, &gradients, RATE).unwrap_err();

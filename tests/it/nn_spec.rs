@@ -54,7 +54,7 @@ fn the_parameter_count_matches_the_tensors() {
     }
 }
 
-/// Each weight (no bias) counts once for each frame it works on.
+/// Each weight (biases excluded) counts once for each frame that it is applied to.
 #[test]
 fn multiply_adds_count_every_use_of_a_weight() {
     for (spec, _) in all_kinds() {

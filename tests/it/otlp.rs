@@ -1,11 +1,11 @@
-//! Traces of the real program at a collector.
+//! Traces that the real program sends to a collector.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpListener;
 
 use crate::process::RunningServer;
 
-/// Takes requests until one brings a trace, and gives its path and body.
+/// Accepts one request and returns its first line and body.
 fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
     let (stream, _) = collector.accept().unwrap();
     let mut stream = BufReader::new(stream);

@@ -1,4 +1,4 @@
-//! Names that would leave the data directory, wherever a name can be given.
+//! Names that could leave the data directory, in every place that takes a name.
 
 use std::fs;
 use std::path::Path;
@@ -46,7 +46,7 @@ const PATHS: [(&str, &str); 19] = [
     ("DELETE", "/v1/environments/NAME"),
 ];
 
-/// Every file below, with its length, but the store's own, which grows.
+/// Every file below a directory with its length, without the store's own files, which grow.
 fn files(dir: &Path) -> Vec<(String, u64)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir).unwrap().flatten() {

@@ -1,4 +1,4 @@
-//! The real program in a process of its own, asked over sockets and told to stop.
+//! The real program as a child process: started, called over sockets, and stopped.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::service::TIMEOUT;
 
-/// The program in a directory, with no setting from the environment, as users start it.
+/// A command of the program in a directory, without settings from the environment.
 pub(crate) fn foreframe(dir: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
     command.current_dir(dir).env_remove("CANDLE_NUM_THREADS");
@@ -29,7 +29,7 @@ pub(crate) fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
 }
 
-/// A running program that has said its first line; killed when a test ends before it.
+/// A running program that has printed its first line. Dropping it kills the process.
 pub(crate) struct Program {
     child: Child,
     line: String,
@@ -62,7 +62,7 @@ impl Program {
         assert!(kill.unwrap().success());
     }
 
-    /// Waits for the end; gives its log.
+    /// Waits for a successful exit and returns the log.
     pub(crate) fn wait_for_exit(mut self) -> String {
         let deadline = Instant::now() + TIMEOUT;
         let status = loop {
@@ -80,13 +80,13 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // It has ended already in a test that passes.
+        // In a passing test it has ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// A server that is ready.
+/// A server process that is ready.
 pub(crate) struct RunningServer {
     pub(crate) program: Program,
     pub(crate) address: SocketAddr,
@@ -116,12 +116,12 @@ impl RunningServer {
         server
     }
 
-    /// The whole answer.
+    /// The whole response, with its headers.
     pub(crate) fn get(&self, path: &str) -> String {
         self.send("GET", path, "")
     }
 
-    /// The JSON of the answer.
+    /// The JSON body of the response.
     pub(crate) fn ask(&self, method: &str, path: &str, body: &Value) -> Value {
         let answer = self.send(method, path, &body.to_string());
         let body = answer.split_once("\r\n\r\n").map(|(_, body)| body).unwrap();
@@ -142,7 +142,7 @@ impl RunningServer {
         answer
     }
 
-    /// Asks for a job until that has come.
+    /// Polls a job until the condition holds. Panics if the job fails.
     pub(crate) fn wait_for_job(&self, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + TIMEOUT;
         loop {
@@ -159,7 +159,7 @@ impl RunningServer {
         self.program.terminate();
     }
 
-    /// Waits for the end; gives its log.
+    /// Waits for a successful exit and returns the log.
     pub(crate) fn wait_for_exit(self) -> String {
         self.program.wait_for_exit()
     }

@@ -1,4 +1,4 @@
-//! The real program: what it says on the command line, and how it ends.
+//! The real program: shutdown, metrics, health checks, keys and configuration.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use crate::process::{RunningServer, foreframe, output, text};
 use crate::service::{TIMEOUT, context, model, slow_spec, spec};
 
-/// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
+/// Sends requests until connections are refused. A request counts as accepted once the server asks for its body.
 fn send_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
     let head = format!(
         "POST /v1/models/slow/predict HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\nexpect: 100-continue\r\n\
@@ -196,7 +196,7 @@ fn a_public_server_requires_an_api_key() {
     assert_eq!(output(dir.path(), &["keys", "revoke", id]).status.code(), Some(2));
     let deadline = Instant::now() + TIMEOUT;
     while !ask(&keys[0]).starts_with("HTTP/1.1 401") {
-        assert!(Instant::now() < deadline, "the revoked key is still taken");
+        assert!(Instant::now() < deadline, "the revoked key is still accepted");
     }
     assert!(ask(&keys[1]).starts_with("HTTP/1.1 200"));
     server.terminate();
@@ -229,7 +229,7 @@ fn invalid_directories_are_refused_at_startup() {
             (Some(2), format!("error: {complaint}").as_str())
         );
     }
-    // Without any, it says what to do.
+    // Without models the server starts, and the log says what to do.
     let server = RunningServer::start(dir.path(), &[]);
     assert!(server.get("/v1/models").ends_with("{\"models\":[]}"));
     server.terminate();

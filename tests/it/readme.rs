@@ -15,14 +15,20 @@ const DOCUMENTS: [&str; 1] = ["README.md"];
 
 /// How commands that are not run begin, and why they are not.
 const NOT_RUN: [(&str, &str); 9] = [
-    ("cargo run", "it compiles; the server that it starts is started here without cargo"),
+    (
+        "cargo run",
+        "it compiles; the server that it starts is started here without cargo",
+    ),
     ("cargo build", "it compiles; the tests are built by it already"),
     ("cargo test", "it would start the tests again"),
     ("cargo bench", "it measures for minutes; .ci/run runs the short forms"),
     ("taskset", "it measures for minutes; .ci/run runs the short forms"),
     ("pip install", "it needs the network; .ci/run runs it"),
     ("python", "it needs a Python package; .ci/run runs it"),
-    ("docker", "it needs a container runtime; .ci/run builds and starts the image"),
+    (
+        "docker",
+        "it needs a container runtime; .ci/run builds and starts the image",
+    ),
     ("git clone", "it needs the network"),
 ];
 
@@ -33,7 +39,10 @@ const REPLACED: [(&str, &str); 9] = [
         "foreframe train ",
         "foreframe train --set data.windows=16 --set data.validation_windows=4 --set pretrain.steps=2 --set fit.steps=2 ",
     ),
-    ("foreframe evaluate ", "foreframe evaluate --windows 20 --resamples 100 "),
+    (
+        "foreframe evaluate ",
+        "foreframe evaluate --windows 20 --resamples 100 ",
+    ),
     ("/var/lib/foreframe", "service-data"),
     ("0.0.0.0:8642", "127.0.0.1:0"),
     ("http://127.0.0.1:8642", "http://ADDRESS"),
@@ -115,7 +124,10 @@ fn checkout() -> tempfile::TempDir {
     std::fs::create_dir(&bin).unwrap();
     for (name, program) in [
         ("foreframe", format!("'{}'", env!("CARGO_BIN_EXE_foreframe"))),
-        ("curl", format!("'{}' --fail --max-time 600", curl().unwrap_or_default())),
+        (
+            "curl",
+            format!("'{}' --fail --max-time 600", curl().unwrap_or_default()),
+        ),
     ] {
         std::fs::write(bin.join(name), format!("#!/bin/sh\nexec {program} \"$@\"\n")).unwrap();
         std::fs::set_permissions(bin.join(name), std::fs::Permissions::from_mode(0o755)).unwrap();
@@ -125,7 +137,9 @@ fn checkout() -> tempfile::TempDir {
 
 fn curl() -> Option<String> {
     let paths = std::env::var_os("PATH")?;
-    let found = std::env::split_paths(&paths).map(|dir| dir.join("curl")).find(|path| path.is_file());
+    let found = std::env::split_paths(&paths)
+        .map(|dir| dir.join("curl"))
+        .find(|path| path.is_file());
     found.map(|path| path.display().to_string())
 }
 
@@ -138,7 +152,12 @@ fn run(dir: &Path, command: &str) -> String {
     for (name, _) in template.get_envs() {
         shell.env_remove(name);
     }
-    let output = shell.args(["-c", command]).current_dir(dir).env("PATH", path).output().unwrap();
+    let output = shell
+        .args(["-c", command])
+        .current_dir(dir)
+        .env("PATH", path)
+        .output()
+        .unwrap();
     assert!(output.status.success(), "{command}: {}", text(&output.stderr));
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
@@ -185,7 +204,10 @@ fn every_command_in_the_documents_succeeds() {
             }
         }
     }
-    assert!(counts.0 > 0 && (counts.1 > 0 || curl().is_none()), "too few commands were found: {counts:?}");
+    assert!(
+        counts.0 > 0 && (counts.1 > 0 || curl().is_none()),
+        "too few commands were found: {counts:?}"
+    );
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Many futures of one context, and images as files.
+//! Rollouts: many plans from one context. Also predictions from image files in a form.
 
 use std::pin::pin;
 
@@ -18,6 +18,7 @@ use crate::service::{
 };
 
 const ROLLOUTS: &str = "/v1/models/moving/rollouts";
+const PLAIN_PREDICT: &str = "/v1/models/plain/predict";
 
 fn candidates(count: usize) -> Vec<Value> {
     (0..count)
@@ -32,7 +33,7 @@ fn pixels(image: &Value) -> Vec<u8> {
     STANDARD.decode(image.as_str().unwrap()).unwrap()
 }
 
-/// The greatest difference of any two pixels.
+/// The largest absolute difference between two lists of raw images.
 fn largest_pixel_difference(a: &Value, b: &Value) -> u8 {
     let (a, b) = (a.as_array().unwrap(), b.as_array().unwrap());
     assert_eq!(a.len(), b.len());
@@ -79,7 +80,7 @@ async fn other_requests_are_answered_during_a_large_rollout() {
             answer = post(&app, "/v1/models/slow/predict", &single) => answered += usize::from(answer.status == 200),
         }
     }
-    // Were they computed in one go, one prediction would fit before and one would wait for the end.
+    // If the rollout ran as one batch, only one or two single predictions could be answered.
     assert!(answered > 4, "{answered} answered");
 }
 
@@ -202,16 +203,12 @@ async fn post_form(app: &App, path: &str, parts: &[(&str, &[u8])]) -> Answer {
 #[tokio::test]
 async fn multipart_and_json_give_the_same_prediction() {
     let dir = tempfile::tempdir().unwrap();
-    let config = ServerConfig {
-        max_frames: 4,
-        ..ServerConfig::default()
-    };
-    let app = app(dir.path(), config);
+    let app = app(dir.path(), ServerConfig::default());
     let files: Vec<Vec<u8>> = (0..CONTEXT as u8)
         .map(|i| codec::encode_png(&frame(i * 10)).unwrap())
         .collect();
     let mut parts: Vec<(&str, &[u8])> = files.iter().map(|file| ("frames", file.as_slice())).collect();
-    let plain = "/v1/models/plain/predict";
+    let plain = PLAIN_PREDICT;
     let by_json = post(&app, plain, &json!({"frames": context()})).await.json();
     assert_eq!(post_form(&app, plain, &parts).await.json()["frames"], by_json["frames"]);
 
@@ -223,7 +220,16 @@ async fn multipart_and_json_give_the_same_prediction() {
     parts.push(("request", inputs.as_bytes()));
     let by_form = post_form(&app, "/v1/models/moving/predict", &parts).await.json();
     assert_eq!(by_form["frames"], by_json["frames"]);
+}
 
+#[tokio::test]
+async fn invalid_multipart_forms_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_frames: 4,
+        ..ServerConfig::default()
+    };
+    let (app, plain) = (app(dir.path(), config), PLAIN_PREDICT);
     let odd = post_form(&app, plain, &[("image", &b"x"[..])]).await.detail(422);
     assert_eq!(odd, "the form has a part \"image\"; there are frames and request");
     let many = post_form(&app, plain, &[("frames", &b"x"[..]); 5]).await.detail(413);

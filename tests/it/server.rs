@@ -1,4 +1,4 @@
-//! Predictions over HTTP: answers, refusals by field, limits, and the end of the server.
+//! Predictions over HTTP: responses, refusals, limits and shutdown.
 
 use axum::http::header;
 use base64::Engine as _;
@@ -296,7 +296,7 @@ async fn an_accepted_request_is_answered_during_shutdown() {
     let mut interim = [0; 25];
     client.read_exact(&mut interim).await.unwrap();
     assert_eq!(&interim, b"HTTP/1.1 100 Continue\r\n\r\n");
-    // The request has been taken; only its body is missing.
+    // The server has accepted the request; only its body is missing.
     server.shutdown.send(()).unwrap();
     client.write_all(body.as_bytes()).await.unwrap();
     let mut answer = String::new();
@@ -316,7 +316,7 @@ async fn a_model_has_a_preview_picture() {
     let preview = get(&app, "/v1/models/plain/preview.png").await;
     assert_eq!(preview.status, 200, "{}", String::from_utf8_lossy(&preview.body));
     assert!(codec::decode(&preview.body).unwrap().height() > 3 * HEIGHT);
-    let misfit = get(&app, "/v1/models/moving/preview.png").await.detail(422);
-    assert_eq!(misfit, "state holds 6 numbers; model \"moving\" takes 1: x m");
+    let mismatch = get(&app, "/v1/models/moving/preview.png").await.detail(422);
+    assert_eq!(mismatch, "state holds 6 numbers; model \"moving\" takes 1: x m");
     assert_eq!(HORIZON, 2);
 }

@@ -1,4 +1,4 @@
-//! The frames of a session: their order, gaps, those sent twice, ahead, or overtaken by newer ones, and sockets that go in between.
+//! The frames of a session: order, gaps, repeated, pipelined and overtaken frames, and lost connections.
 
 use foreframe::server::protocol::{
     ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, OnLate, ServerMessage,
@@ -78,7 +78,7 @@ async fn on_late_skip_predicts_only_from_the_newest_frame() {
     for seq in 0..count {
         skipped.send(&numbered_message(seq)).await;
     }
-    // What is sent again overtakes nothing.
+    // A repeated frame overtakes nothing.
     skipped.send(&numbered_message(count - 1)).await;
     let (mut overtaken, mut in_a_row) = (0, 0);
     for expected in 0..count {
@@ -93,7 +93,7 @@ async fn on_late_skip_predicts_only_from_the_newest_frame() {
             }
             ServerMessage::Buffering { seq, .. } => assert_eq!(*seq, expected),
             _ => {
-                // From the same context, whatever was predicted on the way.
+                // Overtaken frames are part of the context too.
                 assert_eq!(frames(&answer), frames(&from_all));
                 in_a_row = 0;
             }
@@ -134,17 +134,17 @@ async fn pipelined_frames_are_answered_in_order() {
 
 #[derive(Clone, Copy, Debug)]
 enum NetworkFault {
-    /// The next frame as it should be.
+    /// No fault: the next frame.
     Next,
-    /// One of the last frames once more.
+    /// One of the last frames is repeated.
     Twice(u64),
-    /// A frame that leaves others out.
+    /// Frames are skipped.
     Ahead(u64),
-    /// Two frames the wrong way round.
+    /// Two frames in the wrong order.
     Swapped,
-    /// The socket goes without a word.
+    /// The connection is lost.
     Lost,
-    /// The socket goes after a frame was sent and before its answer came.
+    /// The connection is lost after a frame was sent and before its answer arrives.
     LostAfter,
 }
 
@@ -190,7 +190,7 @@ async fn run_with_faults(faults: &[NetworkFault]) -> Result<(), TestCaseError> {
             NetworkFault::LostAfter => {
                 client.send(&numbered_message(next)).await;
                 client = connect().await;
-                // It was taken or it was not; the server says which.
+                // The server says whether it accepted the frame.
                 prop_assert!(client.next_seq == next || client.next_seq == next + 1);
                 next = client.next_seq;
             }
@@ -263,7 +263,7 @@ async fn a_truncated_frame_is_ignored() {
         .await
         .unwrap();
     client.ask(&numbered_message(0)).await;
-    // The head of a masked binary message of 200 bytes, and three of them.
+    // The header of a masked binary message of 200 bytes, and its first three bytes.
     client
         .socket
         .get_mut()
@@ -292,7 +292,7 @@ async fn an_invalid_frame_does_not_change_the_session() {
         .await
         .unwrap();
     let before = get(&app, &session.path("/state")).await.json();
-    // A PNG that states 60,000 × 60,000 pixels in its first bytes.
+    // A PNG whose header states 60,000 × 60,000 pixels.
     let mut oversized_png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\0\0\0\0".to_vec();
     oversized_png.extend([0; 64]);
     let changed = |change: &dyn Fn(&mut foreframe::server::protocol::FrameMessage)| {

@@ -1,4 +1,4 @@
-//! The program itself, killed in the middle of a stream.
+//! A server process that is killed during a stream.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -57,7 +57,7 @@ impl KillableServer {
         serde_json::from_str(body).unwrap()
     }
 
-    /// As `kill -9` does.
+    /// Kills the process with SIGKILL.
     fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();

@@ -1,4 +1,4 @@
-//! Sessions: what outlives a socket, what a number sent twice means, and who may ask.
+//! Sessions: reconnection, expiry, access tokens, and export and import of their state.
 
 use std::time::Duration;
 
@@ -42,7 +42,7 @@ async fn a_session_continues_after_reconnecting() {
         .await
         .unwrap();
     for seq in 0..6 {
-        // Every frame over a socket of its own, in either sub-protocol.
+        // Each frame over a new socket, in alternating sub-protocols.
         let codec = [Codec::Json, Codec::Msgpack][seq as usize % 2];
         let mut client = Client::connect(server.address, &broken.path("/stream"), codec)
             .await
@@ -137,7 +137,7 @@ async fn an_unused_session_expires_and_is_answered_410() {
         .await
         .unwrap();
     tokio::time::sleep(Duration::from_millis(80)).await;
-    // While its stream is open it does not expire, and holds its place.
+    // While its stream is open, the session does not expire and counts towards the limit.
     assert!(matches!(
         client.ask(&numbered_message(0)).await,
         ServerMessage::Buffering { .. }
@@ -147,7 +147,7 @@ async fn an_unused_session_expires_and_is_answered_410() {
     assert_eq!(full.headers["retry-after"], "1");
     drop(client);
     let path = session.path("/state");
-    // Asking with the token would count as use.
+    // A request with the token would count as use.
     let peek = format!("/v1/sessions/{}", session.id);
     poll_until(async || (get(&app, &peek).await.status == 410).then_some(())).await;
     assert!(
@@ -217,7 +217,7 @@ async fn an_exported_state_continues_on_another_server() {
         .await
         .unwrap();
     assert_eq!(client.next_seq, 5);
-    // The last answer did not travel; it is computed again, and nothing is stepped.
+    // The exported state has no cached answer: the server computes it again, and `next_seq` does not change.
     assert_eq!(frames(&client.ask(&numbered_message(4)).await), frames(&last));
     assert_eq!(frames(&client.ask(&numbered_message(5)).await), frames(&next));
     old.stop().await;

@@ -1,4 +1,4 @@
-//! Data sets of several machines that keep their objects in one place, each with a data directory and a database of its own.
+//! Data sets of several machines that share an object store; each has its own data directory and database.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::service::{Answer, get, post, send, poll_until};
 const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";
 
-/// A server with a data directory of its own and no shipped models.
+/// A server with its own data directory and no shipped models.
 async fn machine(objects: &Path) -> (TempDir, App) {
     let dir = tempfile::tempdir().unwrap();
     let models_dir = dir.path().join("none-shipped");
@@ -32,7 +32,7 @@ fn collect(trials: u32) -> Value {
     json!({"kind": "collect", "name": "d", "scenario": "static-observer", "trials": trials})
 }
 
-/// Asks for a collection and waits until it has succeeded.
+/// Creates a collection job and waits until it has succeeded.
 async fn collected(app: &App, trials: u32) {
     let taken = post(app, JOBS, &collect(trials)).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
@@ -112,7 +112,7 @@ async fn a_stale_copy_does_not_block_a_new_collection() {
     collected(&one, 5).await;
     assert_eq!(get(&other, SET).await.json()["episodes"], 5);
     assert_eq!(delete(&other).await.status, 204);
-    // With the same arguments it is the same set.
+    // The same arguments give the same data set again.
     collected(&one, 5).await;
     assert_eq!(get(&other, SET).await.json()["episodes"], 5);
 }

@@ -1,4 +1,4 @@
-//! The simulated world against closed forms, and its promises: seeds, bounds, collisions, refusals.
+//! The simulated world: closed forms, seeds, bounds, collisions, camera.
 
 use foreframe::sim::camera::Camera;
 use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
@@ -20,7 +20,7 @@ pub(crate) fn small() -> WorldConfig {
     }
 }
 
-/// A moving-observer trial in which Tb1 begins at that pose.
+/// A moving-observer trial in which Tb1 starts at this pose.
 fn world_from(x_m: f32, y_m: f32, heading_rad: f32, config: &WorldConfig) -> World {
     let mut parameters = TrialParameters::draw(Scenario::MovingObserver, Seed(3), 0);
     parameters.observer = PlanarPose { x_m, y_m, heading_rad };
@@ -52,7 +52,7 @@ fn constant_wheel_speeds_drive_an_exact_arc() {
         world.step(&action(linear as f32, angular as f32)).unwrap();
     }
     let to = world.observer_pose();
-    // A unicycle at constant speeds, by hand: circle of radius v/ω.
+    // Closed form of a unicycle at constant speeds: a circle of radius v/ω.
     let turned = angular * 2.0;
     let heading = f64::from(from.heading_rad);
     let radius = linear / angular;
@@ -97,7 +97,7 @@ fn a_wall_stops_the_robot_while_its_wheels_turn() {
     let reach = arena::LENGTH_M - 0.177;
     assert!((truth.x_m - reach).abs() < 0.02, "{} {reach}", truth.x_m);
     assert!(world.observe().state.as_slice()[0] > truth.x_m + 0.3);
-    assert!(least < 0.0, "bumping costs: {least}");
+    assert!(least < 0.0, "a collision must have a negative reward: {least}");
 }
 
 #[test]
@@ -194,7 +194,7 @@ fn static_trials_show_the_whole_robot_for_twelve_frames() {
     assert!(lengths[399] <= 40);
 }
 
-/// Whether the middle axis of a TurtleBot and its sides are in the picture of 16×16.
+/// Whether the whole width and height of a TurtleBot is inside the frame of 16×16 px.
 fn is_whole(camera: &Camera, pose: PlanarPose) -> bool {
     [(0.0, -0.17), (0.0, 0.17), (0.42, -0.17), (0.42, 0.17)]
         .into_iter()
@@ -318,7 +318,7 @@ fn a_still_camera_sees_a_still_background() {
     config.camera.noise_std = 0.0;
     let (seen, _) = whole_trial(Scenario::StaticObserver, Seed(1), 0, &config);
     let (first, last) = (&seen[0], &seen[seen.len() - 1]);
-    // The topmost rows show wall only.
+    // The top rows show only wall.
     assert_eq!(first.frame.pixels()[..64 * 4], last.frame.pixels()[..64 * 4]);
     assert!(first.frame != last.frame);
 }

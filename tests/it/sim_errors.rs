@@ -1,4 +1,4 @@
-//! What the simulated world refuses, and what it says then; an environment's episodes.
+//! Errors of the simulator, and the episodes of an environment.
 
 use foreframe::sim::{Environment, Scenario, SimError, TrialParameters, World, WorldConfig};
 use foreframe::types::{Action, Seed};

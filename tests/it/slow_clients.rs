@@ -1,4 +1,4 @@
-//! Clients that read slowly or never, beside others.
+//! Stream clients that read slowly or never, and their effect on others.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ use crate::service::{self, TIMEOUT, InProcessServer, model, run, spec, poll_unti
 const SIDE: u32 = 256;
 const SEND_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// A server of a model whose answers, half a megabyte each, soon fill a socket.
+/// A server with a model whose answers are so large (half a megabyte) that they soon fill a socket.
 async fn start(dir: &std::path::Path) -> InProcessServer {
     let config = ServerConfig {
         stream_send_ms: SEND_TIMEOUT.as_millis() as u64,
@@ -47,11 +47,12 @@ fn frame(seq: u64) -> ClientMessage {
     })
 }
 
-/// Reads nothing for longer than the server waits, then everything: the end, as far as it could still be dropped_total.
+/// Reads nothing for longer than the server waits, then everything. Returns the reason and code of the close, if they
+/// arrived.
 async fn read_nothing_then_all(server: &InProcessServer) -> (Option<ClosingReason>, Option<u16>) {
     let mut client = connect(server).await;
     client.ask(&frame(0)).await;
-    // The kept answer is sent again for each.
+    // The server sends the cached answer for each.
     let flood = async { while client.try_send(&frame(0)).await.is_ok() {} };
     let _ = tokio::time::timeout(SEND_TIMEOUT + SEND_TIMEOUT / 2, flood).await;
     let end = tokio::time::timeout(4 * SEND_TIMEOUT, client.end()).await;
@@ -62,7 +63,7 @@ async fn read_nothing_then_all(server: &InProcessServer) -> (Option<ClosingReaso
 async fn a_client_that_never_reads_is_closed_with_1013() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
-    // On a busy machine the client may begin to read before the server's patience is over, or after it has hung up.
+    // On a busy machine the client may start to read before the server's time limit, or after the connection has ended.
     let slow = (Some(ClosingReason::Slow), Some(1013));
     poll_until(async || (read_nothing_then_all(&server).await == slow).then_some(())).await;
     server.stop().await;

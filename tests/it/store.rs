@@ -1,4 +1,4 @@
-//! The store, on SQLite always and on PostgreSQL where `FOREFRAME_TEST_POSTGRES` holds the URL of one to make databases in.
+//! The store on SQLite, and on PostgreSQL if `FOREFRAME_TEST_POSTGRES` is the URL of a server to create databases on.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use foreframe::store::{
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
-/// Where to open a store of each kind, empty. `name` is the test's.
+/// Configurations of an empty store of each kind. `name` is that of the test.
 async fn configs(name: &str) -> Vec<(TempDir, StoreConfig)> {
     let mut configs = vec![config(None)];
     configs.extend(postgres(name).await.map(|url| config(Some(url))));
@@ -143,10 +143,10 @@ async fn an_expired_lease_cannot_write() {
         assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
         let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
-        assert_eq!(store.renew(stale, 99.0, update("from the dead")).await.unwrap(), None);
+        assert_eq!(store.renew(stale, 99.0, update("from an expired lease")).await.unwrap(), None);
         assert!(
             !store
-                .end(stale, outcome("failed"), update("from the dead"))
+                .end(stale, outcome("failed"), update("from an expired lease"))
                 .await
                 .unwrap()
         );
@@ -203,7 +203,7 @@ async fn concurrent_claims_never_get_the_same_job() {
                 while numbers.len() < 20 {
                     match store.claim(&runner.to_string(), 0.0, 10.0).await.unwrap() {
                         Some((row, _)) => numbers.push(row.number),
-                        // Those that others are about to take are passed over.
+                        // A claim skips jobs that others are claiming.
                         None if store.jobs(queued()).await.unwrap().is_empty() => break,
                         None => tokio::task::yield_now().await,
                     }
@@ -270,7 +270,7 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
     }
 }
 
-/// A job of that model, taken up, with its version reserved.
+/// Claims a new job and reserves a version of the model for it.
 async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
     enqueued(store).await;
     let (_, lease) = store.claim("me", 0.0, 10.0).await.unwrap().unwrap();
@@ -306,7 +306,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
         );
         let listed = store.published_versions().await.unwrap();
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
-        // The first stays chosen until another is.
+        // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
         assert!(!store.delete_version("m", 5, 1.0).await.unwrap());
         store.set_active("m", 4, 1.0).await.unwrap();
@@ -385,7 +385,7 @@ async fn an_unreachable_postgresql_is_refused_with_the_reason() {
         };
         Store::open(&config).await.err().unwrap().to_string()
     };
-    // The tests' server speaks no TLS.
+    // The test server has no TLS.
     let error = refused(format!("{url}?sslmode=require")).await;
     let reason = if cfg!(feature = "cloud") {
         "server does not support TLS"

@@ -1,9 +1,9 @@
-//! Objects that several machines share, in a directory and, where there is one, in S3.
+//! The object store that several machines share: in a directory, and in S3 if available.
 
 use foreframe::store::{Store, StoreConfig};
 use tempfile::TempDir;
 
-/// Two data directories with one place for objects, a directory or, where `FOREFRAME_TEST_S3` holds a URL, a bucket.
+/// Two data directories with one object store: a directory, and an S3 bucket if `FOREFRAME_TEST_S3` is set.
 #[tokio::test]
 async fn pushed_objects_are_visible_on_other_machines() {
     let shared = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Streams predict what single requests do, whoever shares their batches.
+//! Streams predict the same as single requests, whatever else is in their batches.
 
 use std::path::Path;
 
@@ -19,7 +19,7 @@ fn shipped(name: &str) -> LoadedModel {
     registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
 }
 
-/// What one robot saw and did.
+/// Frames, actions and states of one robot.
 struct Recording {
     frames: Vec<Frame>,
     actions: Vec<Vec<f32>>,
@@ -27,7 +27,7 @@ struct Recording {
 }
 
 impl Recording {
-    /// The frames that come with the program.
+    /// The frames in `examples`.
     fn example() -> Self {
         let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/frames");
         let recorded: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
@@ -40,7 +40,7 @@ impl Recording {
         }
     }
 
-    /// Noise, different for every robot.
+    /// Random frames, actions and states, different for each robot.
     fn noise(model: &LoadedModel, robot: u64, steps: usize) -> Self {
         let spec = &model.manifest.spec;
         let mut rng = Seed(11).derive("robot", robot).rng();
@@ -74,7 +74,7 @@ impl Recording {
         })
     }
 
-    /// The prediction after frame `seq` without any session.
+    /// The prediction after frame `seq`, computed without a session.
     fn stateless(&self, model: &LoadedModel, seq: usize) -> Vec<Frame> {
         let input = PredictionInput {
             frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
@@ -85,7 +85,7 @@ impl Recording {
         serving::predict(model, &[&input]).unwrap().remove(0)
     }
 
-    /// Whether a prediction is the stateless one: 1e-5 apart, so at most one intensity after rounding.
+    /// Checks a prediction against the stateless one. They differ by at most 1e-5, so by at most one intensity after rounding.
     fn check(&self, model: &LoadedModel, seq: usize, frames: &[ImageBytes]) {
         let expected = self.stateless(model, seq);
         assert_eq!(frames.len(), expected.len());
@@ -96,7 +96,7 @@ impl Recording {
         }
     }
 
-    /// Whether an exported state holds the features of the last frames, to 1e-5.
+    /// Checks that an exported state has the features of the last frames, within 1e-5.
     fn check_state(&self, model: &LoadedModel, state: &Value) {
         let spec = &model.manifest.spec;
         let features: Vec<Vec<f32>> = serde_json::from_value(state["memory"]["features"].clone()).unwrap();
@@ -180,7 +180,8 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
     }
 }
 
-/// A robot that sends when it likes, some frames ahead of their answers; every prediction is held against the stateless.
+/// A robot that sends frames at random times, some ahead of their answers. Every prediction is checked against the
+/// stateless one.
 async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, robot: u64, steps: usize) {
     let recording = Recording::noise(model, robot, steps);
     let session = SessionHandle::open(app, &json!({"model": "moving"})).await;
@@ -206,7 +207,7 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
             }
             other => panic!("{other:?}"),
         }
-        // In one go, so that the robots keep the server busy together.
+        // Check many at once, so that all robots keep the server busy at the same time.
         if unchecked.len() == 50 || answered + 1 == steps {
             for (seq, frames) in unchecked.drain(..) {
                 recording.check(model, seq, &frames);
@@ -232,7 +233,7 @@ async fn sixty_four_interleaved_sessions_equal_single_predictions() {
 
 /// `cargo test --release --test it -- --ignored sixty_four_interleaved_sessions_for_a_thousand_steps`
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[ignore = "64,000 predictions twice over: minutes"]
+#[ignore = "64,000 predictions, each computed twice, take minutes"]
 async fn sixty_four_interleaved_sessions_for_a_thousand_steps() {
     run_interleaved(1000).await;
 }

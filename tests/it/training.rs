@@ -1,4 +1,4 @@
-//! Training: both stages on a small moving scene, stopped and gone on with, refused and diverging.
+//! Training: both stages on a small moving scene, resuming, refusals, and divergence.
 
 use std::cell::Cell;
 use std::path::Path;
@@ -38,7 +38,7 @@ fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<Training
     train_until(config, dataset, dir, usize::MAX)
 }
 
-/// Trains until so many updates were made in this call.
+/// Trains until this call has made `updates` updates.
 fn train_until(
     config: &TrainConfig,
     dataset: &Dataset,

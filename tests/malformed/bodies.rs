@@ -1,4 +1,4 @@
-//! Bodies of requests, JSON and forms, and the state that a session is imported from.
+//! Request bodies (JSON and forms), and exported session states.
 
 use std::sync::LazyLock;
 
@@ -13,7 +13,7 @@ use crate::mutation::{mutated, mutations};
 use crate::service::Answer;
 use crate::test_service::SERVICE;
 
-/// An environment that is stepped; where an episode ends, the next begins.
+/// The environment that is stepped. When an episode ends, it is reset.
 static ENVIRONMENT: LazyLock<String> = LazyLock::new(|| {
     let world = json!({"frame_width_px": 16, "frame_height_px": 12});
     let asked = json!({"scenario": "moving-observer", "world": world}).to_string();
@@ -29,7 +29,7 @@ fn path(endpoint: &str) -> String {
     }
 }
 
-/// Asks, and gives back what was taken.
+/// Sends a body, and releases what the request created.
 fn ask(file: &CorpusFile, bytes: Vec<u8>) -> Answer {
     let endpoint = file.part(1);
     let path = path(endpoint);
@@ -40,7 +40,7 @@ fn ask(file: &CorpusFile, bytes: Vec<u8>) -> Answer {
     };
     match (endpoint, answer.status.as_u16()) {
         ("environments", 201) => SERVICE.delete(answer.headers["location"].to_str().unwrap()),
-        // Or its name would be taken.
+        // Otherwise its name would stay in use.
         ("jobs", 202) => cancel(answer.json()["id"].as_str().unwrap()),
         ("step", 200) if answer.json()["truncated"] == true => reset(),
         _ => {}
@@ -58,7 +58,7 @@ fn reset() {
     assert_eq!(SERVICE.json("a reset", &path, b"{}".to_vec()).status, 200);
 }
 
-/// Opens a session with a state; where it is taken, it also predicts from there.
+/// Opens a session with a state; if it is accepted, also asks for a rollout.
 fn import(name: &str, state: &str) -> Answer {
     let weights = &SERVICE.app.predictor().model("moving").unwrap().weights_sha256;
     let body = format!(r#"{{"state":{}}}"#, state.replace("WEIGHTS", weights));

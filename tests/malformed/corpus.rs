@@ -1,9 +1,9 @@
-//! The kept files.
+//! The files of the corpus.
 
 use std::fs;
 use std::path::Path;
 
-/// One file: `STATUS-…` or `ok-…` or `refused-…`.
+/// One file, named `STATUS-…`, `ok-…` or `refused-…`.
 #[derive(Clone, Debug)]
 pub(crate) struct CorpusFile {
     pub(crate) name: String,
@@ -11,7 +11,7 @@ pub(crate) struct CorpusFile {
 }
 
 impl CorpusFile {
-    /// The name's part before that `-`, counted from 0, without what follows the point.
+    /// Part `index` of the name without its extension, separated by `-` and counted from 0.
     pub(crate) fn part(&self, index: usize) -> &str {
         let stem = self.name.split('.').next().unwrap();
         stem.split('-').nth(index).unwrap()
@@ -22,7 +22,7 @@ impl CorpusFile {
     }
 }
 
-/// Every file of a folder of `tests/corpus`, in the order of their names.
+/// All files of a folder of `tests/corpus`, sorted by name.
 pub(crate) fn files(folder: &str) -> Vec<CorpusFile> {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(folder);
     let mut files: Vec<CorpusFile> = fs::read_dir(dir)
@@ -34,6 +34,6 @@ pub(crate) fn files(folder: &str) -> Vec<CorpusFile> {
         })
         .collect();
     files.sort_by(|a, b| a.name.cmp(&b.name));
-    assert!(files.len() > 10, "{folder} holds only {}", files.len());
+    assert!(files.len() > 10, "{folder} has only {} files", files.len());
     files
 }

@@ -1,4 +1,4 @@
-//! Images, by way of a request for a prediction.
+//! Images in prediction requests.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;

@@ -1,5 +1,6 @@
-//! Bad input through the real entry points: every file of `tests/corpus`, and mutations of each. Nothing panics, every answer
-//! is the contract's, and memory stays within the limit given to [`within_memory`]. A binary of its own, since its allocator counts.
+//! Malformed input through the real entry points: every file of `tests/corpus`, and mutations of each. Nothing panics, every
+//! response is documented, and memory stays within the limit given to [`within_memory`]. This is a separate binary because
+//! its allocator counts.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod bodies;
@@ -22,14 +23,14 @@ use peak_alloc::PeakAlloc;
 #[global_allocator]
 static ALLOCATOR: PeakAlloc = PeakAlloc;
 
-/// What is allocated is counted for the whole process, so one test runs at a time.
+/// Memory is counted for the whole process, so one test runs at a time.
 static EXCLUSIVE: Mutex<()> = Mutex::new(());
 
 fn exclusive() -> MutexGuard<'static, ()> {
     EXCLUSIVE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Runs what shall take at most that many bytes of memory at a time, beyond what is held already.
+/// Runs `work`, which may allocate at most `limit_bytes` beyond what is already allocated.
 fn within_memory<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) -> T {
     ALLOCATOR.reset_peak_usage();
     let before = ALLOCATOR.current_usage();
@@ -37,7 +38,7 @@ fn within_memory<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) ->
     let taken = ALLOCATOR.peak_usage().saturating_sub(before);
     assert!(
         taken <= limit_bytes,
-        "{what}: {taken} bytes were allocated at a time, over {limit_bytes}"
+        "{what}: {taken} bytes were allocated; the limit is {limit_bytes}"
     );
     result
 }

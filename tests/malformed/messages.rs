@@ -1,4 +1,4 @@
-//! Both sub-protocols' codec.
+//! Stream messages in both sub-protocols.
 
 use axum::extract::ws::Message;
 use foreframe::server::protocol::{ClientMessage, Codec};
@@ -9,7 +9,7 @@ use crate::corpus::files;
 use crate::mutation::{mutated, mutations};
 use crate::{exclusive, within_memory};
 
-/// Bytes of memory for each byte of a message at most, and beside them: what it holds, and a list of lists of numbers.
+/// Limit of memory: this many bytes per byte of the message, plus `BASE_BYTES`.
 const BYTES_PER_BYTE: usize = 4;
 const BASE_BYTES: usize = 1 << 20;
 
@@ -24,7 +24,7 @@ fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     }
 }
 
-/// What becomes of a message; an error names the sub-protocol.
+/// Decodes a message within the memory limit. An error must name the sub-protocol.
 fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, String> {
     let limit = BASE_BYTES + BYTES_PER_BYTE * bytes.len();
     let (codec, message) = message(is_text, bytes);

@@ -1,4 +1,4 @@
-//! A service in this process, and what its answers must be like.
+//! A service in this process, and the checks of its responses.
 
 use std::sync::LazyLock;
 
@@ -11,12 +11,12 @@ use tokio::runtime::Runtime;
 use crate::service::{Answer, app, send};
 use crate::within_memory;
 
-/// Bytes of memory for each byte of a body at most, and beside them: the service's own work, and the longest request for a
-/// job, of which a byte may take more.
+/// Limit of memory: this many bytes per byte of the body, plus `BASE_BYTES` for the service's own work and for the longest
+/// job request, which may need more per byte.
 const BYTES_PER_BYTE: usize = 32;
 const BASE_BYTES: usize = 12 << 20;
 
-/// The statuses with which a body can be answered.
+/// The documented statuses.
 const STATUSES: [u16; 11] = [200, 201, 202, 400, 404, 406, 409, 413, 415, 422, 503];
 
 pub(crate) struct TestService {
@@ -25,7 +25,7 @@ pub(crate) struct TestService {
     _dir: TempDir,
 }
 
-/// One for all tests of this binary. Its jobs are taken and never run.
+/// One service for all tests of this binary. It accepts jobs and never runs them.
 pub(crate) static SERVICE: LazyLock<TestService> = LazyLock::new(|| {
     let dir = tempfile::tempdir().unwrap();
     let runtime = Runtime::new().unwrap();
@@ -45,7 +45,7 @@ pub(crate) static SERVICE: LazyLock<TestService> = LazyLock::new(|| {
 });
 
 impl TestService {
-    /// Asks; the answer is one of the contract's, and took no more memory than it may.
+    /// Sends a body; checks the status, the detail of a refusal, and the memory limit.
     pub(crate) fn post(&self, name: &str, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
         let limit = BASE_BYTES + BYTES_PER_BYTE * body.len();
         let request = Request::post(path)
@@ -76,7 +76,7 @@ impl TestService {
     }
 }
 
-/// Whether a detail says where: a field, a place in the body, or what was longer than it may be.
+/// Whether a detail names the cause: a field, a position in the body, or what is too long.
 fn names_a_place(detail: &str) -> bool {
     let words = ["line ", "field `", "body", "model", "request", "name", "kind"];
     let is_field = |word: &str| word.contains(['_', '[', '.', ':']) || FIELDS.contains(&word);
