@@ -5,10 +5,12 @@
 use std::os::unix::fs::{PermissionsExt as _, symlink};
 use std::path::Path;
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
 use crate::process::{Program, RunningServer, foreframe, text};
+use crate::service::TIMEOUT;
 
 /// The documents whose commands are run, in the order in which a reader would read them.
 const DOCUMENTS: [&str; 1] = ["README.md"];
@@ -33,7 +35,7 @@ const NOT_RUN: [(&str, &str); 9] = [
 ];
 
 /// Text that is replaced before a command is run: what takes long, and what a reader fills in.
-const REPLACED: [(&str, &str); 9] = [
+const REPLACED: [(&str, &str); 11] = [
     ("--trials 5000", "--trials 60"),
     (
         "foreframe train ",
@@ -43,6 +45,8 @@ const REPLACED: [(&str, &str); 9] = [
         "foreframe evaluate ",
         "foreframe evaluate --windows 20 --resamples 100 ",
     ),
+    ("\"steps\": 50}", "\"steps\": 5}"),
+    ("\"steps\": 200}", "\"steps\": 10}"),
     ("/var/lib/foreframe", "service-data"),
     ("0.0.0.0:8642", "127.0.0.1:0"),
     ("http://127.0.0.1:8642", "http://ADDRESS"),
@@ -126,7 +130,10 @@ fn checkout() -> tempfile::TempDir {
         ("foreframe", format!("'{}'", env!("CARGO_BIN_EXE_foreframe"))),
         (
             "curl",
-            format!("'{}' --fail --max-time 600", curl().unwrap_or_default()),
+            format!(
+                "'{}' --fail-with-body --show-error --max-time 600",
+                curl().unwrap_or_default()
+            ),
         ),
     ] {
         std::fs::write(bin.join(name), format!("#!/bin/sh\nexec {program} \"$@\"\n")).unwrap();
@@ -158,15 +165,28 @@ fn run(dir: &Path, command: &str) -> String {
         .env("PATH", path)
         .output()
         .unwrap();
-    assert!(output.status.success(), "{command}: {}", text(&output.stderr));
-    String::from_utf8_lossy(&output.stdout).into_owned()
+    let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command}: {stderr} {stdout}");
+    stdout.into_owned()
 }
 
-/// Waits for the end of the job that an answer describes, as a reader would before the next command.
+/// Waits for the end of the job that an answer describes, and for the model that it trains, as a reader would before the
+/// next command.
 fn wait_for_created_job(server: &RunningServer, answer: &str) {
-    let job: Value = serde_json::from_str(answer).unwrap_or_default();
-    if let Some(id) = job["id"].as_str().filter(|id| id.starts_with("job-")) {
-        server.wait_for_job(id, |job| job["state"] == "succeeded");
+    let created: Value = serde_json::from_str(answer).unwrap_or_default();
+    let Some(id) = created["id"].as_str().filter(|id| id.starts_with("job-")) else {
+        return;
+    };
+    let job = server.wait_for_job(id, |job| job["state"] == "succeeded");
+    if let Some(model) = job["result"]["model"]
+        .as_str()
+        .filter(|_| job["spec"]["kind"] == "train")
+    {
+        let deadline = Instant::now() + TIMEOUT;
+        while !server.get(&format!("/v1/models/{model}")).starts_with("HTTP/1.1 200") {
+            assert!(Instant::now() < deadline, "{model} is not served");
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
 }
 
