@@ -34,7 +34,7 @@ pub use sampler::{Split, Splits, WindowShape};
 use crate::files::hex;
 pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
-use crate::wording::listed;
+use crate::error_text::comma_separated;
 
 /// What a data set is: sizes, rates, meanings and the hash of its content.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -278,7 +278,7 @@ impl Dataset {
             name: self.info.name.clone(),
             kind,
             found: channels.len(),
-            names: listed(channels),
+            names: comma_separated(channels),
             wanted,
         })
     }

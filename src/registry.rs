@@ -11,7 +11,7 @@ pub use self::loader::{LoadedModel, load};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
-use crate::wording::those;
+use crate::error_text::existing;
 
 /// The weights' file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";
@@ -22,7 +22,7 @@ pub const MANIFEST_FILE: &str = "manifest.json";
 #[derive(Debug, thiserror::Error)]
 pub enum RegistryError {
     /// There is no model of that name.
-    #[error("there is no model {name:?} in {}; there {}", dir.display(), those(known))]
+    #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]
     Unknown {
         /// The name asked for.
         name: String,

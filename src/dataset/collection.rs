@@ -13,7 +13,7 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
-use crate::files::{is_partial_of, remove_abandoned, sha256_hex};
+use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -168,7 +168,7 @@ impl<'a> Collection<'a> {
             },
             TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
         })?;
-        remove_abandoned(&config.out);
+        remove_stale_partials(&config.out);
         let mut collection = Self {
             info: description(config),
             config,

@@ -172,9 +172,9 @@ pub enum DatasetError {
     },
     /// There is no data set of that name.
     #[error(
-        "there is no data set {name:?} in {dir}; there {those}; `foreframe collect` makes one",
+        "there is no data set {name:?} in {dir}; there {existing}; `foreframe collect` makes one",
         dir = dir.display(),
-        those = crate::wording::those(known)
+        existing = crate::error_text::existing(known)
     )]
     Unknown {
         /// The name asked for.

@@ -308,7 +308,7 @@ mod tests {
     #[test]
     fn a_frame_that_is_no_image_is_named_with_its_cause() {
         let error = open_changed(info(), |episode| episode.images[3] = vec![1, 2, 3], |_| {}).unwrap_err();
-        let sentence = crate::wording::sentence(&error);
+        let sentence = crate::error_text::with_causes(&error);
         let expected = "file-000.parquet, row 3: observation.image is damaged: not a readable PNG or JPEG image: ";
         assert!(sentence.contains(expected), "{sentence}");
     }
