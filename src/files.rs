@@ -36,7 +36,10 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
 
 /// The temporary path of a file. It is different in each call, because several writers can write the same file at once.
 fn partial_path(path: &Path) -> io::Result<PathBuf> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
+    let name = path.file_name();
+    let mut name = name
+        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path does not end with a file name"))?
+        .to_owned();
     name.push(format!(
         ".{:016x}.{PARTIAL}",
         getrandom::u64().map_err(io::Error::other)?

@@ -96,7 +96,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
             "train --set model.context=90",
             "a window of 95 frames (90 seen, 5 to come) is longer than every episode",
         ),
-        ("train --set name=A", "\"A\" is no model name"),
+        ("train --set name=A", "\"A\" is not a valid model name"),
         (
             "evaluate --model plane",
             "there is no model \"plane\" in models; there are: moving, plain",
@@ -247,13 +247,13 @@ fn a_damaged_data_set_or_model_ends_in_1_and_is_told_with_its_cause() {
     fs::write(dir.path().join("models/plain/model.safetensors"), b"short").unwrap();
     let (code, text) = run(dir.path(), "inspect plain");
     assert!(
-        code == 1 && text.contains("fetch the model again or train it anew"),
+        code == 1 && text.contains("download the model or train it again"),
         "{text}"
     );
     fs::write(dir.path().join("models/plain/manifest.json"), b"{").unwrap();
     let (code, text) = run(dir.path(), "evaluate --model plain");
     assert!(
-        code == 1 && text.contains("manifest.json is no model manifest: EOF"),
+        code == 1 && text.contains("manifest.json is not a valid model manifest: EOF"),
         "{text}"
     );
 }
