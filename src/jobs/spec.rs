@@ -206,7 +206,7 @@ impl CollectSpec {
             return Ok(());
         }
         match CollectionStatus::of(&config) {
-            Ok(CollectionStatus::New | CollectionStatus::PendingStep { .. }) if !is_there => Ok(()),
+            Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
             Ok(_) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),

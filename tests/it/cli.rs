@@ -70,7 +70,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
         ("collect --trials 4 --frame-size 8", "trials: 3 there, 4 asked"),
         (
             "collect --out thesis",
-            "thesis exists and is not a collection; name a directory that doesn't exist",
+            "thesis exists and is not a collection; use a directory that does not exist",
         ),
         ("collect --out thesis/one.tex", "one.tex exists and is not a collection"),
         (
@@ -94,7 +94,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
         ("train", "but the train split has only"),
         (
             "train --set model.context=90",
-            "a window of 95 frames (90 seen, 5 to come) is longer than every episode",
+            "a window of 95 frames (context 90, horizon 5) is longer than every episode",
         ),
         ("train --set name=A", "\"A\" is not a valid model name"),
         (
@@ -234,7 +234,7 @@ fn a_damaged_data_set_or_model_ends_in_1_and_is_told_with_its_cause() {
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
     let (code, text) = run(dir.path(), "inspect static-observer");
     assert!(code == 1 && text.contains("file-000.parquet has the sha256"), "{text}");
-    assert!(text.contains("restore the file or collect the data set anew"), "{text}");
+    assert!(text.contains("restore the file or collect the data set again"), "{text}");
 
     record_anew(
         &dir.path().join("data/datasets/static-observer"),
@@ -296,7 +296,7 @@ fn collect_train_and_evaluate_meet_in_one_place_without_being_told() {
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();
     let (code, text) = run(dir.path(), &format!("train {small} --out thesis"));
     assert!(
-        code == 2 && text.contains("thesis exists and holds no training run; name a new directory"),
+        code == 2 && text.contains("thesis exists and holds no training run; use a new directory"),
         "{text}"
     );
     done(dir.path(), &format!("train {small}"));

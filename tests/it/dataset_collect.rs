@@ -141,11 +141,11 @@ fn going_on_simulates_only_what_is_missing() {
     let error = run_until(&one_thread, 7).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "stopped with 6 of 11 trials kept; run the same command again to go on"
+        "stopped after 6 of 11 trials were saved; run the same command again to resume"
     );
     assert_eq!(
         CollectionStatus::of(&one_thread).unwrap(),
-        CollectionStatus::PendingStep { trials: 6 }
+        CollectionStatus::Unfinished { trials: 6 }
     );
     let first = AtomicU64::new(u64::MAX);
     let told = |progress: CollectProgress| {
@@ -178,7 +178,7 @@ fn an_unfinished_set_says_so_and_how_to_go_on() {
     let out = directory.path().join("set");
     run_until(&config(&out), 4).unwrap_err();
     let message = Dataset::open(&out).unwrap_err().to_string();
-    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to go on"));
+    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to resume it"));
     assert!(message.contains("\"trials\":11"), "{message}");
 }
 
@@ -209,7 +209,8 @@ fn other_arguments_are_refused_by_name() {
     let message = run(&other).unwrap_err().to_string();
     assert!(
         message.ends_with(
-            "was begun with other arguments (trials: 11 there, 12 asked); use those to go on, or name another directory"
+            "holds a collection with other arguments (trials: 11 in the directory, 12 requested); use the same arguments to \
+             resume it, or use another directory"
         ),
         "{message}"
     );
