@@ -14,7 +14,7 @@ fn camera(criterion: &mut Criterion) {
     for scenario in Scenario::ALL {
         let world = World::new(scenario, &config, Seed(1), 0).unwrap();
         group.bench_function(format!("picture 64×64 {scenario}"), |bencher| {
-            bencher.iter(|| black_box(world.photograph().unwrap()));
+            bencher.iter(|| black_box(world.render().unwrap()));
         });
     }
     group.finish();

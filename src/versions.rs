@@ -14,7 +14,7 @@ use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
 use crate::store::{Lease, Store, StoreError, unix_s};
 use crate::telemetry::names;
-use crate::wording;
+use crate::error_text;
 
 /// Why a version could not be loaded, published, chosen or deleted.
 #[derive(Debug, thiserror::Error)]
@@ -182,7 +182,7 @@ impl Versions {
         let loaded = tokio::task::spawn_blocking(move || registry::load(&dir)).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
-            .map_err(|error| refused(wording::sentence(&error)))?;
+            .map_err(|error| refused(error_text::with_causes(&error)))?;
         let Manifest {
             name, version: found, ..
         } = &*loaded.manifest;
@@ -333,7 +333,7 @@ impl Versions {
             Err(error) => Err(VersionError::Refused {
                 model: model.to_owned(),
                 version,
-                reason: wording::sentence(&error),
+                reason: error_text::with_causes(&error),
             }),
         }
     }

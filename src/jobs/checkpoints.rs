@@ -4,7 +4,7 @@ use tracing::warn;
 
 use crate::store::{Objects, StoreError};
 use crate::training::{CHECKPOINT_FILE, CheckpointPosition};
-use crate::wording;
+use crate::error_text;
 
 /// Fetches the run's last checkpoint, unless the data directory has it or a later one: pushing that may have failed.
 /// Errors: `Io`, `Object`.
@@ -33,7 +33,7 @@ pub(super) struct CheckpointSync {
 impl CheckpointSync {
     /// Notes how keeping one went; gives a line for the job's log when that is not as it was.
     pub(super) fn note(&mut self, kept: Result<(), StoreError>) -> Option<String> {
-        let reason = kept.err().map(|error| wording::sentence(&error));
+        let reason = kept.err().map(|error| error_text::with_causes(&error));
         if let Some(reason) = &reason {
             warn!(reason, "could not keep a checkpoint where the other objects are");
         }

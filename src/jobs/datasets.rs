@@ -49,7 +49,7 @@ pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
     if is_valid_name(name) && is_kept(objects, name).await? {
         let dir = objects.data_dir().join(key(name));
         if objects.are_shared() && !(dataset::is_finished(&dir) && is_current(objects, name).await?) {
-            objects.pull_same(&key(name), dataset::STAMP, LAST_FILE).await?;
+            objects.pull_same(&key(name), dataset::METADATA, LAST_FILE).await?;
         }
         if dataset::is_finished(&dir) {
             return Ok(dir);
@@ -60,7 +60,7 @@ pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
 
 /// Whether the data set here is the one kept where objects are.
 async fn is_current(objects: &Objects, name: &str) -> Result<bool, JobError> {
-    Ok(objects.is_same(&format!("{}/{}", key(name), dataset::STAMP)).await?)
+    Ok(objects.is_same(&format!("{}/{}", key(name), dataset::METADATA)).await?)
 }
 
 /// Has the data directory hold nothing else under the name of a data set that is to be collected: where objects are shared,
@@ -72,7 +72,7 @@ pub(super) async fn make_way(objects: &Objects, name: &str, config: &CollectConf
     if is_kept(objects, name).await? {
         return fetch(objects, name).await.map(drop);
     }
-    let is_of_a_deleted_set = config.out.join(dataset::STAMP).is_file();
+    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
     match CollectionStatus::of(config) {
         Err(DatasetError::OutExists { .. }) if is_of_a_deleted_set => Ok(objects.delete(&key(name)).await?),
         Err(DatasetError::OtherArguments { .. }) => Ok(objects.delete(&key(name)).await?),
@@ -84,9 +84,9 @@ pub(super) async fn make_way(objects: &Objects, name: &str, config: &CollectConf
 /// What a finished data set is, without fetching it. Errors: `NotFound` with the names there are, `Store`, `Dataset`.
 pub async fn describe(objects: &Objects, name: &str) -> Result<DatasetInfo, JobError> {
     if is_valid_name(name) && is_kept(objects, name).await? {
-        let path = format!("{}/{}", key(name), dataset::STAMP);
+        let path = format!("{}/{}", key(name), dataset::METADATA);
         if let Some(text) = objects.read(&path).await? {
-            return Ok(dataset::describe_stamp(Path::new(&path), &text)?);
+            return Ok(dataset::describe_metadata(Path::new(&path), &text)?);
         }
     }
     Err(unknown(objects, name).await?)

@@ -20,7 +20,7 @@ use crate::store::{LossRow, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
-use crate::wording;
+use crate::error_text;
 
 /// The file of a report that is written last.
 const REPORT_FILE: &str = "report.json";
@@ -359,7 +359,7 @@ fn posted(spec: &JobSpec) -> String {
 }
 
 fn failed(error: &dyn Error) -> JobFailure {
-    JobFailure::Failed(wording::sentence(error))
+    JobFailure::Failed(error_text::with_causes(error))
 }
 
 #[cfg(test)]

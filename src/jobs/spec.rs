@@ -13,7 +13,7 @@ use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
 use crate::types::Seed;
-use crate::wording;
+use crate::error_text;
 
 /// Trials of one collection at most.
 pub const MAX_TRIALS: u64 = 1_000_000;
@@ -206,7 +206,7 @@ impl CollectSpec {
             return Ok(());
         }
         match CollectionStatus::of(&config) {
-            Ok(CollectionStatus::New | CollectionStatus::PendingStep { .. }) if !is_there => Ok(()),
+            Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
             Ok(_) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),
@@ -268,7 +268,7 @@ impl TrainSpec {
                 field: "preset",
                 reason: error.to_string(),
             },
-            other => settings(wording::sentence(&other)),
+            other => settings(error_text::with_causes(&other)),
         })?;
         Ok(TrainConfig {
             name: self.name.clone(),

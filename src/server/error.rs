@@ -19,7 +19,7 @@ use crate::frame::FrameError;
 use crate::jobs::JobError;
 use crate::serving::ServingError;
 use crate::versions::VersionError;
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 /// When to try again where nothing more is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -176,7 +176,7 @@ impl From<ServingError> for ApiError {
             ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(sentence(&error)),
+            | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
         }
     }
 }
@@ -196,7 +196,7 @@ impl From<PredictError> for ApiError {
             PredictError::Picture(FrameError::Size { .. }) => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
-            PredictError::Picture(_) => Self::Internal(sentence(&error)),
+            PredictError::Picture(_) => Self::Internal(with_causes(&error)),
         }
     }
 }
@@ -204,7 +204,7 @@ impl From<PredictError> for ApiError {
 impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
-            ImageError::Encode(_) => Self::Internal(sentence(&error)),
+            ImageError::Encode(_) => Self::Internal(with_causes(&error)),
             _ => Self::Unprocessable(error.to_string()),
         }
     }
@@ -246,7 +246,7 @@ impl From<JobError> for ApiError {
             | JobError::Threads(_)
             | JobError::Dataset(_)
             | JobError::Versions(_)
-            | JobError::Store(_) => Self::Internal(sentence(&error)),
+            | JobError::Store(_) => Self::Internal(with_causes(&error)),
         }
     }
 }
@@ -259,7 +259,7 @@ impl From<VersionError> for ApiError {
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(sentence(&error))
+                Self::Internal(with_causes(&error))
             }
         }
     }
@@ -269,7 +269,7 @@ impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
             DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(sentence(&error)),
+            _ => Self::Internal(with_causes(&error)),
         }
     }
 }

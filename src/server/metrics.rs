@@ -51,6 +51,6 @@ pub(super) async fn keep_folded() -> Infallible {
     let mut ticks = tokio::time::interval(FOLD_INTERVAL);
     loop {
         ticks.tick().await;
-        telemetry::fold();
+        telemetry::run_upkeep();
     }
 }

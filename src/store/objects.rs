@@ -13,7 +13,7 @@ use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::{files_below, if_there, is_partial, remove_abandoned, remove_dir, write_atomically};
+use crate::files::{files_below, none_if_missing, is_partial, remove_stale_partials, remove_dir, write_atomically};
 
 /// The data directory, and where it is mirrored.
 #[derive(Clone)]
@@ -101,7 +101,7 @@ impl Objects {
     /// Whether a file in the data directory is as the one where objects are kept. Errors: `Io`, `Object`.
     pub async fn is_same(&self, path: &str) -> Result<bool, StoreError> {
         let here = self.data_dir.join(path);
-        let found = if_there(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
+        let found = none_if_missing(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
         Ok(found.is_some() && found == self.read(path).await?)
     }
 
@@ -113,7 +113,7 @@ impl Objects {
             return Ok(false);
         }
         on_disk("list", &self.data_dir.join(dir), |dir| {
-            remove_abandoned(dir);
+            remove_stale_partials(dir);
             Ok(())
         })
         .await?;
@@ -142,7 +142,7 @@ impl Objects {
     pub async fn read(&self, path: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let Some(shared) = &self.shared else {
             let path = self.data_dir.join(path);
-            return if_there(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
+            return none_if_missing(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
         };
         match read(shared, &Key::from(path)).await {
             Ok(bytes) => Ok(Some(bytes)),

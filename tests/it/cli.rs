@@ -70,7 +70,7 @@ fn usage_errors_exit_with_2_and_advice() {
         ("collect --trials 4 --frame-size 8", "trials: 3 there, 4 asked"),
         (
             "collect --out thesis",
-            "thesis exists and is not a collection; name a directory that doesn't exist",
+            "thesis exists and is not a collection; use a directory that does not exist",
         ),
         ("collect --out thesis/one.tex", "one.tex exists and is not a collection"),
         (
@@ -94,9 +94,9 @@ fn usage_errors_exit_with_2_and_advice() {
         ("train", "but the train split has only"),
         (
             "train --set model.context=90",
-            "a window of 95 frames (90 seen, 5 to come) is longer than every episode",
+            "a window of 95 frames (context 90, horizon 5) is longer than every episode",
         ),
-        ("train --set name=A", "\"A\" is no model name"),
+        ("train --set name=A", "\"A\" is not a valid model name"),
         (
             "evaluate --model plane",
             "there is no model \"plane\" in models; there are: moving, plain",
@@ -234,7 +234,7 @@ fn damaged_files_exit_with_1_and_the_cause() {
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
     let (code, text) = run(dir.path(), "inspect static-observer");
     assert!(code == 1 && text.contains("file-000.parquet has the sha256"), "{text}");
-    assert!(text.contains("restore the file or collect the data set anew"), "{text}");
+    assert!(text.contains("restore the file or collect the data set again"), "{text}");
 
     record_hash(
         &dir.path().join("data/datasets/static-observer"),
@@ -247,13 +247,13 @@ fn damaged_files_exit_with_1_and_the_cause() {
     fs::write(dir.path().join("models/plain/model.safetensors"), b"short").unwrap();
     let (code, text) = run(dir.path(), "inspect plain");
     assert!(
-        code == 1 && text.contains("fetch the model again or train it anew"),
+        code == 1 && text.contains("download the model or train it again"),
         "{text}"
     );
     fs::write(dir.path().join("models/plain/manifest.json"), b"{").unwrap();
     let (code, text) = run(dir.path(), "evaluate --model plain");
     assert!(
-        code == 1 && text.contains("manifest.json is no model manifest: EOF"),
+        code == 1 && text.contains("manifest.json is not a valid model manifest: EOF"),
         "{text}"
     );
 }
@@ -296,7 +296,7 @@ fn collect_train_and_evaluate_share_default_directories() {
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();
     let (code, text) = run(dir.path(), &format!("train {small} --out thesis"));
     assert!(
-        code == 2 && text.contains("thesis exists and holds no training run; name a new directory"),
+        code == 2 && text.contains("thesis exists and holds no training run; use a new directory"),
         "{text}"
     );
     succeed(dir.path(), &format!("train {small}"));

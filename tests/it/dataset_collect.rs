@@ -141,11 +141,11 @@ fn resuming_simulates_only_missing_trials() {
     let error = run_until(&one_thread, 7).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "stopped with 6 of 11 trials kept; run the same command again to go on"
+        "stopped after 6 of 11 trials were saved; run the same command again to resume"
     );
     assert_eq!(
         CollectionStatus::of(&one_thread).unwrap(),
-        CollectionStatus::PendingStep { trials: 6 }
+        CollectionStatus::Unfinished { trials: 6 }
     );
     let first = AtomicU64::new(u64::MAX);
     let on_progress = |progress: CollectProgress| {
@@ -178,7 +178,7 @@ fn opening_an_unfinished_data_set_explains_how_to_resume() {
     let out = directory.path().join("set");
     run_until(&config(&out), 4).unwrap_err();
     let message = Dataset::open(&out).unwrap_err().to_string();
-    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to go on"));
+    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to resume it"));
     assert!(message.contains("\"trials\":11"), "{message}");
 }
 
@@ -209,7 +209,8 @@ fn resuming_with_other_arguments_is_refused() {
     let message = run(&other).unwrap_err().to_string();
     assert!(
         message.ends_with(
-            "was begun with other arguments (trials: 11 there, 12 asked); use those to go on, or name another directory"
+            "holds a collection with other arguments (trials: 11 in the directory, 12 requested); use the same arguments to \
+             resume it, or use another directory"
         ),
         "{message}"
     );

@@ -154,7 +154,7 @@ fn a_window_longer_than_every_episode_is_refused() {
         .unwrap_err();
     assert_eq!(
         error.to_string(),
-        "a window of 10 frames (5 seen, 5 to come) is longer than every episode of the train split; the longest runs \
+        "a window of 10 frames (context 5, horizon 5) is longer than every episode of the train split; the longest has \
          9 frames without a gap"
     );
 }
@@ -178,7 +178,8 @@ fn sampling_too_many_windows_is_refused_with_their_number() {
     let error = splits.sample(&dataset, Split::Train, shape, 1000, Seed(0)).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "data.windows is 1000, but the train split has only 71; ask for fewer (data.windows=all takes what there is) or collect more"
+        "data.windows is 1000, but the train split has only 71 windows; use a smaller number, use data.windows=all, or \
+         collect more trials"
     );
 }
 
@@ -198,7 +199,7 @@ fn columns_of_different_lengths_are_refused() {
     let mut data = episode(5, &[], None);
     data.actions.pop();
     let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
-    assert_eq!(error.to_string(), "episode 0: action has 4 values; 5 frames take 5");
+    assert_eq!(error.to_string(), "episode 0: action has 4 values; 5 frames need 5");
 }
 
 #[test]

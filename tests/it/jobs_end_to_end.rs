@@ -206,7 +206,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
     let refused = post(&app, "/v1/models/plain/versions/4/activate", &Value::Null)
         .await
         .detail(422);
-    assert!(refused.contains("do not fit their manifest"), "{refused}");
+    assert!(refused.contains("do not match their manifest"), "{refused}");
     assert_eq!(get(&app, "/v1/models/plain").await.json()["active_version"], 2);
 
     let unknown = post(&app, "/v1/models/plain/versions/7/activate", &Value::Null)

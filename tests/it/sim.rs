@@ -121,7 +121,7 @@ fn robots_never_overlap() {
         };
         let mut world = World::new(Scenario::Crowded, &config, Seed(5), trial).unwrap();
         while !world.step(&world.policy_action()).unwrap().truncated {
-            let mut places: Vec<[f32; 2]> = world.mover_poses().into_iter().map(arena::position).collect();
+            let mut places: Vec<[f32; 2]> = world.other_robot_poses().into_iter().map(arena::position).collect();
             places.push(arena::position(world.observer_pose()));
             for (index, &one) in places.iter().enumerate() {
                 for &other in &places[..index] {
@@ -162,7 +162,7 @@ fn a_world_rebuilt_from_its_parameters_is_the_same() {
     let written = serde_json::to_string(world.parameters()).unwrap();
     let again = World::from_parameters(serde_json::from_str(&written).unwrap(), &config).unwrap();
     assert_eq!(world.observe(), again.observe());
-    assert_eq!(world.photograph().unwrap().0, world.observe().frame);
+    assert_eq!(world.render().unwrap().0, world.observe().frame);
 }
 
 #[test]
@@ -174,7 +174,7 @@ fn static_trials_show_the_whole_robot_for_twelve_frames() {
         let mut frames = 1;
         loop {
             assert!(
-                is_whole(&world.camera(), world.mover_poses()[0]),
+                is_whole(&world.camera(), world.other_robot_poses()[0]),
                 "trial {trial}, frame {frames}"
             );
             let step = world.step(&world.policy_action()).unwrap();
@@ -285,7 +285,7 @@ fn the_mask_of_tb2_is_where_its_body_projects() {
         for _ in 0..5 {
             world.step(&action(0.0, 0.0)).unwrap();
         }
-        let (mask, pose) = (world.observe().mask, world.mover_poses()[0]);
+        let (mask, pose) = (world.observe().mask, world.other_robot_poses()[0]);
         assert!(mask.iter().all(|&owner| owner <= 1));
         let pixels: Vec<usize> = (0..mask.len()).filter(|&index| mask[index] == 1).collect();
         let mean = pixels.iter().map(|index| (index % 128) as f32 + 0.5).sum::<f32>() / pixels.len() as f32;

@@ -64,7 +64,7 @@ fn an_action_of_the_wrong_length_is_refused() {
     let error = world.step(&Action::try_from(vec![0.0; 3]).unwrap()).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "an action of 3 components was given; it takes 2: linear (m/s) and angular (rad/s)"
+        "the action has 3 components; it must have 2: linear (m/s) and angular (rad/s)"
     );
     assert!(Action::try_from(vec![0.0, f32::NAN]).is_err());
 }

@@ -225,7 +225,7 @@ fn a_damaged_checkpoint_is_refused_with_advice() {
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     let error = train(&config, &dataset, dir.path()).unwrap_err().to_string();
     assert!(
-        error.contains("cannot be gone on from") && error.contains("delete it to start anew"),
+        error.contains("cannot resume from the checkpoint") && error.contains("delete it to start again"),
         "{error}"
     );
 }
