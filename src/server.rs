@@ -133,7 +133,7 @@ impl App {
     pub async fn open(config: ServerConfig) -> Result<Self, ServerError> {
         config.validate()?;
         let store = Store::open(&config.store()).await?;
-        let models = Versions::new(store.clone(), &config.models_dir).serving().await?;
+        let models = Versions::new(store.clone(), &config.models_dir).load_serving().await?;
         Self::start(config, models, store)
     }
 
@@ -362,11 +362,11 @@ async fn follow(app: App) {
     let (mut stopping, mut refused) = (app.streams().stopping(), std::collections::BTreeSet::new());
     loop {
         tokio::select! {
-            () = app.jobs().ended() => {}
+            () = app.jobs().job_ended() => {}
             () = tokio::time::sleep(FOLLOW_EVERY) => {}
             () = streams::told(&mut stopping) => return,
         }
-        if let Err(error) = app.versions().follow(app.predictor(), &mut refused).await {
+        if let Err(error) = app.versions().load_activated(app.predictor(), &mut refused).await {
             warn!(%error, "could not look for newly activated versions");
         }
     }

@@ -132,12 +132,12 @@ pub(super) async fn of_session(
 ) -> Result<Response, ApiError> {
     let model = Arc::clone(session.model());
     let (state, format) = (session.state().0, request.format);
-    let (have, need) = (state.have(), model.manifest.spec.context);
+    let (have, need) = (state.frame_count(), model.manifest.spec.context);
     if have < need {
         return Err(PredictError::Buffering { have, need }.into());
     }
     let told = predict::last_state(request.state, None, 0)?.or_else(|| state.robot_state().cloned());
-    let task = state.futures(premises(request.candidates, told, &model.manifest, app.config())?);
+    let task = state.rollout_task(premises(request.candidates, told, &model.manifest, app.config())?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     blocking(move || answer(wanted, format, &model, &[], &computed)).await?
 }
@@ -147,7 +147,7 @@ impl RolloutRequest {
         let seen = predict::decode_frames(self.frames, self.format, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, seen.len())?;
         let premises = premises(self.candidates, state, manifest, config)?;
-        let task = Task::futures(seen.clone(), premises, &manifest.name, &manifest.spec)?;
+        let task = Task::rollout(seen.clone(), premises, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
     }
 }
@@ -185,7 +185,7 @@ fn answer(
     seen: &[Frame],
     computed: &TaskOutput,
 ) -> Result<Response, ApiError> {
-    let futures = &computed.futures;
+    let futures = &computed.predictions;
     let encoded = |format| {
         futures
             .iter()

@@ -31,7 +31,7 @@ async fn invalid_requests_are_answered_with_problem_details() {
     assert!(get(&app, PLAIN).await.detail(405).contains("openapi.json"));
     assert!(get(&app, "/nothing").await.detail(404).contains("openapi.json"));
     let none = get(&app, "/v1/models/movin").await.detail(404);
-    assert_eq!(none, "no model is named \"movin\"; there are: moving, plain");
+    assert_eq!(none, "there is no model \"movin\"; there are: moving, plain");
     assert!(
         get(&app, "/v1/models/plain/stream")
             .await

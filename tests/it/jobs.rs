@@ -127,7 +127,7 @@ async fn queued_jobs_are_limited_and_cancelled_once() {
     let refused = post(&app, JOBS, &collect("d")).await;
     assert_eq!(
         refused.detail(503),
-        "2 jobs wait already; cancel one or try again later"
+        "the job queue is full (2 jobs are waiting); cancel one or try again later"
     );
     assert_eq!(refused.headers["retry-after"], "1");
     let same = post(&app, "/v1/jobs/job-3/cancel", &Value::Null).await;
@@ -135,7 +135,7 @@ async fn queued_jobs_are_limited_and_cancelled_once() {
     let taken = post(&app, JOBS, &collect("a")).await.detail(409);
     assert_eq!(
         taken,
-        "name: data set \"a\" is being made by another job; choose another name"
+        "name: data set \"a\" is the output of another job that has not ended; choose another name"
     );
     assert_eq!(
         post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.json()["cancelling"],
@@ -145,11 +145,11 @@ async fn queued_jobs_are_limited_and_cancelled_once() {
     let again = post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.detail(409);
     assert_eq!(
         again,
-        "job job-1 has been cancelled; only one that waits or runs can be cancelled"
+        "job job-1 is cancelled; only a queued or running job can be cancelled"
     );
     assert_eq!(
         get(&app, "/v1/jobs/job-77").await.detail(404),
-        "there is no job \"job-77\"; of those that ended only the latest are remembered"
+        "there is no job \"job-77\"; only the latest ended jobs are kept"
     );
 }
 
@@ -189,7 +189,7 @@ async fn only_cancelled_or_failed_jobs_can_be_resumed() {
     let early = post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.detail(409);
     assert_eq!(
         early,
-        "job job-1 has started; only one that failed or was cancelled can be resumed"
+        "job job-1 is running; only a failed or cancelled job can be resumed"
     );
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
     wait_for_state(&app, "job-1", "cancelled").await;
@@ -250,7 +250,7 @@ async fn an_idempotency_key_creates_one_job() {
     assert_eq!(ask(collect("a"), "k-1").await.json()["state"], "succeeded");
     let other = ask(collect("b"), "k-1").await.detail(422);
     assert!(
-        other.starts_with("Idempotency-Key: it was used for another job, job-1"),
+        other.starts_with("Idempotency-Key: it was used for a different job, job-1"),
         "{other}"
     );
     let long = ask(collect("b"), &"k".repeat(129)).await.detail(422);
@@ -290,10 +290,10 @@ async fn jobs_are_listed_by_kind_and_state_in_pages() {
     for (query, part) in [
         (
             "kind=dream",
-            "\"dream\" is no kind; there are: collect, train, evaluate",
+            "there is no kind \"dream\"; there are: collect, train, evaluate",
         ),
         ("state=asleep", "unknown variant `asleep`"),
-        ("before=7", "\"7\" is no job's id"),
+        ("before=7", "\"7\" is not a job id"),
         ("limit=0", "limit: 0 is out of range; it must be 1 to 1000"),
         ("colour=red", "unknown field `colour`"),
     ] {
@@ -357,7 +357,7 @@ async fn an_invalid_job_is_refused_at_submission() {
             422,
             "trials: 0 is out of range; 1 to 1000000 trials can be collected",
         ),
-        (collect("../up"), 422, "name: \"../up\" is no name"),
+        (collect("../up"), 422, "name: \"../up\" is not a valid name"),
         (
             train(json!({})),
             422,

@@ -306,7 +306,7 @@ async fn data_sets_are_described_shown_and_deleted() {
     let needed = delete(&app, "/v1/datasets/seen").await.detail(409);
     assert_eq!(
         needed,
-        "data set \"seen\" is in use by job-2; wait for its end or cancel it"
+        "data set \"seen\" is in use by job-2; wait until that job has ended, or cancel it"
     );
     post(&app, "/v1/jobs/job-2/cancel", &Value::Null).await;
     poll_until(async || (get(&app, "/v1/jobs/job-2").await.json()["state"] == "cancelled").then_some(())).await;

@@ -174,7 +174,7 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
         let job = wait_until(&address, "job-1", |job| job["attempts"] == kill + 1);
         assert!(
             started.elapsed() < LEASE,
-            "the job was claimed only after its lease expired: {job}"
+            "the job was claimed only after its lease had expired: {job}"
         );
         std::thread::sleep(at_most.mul_f64(rng.random_range(0.1..1.0)));
         if ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"] != "running" {

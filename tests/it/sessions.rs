@@ -237,7 +237,7 @@ async fn an_invalid_state_is_refused_with_the_field() {
     let state = get(&app, &session.path("/state")).await.json();
     for (pointer, value, status, detail) in [
         ("/weights_sha256", json!("00"), 409, "here version 1"),
-        ("/model", json!("none"), 404, "no model is named"),
+        ("/model", json!("none"), 404, "there is no model"),
         ("/memory/next_seq", json!(0), 422, "state.memory.next_seq is 0"),
         (
             "/memory/features",

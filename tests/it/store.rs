@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use foreframe::store::{
-    EnqueueResult, JobOutcome, JobPage, JobRow, JobUpdate, Lease, LossRow, NewJob, Store, StoreConfig,
+    EnqueueResult, JobOutcome, JobPage, JobRow, JobReport, Lease, LossRow, NewJob, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
@@ -54,7 +54,7 @@ async fn stores(name: &str) -> Vec<(TempDir, Store)> {
 fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
     NewJob {
         kind: "collect".to_owned(),
-        makes: makes.map(str::to_owned),
+        exclusive_output: makes.map(str::to_owned),
         spec: "{}".to_owned(),
         progress: "{}".to_owned(),
         idempotency_key: key.map(str::to_owned),
@@ -78,8 +78,8 @@ fn outcome(state: &'static str) -> JobOutcome {
     }
 }
 
-fn update(line: &str) -> JobUpdate {
-    JobUpdate {
+fn report(line: &str) -> JobReport {
+    JobReport {
         progress: "{\"done\":1}".to_owned(),
         lines: vec![(2.0, line.to_owned())],
         losses: vec![LossRow {
@@ -104,14 +104,14 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         );
         assert_eq!(store.claim("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
-            assert_eq!(store.renew(lease, 20.0, update(line)).await.unwrap(), Some(false));
+            assert_eq!(store.renew(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
         assert_eq!(
-            store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(),
+            store.renew(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
         );
-        assert!(store.end(lease, outcome("cancelled"), update("five")).await.unwrap());
+        assert!(store.end(lease, outcome("cancelled"), report("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.cancelling, row.ended_s),
@@ -125,10 +125,10 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
         assert_eq!(lines, [(4, "four"), (5, "five")]);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
-        assert_eq!(store.job_losses(1).await.unwrap(), update("").losses);
+        assert_eq!(store.job_losses(1).await.unwrap(), report("").losses);
         assert!(
             !store
-                .end(lease, outcome("succeeded"), JobUpdate::default())
+                .end(lease, outcome("succeeded"), JobReport::default())
                 .await
                 .unwrap()
         );
@@ -143,17 +143,17 @@ async fn an_expired_lease_cannot_write() {
         assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
         let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
-        assert_eq!(store.renew(stale, 99.0, update("from an expired lease")).await.unwrap(), None);
+        assert_eq!(store.renew(stale, 99.0, report("from an expired lease")).await.unwrap(), None);
         assert!(
             !store
-                .end(stale, outcome("failed"), update("from an expired lease"))
+                .end(stale, outcome("failed"), report("from an expired lease"))
                 .await
                 .unwrap()
         );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
         assert_eq!(
-            store.renew(fresh, 40.0, JobUpdate::default()).await.unwrap(),
+            store.renew(fresh, 40.0, JobReport::default()).await.unwrap(),
             Some(false)
         );
         assert_eq!(store.release_leases("slow").await.unwrap(), 0);
@@ -292,7 +292,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
         };
         assert!(
             store
-                .end(lease, published(5, true), JobUpdate::default())
+                .end(lease, published(5, true), JobReport::default())
                 .await
                 .unwrap()
         );
@@ -300,7 +300,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
         assert_eq!(version, 6);
         assert!(
             store
-                .end(lease, published(6, true), JobUpdate::default())
+                .end(lease, published(6, true), JobReport::default())
                 .await
                 .unwrap()
         );
@@ -390,7 +390,7 @@ async fn an_unreachable_postgresql_is_refused_with_the_reason() {
     let reason = if cfg!(feature = "cloud") {
         "server does not support TLS"
     } else {
-        "built without; build it with --features cloud"
+        "built without it; build it with --features cloud"
     };
     assert!(error.contains(reason), "{error}");
     let nobody = tokio::net::TcpListener::bind("127.0.0.1:0")

@@ -112,7 +112,7 @@ impl SessionCore {
             return Err(StepError::Seq(step.seq));
         }
         if step.seq < next {
-            return Ok(match (&self.kept, self.state.again(spec)) {
+            return Ok(match (&self.kept, self.state.repeat_task(spec)) {
                 (Some(kept), _) => PendingStep::CachedAnswer(kept.clone()),
                 (None, Some(task)) => PendingStep::Again(task),
                 (None, None) => PendingStep::CachedAnswer(self.last(step.timestamp_us, 0, None)),
@@ -156,7 +156,7 @@ impl SessionCore {
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
         };
-        let future = computed.futures.into_iter().next();
+        let future = computed.predictions.into_iter().next();
         let prediction = future.map(|frames| (frames.into(), timing));
         let kept = self.last(timestamp_us, skipped, prediction);
         self.kept = Some(kept.clone());
@@ -168,7 +168,7 @@ impl SessionCore {
             seq: self.state.next_seq().saturating_sub(1),
             timestamp_us,
             skipped,
-            have: self.state.have(),
+            have: self.state.frame_count(),
             prediction,
         }
     }

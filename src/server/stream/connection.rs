@@ -23,7 +23,7 @@ use crate::server::sessions::core::{FrameStep, StepError};
 use crate::server::sessions::limits;
 use crate::server::sessions::session::{Hold, Holder, Session};
 use crate::server::{App, streams};
-use crate::serving::{ConditioningInput, RawConditioning, STEP};
+use crate::serving::{ConditioningInput, RawConditioning, STEP_FIELDS};
 use crate::telemetry::names;
 use crate::types::{Action, RobotState};
 
@@ -232,7 +232,7 @@ impl StreamConnection {
         Ok(Box::new(FrameStep {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            premise: ConditioningInput::new(told, &STEP, &manifest.name, &manifest.spec)?,
+            premise: ConditioningInput::new(told, &STEP_FIELDS, &manifest.name, &manifest.spec)?,
             frame: images::decode("image", message.image, message.format, manifest)?,
             format: message.format,
             is_overtaken: false,
