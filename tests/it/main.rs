@@ -50,3 +50,4 @@ mod store_objects;
 mod stream;
 mod stream_accuracy;
 mod training;
+mod warp;
