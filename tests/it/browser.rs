@@ -170,7 +170,7 @@ async fn serve(data_dir: &Path) -> (App, Keys, Running) {
     })
     .await
     .unwrap();
-    let keys = Keys::of(app.store().clone(), false).await.unwrap();
+    let keys = Keys::open(app.store().clone(), false).await.unwrap();
     let app = app.with_keys(keys.clone());
     (app.clone(), keys, run(app).await)
 }

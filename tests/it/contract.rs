@@ -2,7 +2,7 @@
 
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::server::{ServerConfig, openapi};
+use foreframe::server::{ServerConfig, openapi_document};
 use serde_json::{Value, json};
 
 use crate::service::{app, get, post, post_text, send, until};
@@ -91,7 +91,7 @@ async fn the_server_is_ready_once_its_models_are_warm() {
 #[test]
 fn the_committed_contract_is_the_codes() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
-    let document = openapi::document();
+    let document = openapi_document();
     if std::env::var_os("UPDATE_OPENAPI").is_some() {
         std::fs::write(path, &document).unwrap();
     }
