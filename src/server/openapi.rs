@@ -1,5 +1,10 @@
 //! The OpenAPI document: what all routes have in common. The routes describe themselves.
 
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use serde_json::Value;
+use utoipa::openapi::path::ParameterBuilder;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::openapi::{Content, Header, Ref, RefOr, Response, ResponseBuilder};
 use utoipa::{Modify, OpenApi};
@@ -86,6 +91,49 @@ fn as_problem(status: &str, response: &mut Response) {
     }
 }
 
+/// Examples, so that the pages at `/docs` can send every request without editing. By path: a request body, and the model
+/// in the path if it is not the default one.
+const EXAMPLES: &str = include_str!("../../openapi/examples.json");
+/// The example of a model in a path.
+const EXAMPLE_MODEL: &str = "paper";
+
+#[derive(Deserialize)]
+struct PathExample {
+    model: Option<String>,
+    body: Value,
+}
+
+struct Examples;
+
+impl Modify for Examples {
+    #[expect(clippy::expect_used, reason = "the examples are part of the program, and a test sends each")]
+    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
+        let mut examples: BTreeMap<String, PathExample> =
+            serde_json::from_str(EXAMPLES).expect("examples that are not JSON are a bug");
+        for (path, item) in &mut contract.paths.paths {
+            let example = examples.remove(path);
+            let model = example.as_ref().and_then(|example| example.model.as_deref());
+            let operations = [&mut item.get, &mut item.post, &mut item.delete];
+            for operation in operations.into_iter().flatten() {
+                for parameter in operation.parameters.iter_mut().flatten() {
+                    if let RefOr::T(parameter) = parameter
+                        && parameter.name == "model"
+                    {
+                        let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
+                        *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
+                    }
+                }
+                if let (Some(RefOr::T(body)), Some(example)) = (&mut operation.request_body, &example)
+                    && let Some(RefOr::T(content)) = body.content.get_mut("application/json")
+                {
+                    content.example = Some(example.body.clone());
+                }
+            }
+        }
+        assert!(examples.is_empty(), "an example without a path is a bug");
+    }
+}
+
 /// The contract without its paths.
 pub(super) fn frame() -> utoipa::openapi::OpenApi {
     Contract::openapi()
@@ -96,6 +144,7 @@ pub(super) fn frame() -> utoipa::openapi::OpenApi {
 pub(super) fn text(mut contract: utoipa::openapi::OpenApi) -> String {
     KeySecurity.modify(&mut contract);
     Problems.modify(&mut contract);
+    Examples.modify(&mut contract);
     let mut text = contract.to_pretty_json().expect("a contract that is not JSON is a bug");
     text.push('\n');
     text

@@ -1,5 +1,5 @@
-//! The messages of a stream, the same in both sub-protocols; [`codec`] takes them from and to the wire. Knows no socket.
-//! `openapi/asyncapi.yaml` is the contract, with an example of each.
+//! The messages of a stream, the same in both sub-protocols; [`codec`] reads and writes them. Knows no socket.
+//! `openapi/asyncapi.yaml` is the contract, with an example of each message.
 
 mod flat;
 
@@ -20,50 +20,50 @@ pub use codec::Codec;
 pub enum ClientMessage {
     /// The next frame.
     Frame(FrameMessage),
-    /// How the session shall behave from here on.
+    /// Changes settings of the session from here on.
     Configure(ConfigureMessage),
-    /// Asks for a sign of life.
+    /// Asks for a `pong`.
     Ping(PingMessage),
     /// Ends the stream; the session stays.
     Close(CloseMessage),
 }
 
-/// A frame with what the robot does and says of itself when it is taken.
+/// A frame with the robot's action and state at that time.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrameMessage {
-    /// Counts from 0; a number once answered gets the last answer again and changes nothing.
+    /// Sequence number, from 0. A number that was answered before gets the last answer again and changes nothing.
     pub seq: u64,
-    /// The client's clock in microseconds; echoed.
+    /// Time of the client's clock in microseconds; echoed.
     pub timestamp_us: i64,
     /// The image.
     pub image: ImageBytes,
-    /// How the image is encoded, and how those of the answer shall be, unless configured.
+    /// How the image is encoded, and the images of the answer unless configured.
     #[serde(default)]
     pub format: ImageFormat,
-    /// What acts from this frame to the next, in the model's order and units; needed where the model is conditioned on
+    /// The action from this frame to the next, in the model's order and units. Required if the model is conditioned on
     /// actions and there is no `plan`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub action: Option<Vec<f32>>,
-    /// What the robot says of itself at this frame; needed where the model is conditioned on it.
+    /// The robot's state at this frame. Required if the model is conditioned on it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<Vec<f32>>,
-    /// The actions to predict under, as many as the model's horizon; default: `action`, held.
+    /// The future actions, as many as the model's horizon. Default: `action`, repeated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<Vec<Vec<f32>>>,
 }
 
-/// Settings of a session; what is absent stays as it is.
+/// Changes of a session's settings; absent settings stay as they are.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ConfigureMessage {
-    /// What a missing frame means.
+    /// What happens if frames are missing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_gap: Option<OnGap>,
-    /// What a frame means that a newer one has overtaken.
+    /// What happens to a frame if newer frames wait behind it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_late: Option<OnLate>,
-    /// How predicted frames are encoded, whatever the format of those sent.
+    /// How predicted frames are encoded, whatever the format of the frames sent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub format: Option<ImageFormat>,
     /// How a frame of another size is resized.
@@ -87,26 +87,26 @@ pub struct SessionSettings {
     pub fit: Option<Fit>,
 }
 
-/// What a missing frame means.
+/// What happens if frames are missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum OnGap {
-    /// The frame that leaves others out is refused.
+    /// The frame after the gap is refused.
     #[default]
     Error,
-    /// The session goes on with it, and its answer says how many are missing.
+    /// The session continues with the frame after the gap, and its answer counts the missing frames.
     Skip,
 }
 
-/// What a frame means that a newer one has overtaken: it waits behind it when its turn comes.
+/// What happens to a frame if newer frames already wait behind it when its turn comes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum OnLate {
-    /// It is predicted from as any other.
+    /// It gets a prediction like any other frame.
     #[default]
     Predict,
-    /// It is taken into the context, and nothing is predicted from it: what is predicted is never of the past for long,
-    /// and a server that is too busy for all frames predicts from the newest. Of at most `pipelined_frames` in a row.
+    /// It goes into the context but gets no prediction, so that a busy server predicts from the newest frame. At most
+    /// `pipelined_frames` in a row are skipped.
     Skip,
 }
 
@@ -114,12 +114,12 @@ pub enum OnLate {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct PingMessage {
-    /// The client's clock in microseconds; echoed.
+    /// Time of the client's clock in microseconds; echoed.
     #[serde(default)]
     pub timestamp_us: i64,
 }
 
-/// Nothing but its type.
+/// A message without fields.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CloseMessage {}
@@ -128,40 +128,40 @@ pub struct CloseMessage {}
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum ServerMessage {
-    /// First of all.
+    /// The first message.
     Ready {
-        /// The session's id; absent where the session ends with its stream.
+        /// The session's id; absent if the session ends with its stream.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         session: Option<String>,
         /// The model's name.
         model: String,
         /// The model's version.
         version: u32,
-        /// What it takes and gives.
+        /// The model's inputs and outputs.
         spec: Box<ModelSpec>,
         /// The stream's bounds.
         limits: StreamLimits,
-        /// The number the next frame shall have.
+        /// The `seq` of the next frame.
         next_seq: u64,
     },
-    /// Frames are missing until the context is full.
+    /// The context is not yet full.
     Buffering {
-        /// The frame's number.
+        /// The `seq` of the frame.
         seq: u64,
-        /// The frame's time, echoed.
+        /// The time of the frame, echoed.
         timestamp_us: i64,
-        /// Frames there are.
+        /// Frames in the context.
         have: usize,
-        /// Frames needed.
+        /// Frames that the context takes.
         need: usize,
-        /// Frames left out before this one.
+        /// Missing frames before this one.
         skipped: u64,
     },
-    /// The frames to come.
+    /// The predicted frames.
     Prediction {
-        /// The frame's number.
+        /// The `seq` of the frame.
         seq: u64,
-        /// The frame's time, echoed.
+        /// The time of the frame, echoed.
         timestamp_us: i64,
         /// t+1, t+2, ….
         frames: Vec<ImageBytes>,
@@ -169,36 +169,36 @@ pub enum ServerMessage {
         format: ImageFormat,
         /// How long it took.
         timing: Timing,
-        /// Predictions left out since the last one that was sent, because they were not read in time.
+        /// Predictions dropped since the last one that was sent, because the client did not read them in time.
         dropped: u64,
-        /// Frames left out before this one.
+        /// Missing frames before this one.
         skipped: u64,
     },
-    /// The frame is in the context; nothing was predicted from it, for a newer one had overtaken it.
+    /// The frame is in the context but got no prediction, because newer frames were waiting.
     Overtaken {
-        /// The frame's number.
+        /// The `seq` of the frame.
         seq: u64,
-        /// The frame's time, echoed.
+        /// The time of the frame, echoed.
         timestamp_us: i64,
-        /// Frames left out before this one.
+        /// Missing frames before this one.
         skipped: u64,
     },
-    /// Answers `configure`: the settings of the session now.
+    /// Answers `configure` with the settings of the session now.
     Configured(SessionSettings),
-    /// Something that the client should know of; nothing was refused.
+    /// A warning; nothing was refused.
     Warning {
-        /// What kind, for programs.
+        /// The kind, for programs.
         code: WarningCode,
-        /// What it is, and what would help.
+        /// The reason and the remedy, for people.
         detail: String,
     },
-    /// Something was refused; unless `closing` follows, the stream goes on.
+    /// A message was refused. The stream continues unless `closing` follows.
     Error {
-        /// What kind, for programs.
+        /// The kind, for programs.
         code: ErrorCode,
         /// What was wrong, and what would be right.
         detail: String,
-        /// The number the next frame shall have.
+        /// The `seq` of the next frame.
         next_seq: u64,
     },
     /// Answers `ping`.
@@ -206,9 +206,9 @@ pub enum ServerMessage {
         /// The client's clock, echoed.
         timestamp_us: i64,
     },
-    /// Last of all.
+    /// The last message.
     Closing {
-        /// Why.
+        /// The reason.
         reason: ClosingReason,
     },
 }
@@ -217,13 +217,13 @@ pub enum ServerMessage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreamLimits {
-    /// Bytes of a message at most.
+    /// Maximum size of a message in bytes.
     pub message_bytes: usize,
-    /// Frames that may be sent before their answers have come; more are read later.
+    /// Maximum number of frames that are read before the earlier ones are answered; more are read later.
     pub pipelined_frames: usize,
-    /// Bytes of answers that wait for a slow reader; beyond them the oldest predictions are dropped.
+    /// Maximum size of the messages that wait for a slow reader, in bytes; beyond it, the oldest predictions are dropped.
     pub buffered_bytes: usize,
-    /// Milliseconds of silence at most.
+    /// Maximum idle time in milliseconds.
     pub idle_ms: u64,
     /// Milliseconds for which the session outlives its stream; 0 if it ends with the stream.
     pub grace_ms: u64,
@@ -248,7 +248,7 @@ impl StreamLimits {
 pub struct Timing {
     /// Microseconds in the queue.
     pub queue_us: u64,
-    /// Microseconds of computation, with the others of its batch.
+    /// Microseconds of computation, of the whole batch.
     pub compute_us: u64,
 }
 
@@ -258,7 +258,7 @@ pub struct Timing {
 pub enum WarningCode {
     /// The client reads too slowly: predictions are dropped.
     Slow,
-    /// Nothing came for long; the stream will be closed.
+    /// No message came for long; the stream will be closed.
     Idle,
 }
 
@@ -270,7 +270,7 @@ pub enum ErrorCode {
     Malformed,
     /// A message that does not fit the model.
     Invalid,
-    /// A frame's number leaves some out.
+    /// Frames are missing before this one.
     Gap,
     /// Too busy to predict; send the same frame again.
     Overloaded,
@@ -282,11 +282,11 @@ pub enum ErrorCode {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ClosingReason {
-    /// The client asked.
+    /// The client asked for it.
     Asked,
-    /// Nothing came for too long.
+    /// No message came for too long.
     Idle,
-    /// The session was taken over by a newer connection.
+    /// A newer stream replaced this one.
     Replaced,
     /// The session was deleted.
     Deleted,
@@ -294,7 +294,7 @@ pub enum ClosingReason {
     Slow,
     /// A message was longer than `limits.message_bytes`.
     TooLong,
-    /// What came is against the WebSocket's own rules.
+    /// An error of the WebSocket protocol.
     Malformed,
     /// Text that is not UTF-8.
     NotUtf8,
