@@ -1,7 +1,8 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
-//! from the model's value range, [`quality`] compares two images, [`warp`] moves pixels.
+//! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels.
 
 pub mod codec;
+pub mod fit;
 pub mod preprocess;
 pub mod quality;
 pub mod warp;

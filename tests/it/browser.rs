@@ -175,7 +175,7 @@ async fn serve_with(data_dir: &Path, max_environments: usize) -> (App, Keys, InP
     })
     .await
     .unwrap();
-    let keys = Keys::of(app.store().clone(), false).await.unwrap();
+    let keys = Keys::open(app.store().clone(), false).await.unwrap();
     let app = app.with_keys(keys.clone());
     (app.clone(), keys, run(app).await)
 }

@@ -1,8 +1,10 @@
 //! Common to all responses of the service: the API contract, problem details, request ids, readiness.
 
+use std::collections::BTreeMap;
+
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::server::{ServerConfig, openapi};
+use foreframe::server::{App, ServerConfig, openapi_document};
 use serde_json::{Value, json};
 
 use crate::service::{app, get, post, post_text, send, poll_until};
@@ -91,7 +93,7 @@ async fn the_server_is_ready_after_warming_its_models() {
 #[test]
 fn the_committed_openapi_document_is_current() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
-    let document = openapi::document();
+    let document = openapi_document();
     if std::env::var_os("UPDATE_OPENAPI").is_some() {
         std::fs::write(path, &document).unwrap();
     }
@@ -188,4 +190,68 @@ async fn every_documented_path_exists() {
             );
         }
     }
+}
+
+#[tokio::test]
+async fn every_example_of_the_contract_succeeds() {
+    let dir = tempfile::tempdir().unwrap();
+    // The shipped models, which the examples name.
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    let contract = get(&app, "/openapi.json").await.json();
+    let mut ids = BTreeMap::new();
+    let mut bodies = 0;
+    // The order of paths lets `/v1/sessions` create what `/v1/sessions/{id}/rollouts` needs.
+    for (path, methods) in contract["paths"].as_object().unwrap() {
+        let operation = &methods["post"];
+        let Some(content) = operation["requestBody"]["content"].as_object() else {
+            continue;
+        };
+        let parameters = operation["parameters"].as_array().into_iter().flatten();
+        let model = parameters
+            .clone()
+            .find(|parameter| parameter["name"] == "model")
+            .map_or("", |parameter| parameter["example"].as_str().unwrap());
+        let resource = path.split('/').nth(2).unwrap();
+        let id = ids.get(resource).map_or("", String::as_str);
+        let address = path.replace("{model}", model).replace("{id}", id);
+        let answer = post(&app, &address, &content["application/json"]["example"]).await;
+        let text = String::from_utf8_lossy(&answer.body).into_owned();
+        // A new session has no frames yet; the contract says so.
+        if path == "/v1/sessions/{id}/rollouts" {
+            assert!(operation["responses"]["409"].is_object());
+            assert_eq!(answer.status, 409, "{path}: {text}");
+        } else {
+            assert!(answer.status.is_success(), "{path}: {text}");
+            if let Some(id) = answer.json()["id"].as_str() {
+                ids.insert(resource.to_owned(), id.to_owned());
+            }
+        }
+        bodies += 1;
+    }
+    assert_eq!(bodies, 8);
+}
+
+#[tokio::test]
+async fn without_a_model_the_server_says_what_to_do() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        models_dir: dir.path().join("none"),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    let detail = get(&app, "/readyz").await.detail(503);
+    let models = get(&app, "/v1/models").await.json();
+    assert_eq!(models["notice"], detail);
+    assert!(
+        detail.starts_with("no model found in ") && detail.contains("POST /v1/jobs"),
+        "{detail}"
+    );
+    let dir = tempfile::tempdir().unwrap();
+    let full = self::app(dir.path(), ServerConfig::default());
+    assert!(get(&full, "/v1/models").await.json().get("notice").is_none());
 }

@@ -9,8 +9,9 @@ use axum::body::Body;
 use axum::http::Request;
 use foreframe::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
 use foreframe::nn::Conditioning;
-use foreframe::server::{App, ServerConfig};
+use foreframe::server::{App, AppParts, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
+use foreframe::versions::Versions;
 use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
 
@@ -65,7 +66,13 @@ fn scripted_app(dir: &std::path::Path, obeys_cancel: bool) -> (App, Sender<Resul
         shutdown_deadline_ms: 300,
         ..with_data(dir, ServerConfig::default())
     };
-    (App::with_parts(config, predictor.unwrap(), jobs, store), finish)
+    let parts = AppParts {
+        predictor: predictor.unwrap(),
+        jobs,
+        versions: Versions::new(store.clone(), &config.models_dir),
+        store,
+    };
+    (App::with_parts(config, parts), finish)
 }
 
 fn collect(name: &str) -> Value {

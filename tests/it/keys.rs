@@ -17,7 +17,7 @@ async fn app_with_keys(is_required: bool) -> (tempfile::TempDir, Store, Keys, Ap
         ..StoreConfig::default()
     };
     let store = Store::open(&config).await.unwrap();
-    let keys = Keys::of(store.clone(), is_required).await.unwrap();
+    let keys = Keys::open(store.clone(), is_required).await.unwrap();
     let app = app(dir.path(), ServerConfig::default()).with_keys(keys.clone());
     (dir, store, keys, app)
 }

@@ -2,6 +2,7 @@
 
 use foreframe::server::protocol::{
     ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, OnLate, ServerMessage,
+    SessionSettings,
 };
 use foreframe::server::{ImageFormat, ServerConfig};
 use proptest::prelude::*;
@@ -25,12 +26,14 @@ async fn on_gap_skip_accepts_a_gap_and_reports_it() {
         on_gap: Some(OnGap::Skip),
         on_late: None,
         format: Some(ImageFormat::Png),
+        fit: None,
     });
-    let configured = ServerMessage::Configured {
+    let configured = ServerMessage::Configured(SessionSettings {
         on_gap: OnGap::Skip,
         on_late: OnLate::Predict,
         format: Some(ImageFormat::Png),
-    };
+        fit: None,
+    });
     assert_eq!(client.ask(&configure).await, configured);
     for (seq, expected) in [(2, 2), (3, 0), (5, 1)] {
         let answer = client.ask(&numbered_message(seq)).await;
@@ -68,11 +71,10 @@ async fn on_late_skip_predicts_only_from_the_newest_frame() {
         on_late: Some(OnLate::Skip),
         ..ConfigureMessage::default()
     });
-    let configured = ServerMessage::Configured {
-        on_gap: OnGap::Error,
+    let configured = ServerMessage::Configured(SessionSettings {
         on_late: OnLate::Skip,
-        format: None,
-    };
+        ..SessionSettings::default()
+    });
     assert_eq!(skipped.ask(&configure).await, configured);
     let count = 200;
     for seq in 0..count {
