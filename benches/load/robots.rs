@@ -14,7 +14,7 @@ use crate::http::Http;
 use crate::workload::Workload;
 use crate::schedule::Schedule;
 use crate::process_usage::{CpuShare, Process};
-use crate::robot::{self, Answer, FrameCounts};
+use crate::robot::{self, PredictionTimes, FrameCounts};
 use crate::server::Server;
 use crate::session::{self, Session};
 
@@ -149,7 +149,7 @@ impl RobotLoad {
 
 impl RobotLoadResult {
     /// Latencies of the predictions whose frames were scheduled in the measured time.
-    pub(crate) fn latencies(&self, of: impl Fn(&Answer) -> Duration) -> Latencies {
+    pub(crate) fn latencies(&self, of: impl Fn(&PredictionTimes) -> Duration) -> Latencies {
         let counted = self.counts.answers.iter();
         Latencies::of(
             counted
@@ -169,7 +169,7 @@ impl RobotLoadResult {
 
     /// Predictions per second received in the measured time.
     pub(crate) fn goodput_hz(&self) -> f64 {
-        let received = |answer: &&Answer| (self.from..self.to).contains(&answer.received);
+        let received = |answer: &&PredictionTimes| (self.from..self.to).contains(&answer.received);
         self.counts.answers.iter().filter(received).count() as f64 / (self.to - self.from).as_secs_f64()
     }
 }

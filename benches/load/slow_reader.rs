@@ -19,7 +19,7 @@ use crate::session;
 const RECEIVE_BUFFER_BYTES: u32 = 4096;
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct SlowReaderArgs {
     #[command(flatten)]
     target: Target,
     /// Number of sessions that read
@@ -58,7 +58,7 @@ struct Round {
     unanswered: u64,
 }
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &SlowReaderArgs, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[]).await;
     let workload = Arc::new(Workload::of(&args.target.model));
     let (mut alone, mut beside) = (Vec::new(), Vec::new());
@@ -97,7 +97,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     server.check(bounds);
 }
 
-async fn round(args: &Args, server: &Server, workload: &Arc<Workload>) -> Round {
+async fn round(args: &SlowReaderArgs, server: &Server, workload: &Arc<Workload>) -> Round {
     let load = RobotLoad {
         sessions: args.sessions,
         mode: SendMode::Scheduled(args.rate_hz),
