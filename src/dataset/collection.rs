@@ -13,8 +13,8 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
-use crate::frame::warp::CameraModel;
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
+use crate::frame::warp::CameraModel;
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -141,7 +141,13 @@ fn differences(found: &str, wanted: &str) -> String {
     let differing: Vec<_> = wanted
         .iter()
         .filter(|(key, value)| found.get(*key) != Some(value))
-        .map(|(key, value)| format!("{key}: {} in the directory, {} requested", text(found.get(key)), text(Some(value))))
+        .map(|(key, value)| {
+            format!(
+                "{key}: {} in the directory, {} requested",
+                text(found.get(key)),
+                text(Some(value))
+            )
+        })
         .collect();
     differing.join("; ")
 }
