@@ -34,6 +34,7 @@ pub use sampler::{Split, Splits, WindowShape};
 use crate::files::hex;
 use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
+use crate::sim::WorldConfig;
 use crate::types::{Channel, Seed};
 use crate::wording::listed;
 
@@ -66,6 +67,8 @@ pub struct DatasetInfo {
     pub has_masks: bool,
     /// How the camera projects; none where that is not known.
     pub camera: Option<CameraModel>,
+    /// How the simulated world was run and seen; none for recordings.
+    pub world: Option<WorldConfig>,
 }
 
 impl DatasetInfo {

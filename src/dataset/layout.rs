@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::{DatasetError, DatasetInfo};
 use crate::files::sha256_hex;
 use crate::frame::warp::CameraModel;
+use crate::sim::{CameraConfig, WorldConfig};
 use crate::types::{Channel, Seed};
 
 /// LeRobot's description; written last, so a directory without it is unfinished.
@@ -98,6 +99,16 @@ impl CollectionStamp {
         Self::parse(&path, &text)
     }
 
+    /// What the data set in that directory is. Where the stamp of an older data set has no camera model, the arguments of
+    /// its collection have one. Errors: `Corrupt`, `Io`.
+    pub(super) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
+        let mut info = self.info();
+        info.world = collected_world(directory)?;
+        let camera = info.world.as_ref().map(|world| &world.camera);
+        info.camera = info.camera.or(camera.map(CameraConfig::model));
+        Ok(info)
+    }
+
     /// Checks what a file of that path says. Errors: `Corrupt`.
     pub(super) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
         let corrupt = |reason| DatasetError::Corrupt {
@@ -129,8 +140,29 @@ impl CollectionStamp {
             episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
             has_masks: self.has_masks,
             camera: self.camera,
+            world: None,
         }
     }
+}
+
+/// The arguments of a collection, of which the world is of use later.
+#[derive(Deserialize)]
+struct CollectedWith {
+    world: WorldConfig,
+}
+
+/// How the world of a collection was set up; nothing where the data set was not collected. Errors: `Corrupt`, `Io`.
+fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError> {
+    let path = directory.join(ARGUMENTS);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+    let arguments: CollectedWith = serde_json::from_slice(&text).map_err(|error| DatasetError::Corrupt {
+        path,
+        reason: error.to_string(),
+    })?;
+    Ok(Some(arguments.world))
 }
 
 /// The hex sha256 over the shards' hex hashes, one after another.

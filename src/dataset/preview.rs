@@ -12,7 +12,7 @@ use crate::frame::Frame;
 /// What the finished data set in a directory is, from its description alone.
 /// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
 pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
-    Ok(CollectionStamp::read(directory)?.info())
+    CollectionStamp::read(directory)?.info_in(directory)
 }
 
 /// What the data set is whose [`super::STAMP`] of that path holds the text. Errors: `Corrupt`.

@@ -23,24 +23,33 @@ pub enum Split {
     Train,
     /// Models and settings are selected on it.
     Validation,
-    /// Opened once, for the final figures: trials never seen.
+    /// Scored once, for the published numbers: trials that training never saw.
     Test,
-    /// Start/goal pairs and gains never seen; empty for recordings.
-    TestUnseen,
+    /// Trials whose start/goal pair training never saw, whatever their gain; empty for recordings.
+    UnseenPairs,
+    /// Trials whose controller gain training never saw, with a start/goal pair that it saw; empty for recordings.
+    UnseenGains,
 }
 
 impl Split {
     /// Every split, in the order of their declaration.
-    pub const ALL: [Self; 4] = [Self::Train, Self::Validation, Self::Test, Self::TestUnseen];
+    pub const ALL: [Self; 5] = [
+        Self::Train,
+        Self::Validation,
+        Self::Test,
+        Self::UnseenPairs,
+        Self::UnseenGains,
+    ];
 
-    /// `train`, `validation`, `test` or `test-unseen`.
+    /// `train`, `validation`, `test`, `unseen-pairs` or `unseen-gains`.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Train => "train",
             Self::Validation => "validation",
             Self::Test => "test",
-            Self::TestUnseen => "test-unseen",
+            Self::UnseenPairs => "unseen-pairs",
+            Self::UnseenGains => "unseen-gains",
         }
     }
 }
@@ -79,8 +88,8 @@ struct EpisodeSegment {
 /// keeps a smaller one's split; recordings by whole episodes where there are ten or more, else by time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
-    episodes: [Vec<usize>; 4],
-    runs: [Vec<EpisodeSegment>; 4],
+    episodes: [Vec<usize>; Split::ALL.len()],
+    runs: [Vec<EpisodeSegment>; Split::ALL.len()],
     /// Timestamps further apart are a gap.
     max_step_s: f64,
 }
@@ -98,7 +107,8 @@ impl Splits {
         if by_trial || dataset.episodes().len() >= WHOLE_EPISODES {
             for episode in dataset.episodes() {
                 let split = match &episode.trial {
-                    Some(trial) if trial.is_held_out() => Split::TestUnseen,
+                    Some(trial) if trial.has_held_out_pair() => Split::UnseenPairs,
+                    Some(trial) if trial.is_held_out() => Split::UnseenGains,
                     Some(trial) => split_of(split_seed, trial.trial),
                     None => split_of(split_seed, episode.index as u64),
                 };

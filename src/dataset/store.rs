@@ -19,7 +19,7 @@ impl Dataset {
     /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, numbers that aren't finite.
     pub fn open(directory: &Path) -> Result<Self, DatasetError> {
         let stamp = CollectionStamp::read(directory)?;
-        let info = stamp.info();
+        let info = stamp.info_in(directory)?;
         let path = directory.join(EPISODES);
         verify(&path, &stamp.episodes_sha256)?;
         let episodes = read_episodes(&path, &info)?;
@@ -32,8 +32,8 @@ impl Dataset {
             info,
             episodes,
         };
+        let info = dataset.info.clone();
         let slots = slots(&mut dataset, directory, &stamp.shards);
-        let info = stamp.info();
         let numbers: Result<Vec<ShardNumbers>, DatasetError> = slots
             .into_par_iter()
             .zip(&stamp.shards)
@@ -160,8 +160,9 @@ pub(super) fn complete(
     }
     let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
     let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
+    let world = info.world.clone();
     let stamp = stamp(info, shards, sha256_hex(&episodes));
-    let info = stamp.info();
+    let info = DatasetInfo { world, ..stamp.info() };
     write_atomically(&directory.join(EPISODES), &episodes)?;
     let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
     write_atomically(&directory.join(TASKS), &tasks)?;

@@ -73,11 +73,13 @@ named_enum!(
 
 named_enum!(
     /// What the prediction is conditioned on, besides the frames seen.
-    Conditioning, "conditioning", "\"none\", \"action\" and \"state-action\"", {
+    Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
         /// Nothing.
         None = "none",
         /// The action that leads to each predicted frame.
         Action = "action",
+        /// The state at the last frame seen.
+        State = "state",
         /// The action that leads to each predicted frame, and the state at the last frame seen.
         StateAction = "state-action",
     }
@@ -217,13 +219,13 @@ impl ModelSpec {
     /// Components of an action that enter the predictor; `None` if the conditioning ignores actions.
     #[must_use]
     pub fn action_inputs(&self) -> Option<usize> {
-        (self.conditioning != Conditioning::None).then_some(self.actions.len())
+        matches!(self.conditioning, Conditioning::Action | Conditioning::StateAction).then_some(self.actions.len())
     }
 
     /// Components of a state that enter the predictor; `None` if the conditioning ignores states.
     #[must_use]
     pub fn state_inputs(&self) -> Option<usize> {
-        (self.conditioning == Conditioning::StateAction).then_some(self.states.len())
+        matches!(self.conditioning, Conditioning::State | Conditioning::StateAction).then_some(self.states.len())
     }
 
     /// Inputs of the predictor's LSTM: features, then the action, then the state.

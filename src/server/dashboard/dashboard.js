@@ -272,7 +272,7 @@ async function refresh() {
       `${model.name} v${model.active_version}`,
       `${model.spec.frame_width_px}×${model.spec.frame_height_px} px every ${model.spec.frame_period_s} s`,
       `${model.spec.context} → ${model.spec.horizon}`,
-      { none: "nothing", action: "actions", "state-action": "state and actions" }[model.spec.conditioning],
+      { none: "nothing", action: "actions", state: "state", "state-action": "state and actions" }[model.spec.conditioning],
       skill(model),
     ]), "none is loaded; train one");
     if (names !== models.map(({ name }) => name).join()) {
