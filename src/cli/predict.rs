@@ -186,7 +186,8 @@ fn write(
         &codec::encode_png(&sheet).map_err(CliError::failed)?,
     )?;
     let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
-    let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
+    let film = seen.iter().chain(predicted).map(montage::enlarged);
+    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
     save(
         "prediction.gif".to_owned(),
         &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,

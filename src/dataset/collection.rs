@@ -79,7 +79,7 @@ impl CollectionStatus {
             });
         }
         if out.join(INFO).exists() {
-            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info())));
+            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
         }
         let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
         let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
@@ -259,9 +259,7 @@ fn description(config: &CollectConfig) -> DatasetInfo {
         frame_count: 0,
         episode_count: 0,
         has_masks: true,
-        camera: Some(CameraModel {
-            horizontal_fov_rad: config.world.camera.horizontal_fov_rad as f32,
-            tilt_down_rad: config.world.camera.tilt_down_rad as f32,
-        }),
+        camera: Some(config.world.camera.model()),
+        world: Some(config.world.clone()),
     }
 }
