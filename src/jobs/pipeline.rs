@@ -282,7 +282,7 @@ impl TrainingReporter<'_> {
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
             // What was not written before the process died must be in the curves all the same.
-            TrainingEvent::Recalled {
+            TrainingEvent::Restored {
                 stage,
                 step,
                 train_loss,
