@@ -158,18 +158,18 @@ fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
         "fit.steps=500",
     ]);
     let error = train(&config, &dataset, dir.path()).unwrap_err();
-    let TrainError::Diverged { stage, step, kept, .. } = &error else {
+    let TrainError::Diverged { stage, step, checkpoint_step, .. } = &error else {
         panic!("{error}")
     };
     assert_eq!(stage.to_string(), "fit");
-    assert!(kept < step && step - kept <= 7, "{error}");
+    assert!(checkpoint_step < step && step - checkpoint_step <= 7, "{error}");
     assert!(dir.path().join("checkpoint.safetensors").is_file());
     assert!(!dir.path().join("model").exists());
     let again = train(&config, &dataset, dir.path()).unwrap_err();
     assert_eq!(
         again.to_string(),
         error.to_string(),
-        "the kept checkpoint leads to the same end"
+        "the same checkpoint leads to the same error"
     );
 }
 
