@@ -1,4 +1,4 @@
-//! Frames of the camera a second, and what a whole step and a new trial cost, on one core.
+//! Time of a camera frame, of a whole simulation step and of a new trial, on one core.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use std::hint::black_box;
@@ -20,7 +20,7 @@ fn camera(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// Physics, driver and a picture from another place each time.
+/// Physics, policy and a frame from a new position in every step.
 fn step(criterion: &mut Criterion) {
     let config = WorldConfig {
         max_duration_s: 3600.0,
