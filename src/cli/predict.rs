@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::{CliError, load_model, say};
+use crate::error_text;
 use crate::evaluation::{self, figures::montage};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
@@ -12,7 +13,6 @@ use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
 use crate::types::{Action, RobotState};
-use crate::error_text;
 
 /// Predict the frames that follow those in a directory.
 ///

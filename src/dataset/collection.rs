@@ -13,8 +13,8 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
-use crate::frame::warp::CameraModel;
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
+use crate::frame::warp::CameraModel;
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
