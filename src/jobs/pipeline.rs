@@ -279,7 +279,7 @@ impl TrainingReporter<'_> {
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
             // A point that the last attempt did not write before it was killed must also be in the curves.
-            TrainingEvent::Recalled {
+            TrainingEvent::Restored {
                 stage,
                 step,
                 train_loss,
