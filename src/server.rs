@@ -58,6 +58,7 @@ use middleware::RequestIds;
 use sessions::table::SessionTable;
 use streams::Streams;
 
+use crate::jobs::child;
 use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{JobError, Jobs};
 use crate::registry::LoadedModel;
@@ -143,8 +144,9 @@ impl App {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
         let versions = Versions::new(store.clone(), &config.models_dir);
-        let pipeline = Pipeline::new(store.clone(), versions, config.job_threads);
-        let jobs = Jobs::start(store.clone(), config.jobs(), Arc::new(pipeline), !config.no_jobs)?;
+        let pipeline = Pipeline::new(store.clone(), versions, config.job_threads).with_memory_limit(config.job_memory_mb);
+        let executor = child::executor(pipeline, config.job_process());
+        let jobs = Jobs::start(store.clone(), config.jobs(), executor, !config.no_jobs)?;
         let app = Self::with_parts(config, predictor, jobs, store);
         tokio::spawn(follow(app.clone()));
         Ok(app)

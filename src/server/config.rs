@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::ServerError;
 use crate::jobs::JobLimits;
+use crate::jobs::child::JobProcess;
 use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
 
@@ -64,6 +65,15 @@ pub struct ServerConfig {
     pub job_threads: usize,
     /// Threads that decode and encode images, simulate and read files for requests; more such work waits.
     pub request_threads: usize,
+    /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
+    pub job_memory_mb: u64,
+    /// After this many attempts in a row that ended abnormally without progress, a job fails.
+    pub job_max_attempts: u32,
+    /// How long one attempt of a job can run, in seconds; 0 for no limit.
+    pub job_time_limit_s: u64,
+    /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
+    #[serde(skip)]
+    pub job_program: Option<PathBuf>,
     /// How long a process that works on a job may be silent before others take it, in milliseconds.
     pub job_lease_ms: u64,
     /// How long a prediction may take, queue and all, in milliseconds.
@@ -125,6 +135,10 @@ impl Default for ServerConfig {
             max_job_log_lines: 1000,
             job_threads: spare_cores(),
             request_threads: 4,
+            job_memory_mb: crate::jobs::memory::default_limit_mb(),
+            job_max_attempts: 3,
+            job_time_limit_s: 0,
+            job_program: None,
             job_lease_ms: 30_000,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
@@ -203,6 +217,9 @@ impl ServerConfig {
             ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
             ("job_threads", self.job_threads as u64, 1..=1024),
             ("request_threads", self.request_threads as u64, 1..=1024),
+            ("job_memory_mb", self.job_memory_mb, 0..=1 << 30),
+            ("job_max_attempts", u64::from(self.job_max_attempts), 1..=1_000_000),
+            ("job_time_limit_s", self.job_time_limit_s, 0..=100_000_000),
             ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
@@ -235,8 +252,22 @@ impl ServerConfig {
             ended: self.max_ended_jobs,
             log_lines: self.max_job_log_lines,
             threads: self.job_threads,
+            max_attempts: self.job_max_attempts,
+            time_limit: (self.job_time_limit_s > 0).then(|| Duration::from_secs(self.job_time_limit_s)),
             lease: Duration::from_millis(self.job_lease_ms),
         }
+    }
+
+    /// How to run jobs in child processes, if `job_program` is set.
+    #[must_use]
+    pub fn job_process(&self) -> Option<JobProcess> {
+        Some(JobProcess {
+            program: self.job_program.clone()?,
+            store: self.store(),
+            models_dir: self.models_dir.clone(),
+            threads: self.job_threads,
+            memory_mb: self.job_memory_mb,
+        })
     }
 
     /// Where state is kept.

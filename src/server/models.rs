@@ -66,7 +66,7 @@ pub(super) struct Lineage {
 
 impl ModelDescription {
     /// Of the version that answers, among all there are.
-    fn new(manifest: &Manifest, mut versions: Vec<u32>) -> Self {
+    fn new(manifest: &Manifest, mut versions: Vec<u32>, metrics: serde_json::Value) -> Self {
         // One that was handed over when the server started may lie in neither directory.
         if let Err(place) = versions.binary_search(&manifest.version) {
             versions.insert(place, manifest.version);
@@ -76,7 +76,7 @@ impl ModelDescription {
             versions,
             active_version: manifest.version,
             spec: manifest.spec.clone(),
-            metrics: manifest.metrics.clone(),
+            metrics,
             lineage: Lineage {
                 dataset: manifest.dataset.name.clone(),
                 dataset_hash: manifest.dataset.content_hash.clone(),
@@ -101,14 +101,13 @@ impl ModelDescription {
 pub(super) async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
     let (manifests, next) = page.of(app.predictor().models(), |manifest| &manifest.name)?;
     let mut versions = app.versions().all().await?;
-    let models = manifests.iter().map(|manifest| {
+    let mut models = Vec::with_capacity(manifests.len());
+    for manifest in &manifests {
         let versions = versions.remove(&manifest.name).unwrap_or_default();
-        ModelDescription::new(manifest, versions)
-    });
-    Ok(axum::Json(ModelList {
-        models: models.collect(),
-        next,
-    }))
+        let metrics = app.versions().metrics(manifest).await?;
+        models.push(ModelDescription::new(manifest, versions, metrics));
+    }
+    Ok(axum::Json(ModelList { models, next }))
 }
 
 /// Describes one model.
@@ -126,7 +125,8 @@ pub(super) async fn get(
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let versions = app.versions().of(&model).await?;
-    Ok(axum::Json(ModelDescription::new(&manifest, versions)))
+    let metrics = app.versions().metrics(&manifest).await?;
+    Ok(axum::Json(ModelDescription::new(&manifest, versions, metrics)))
 }
 
 /// Has a version answer from now on, on every server of the store and after a restart. Streams that run keep theirs.

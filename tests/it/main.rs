@@ -20,6 +20,7 @@ mod hostile_requests;
 mod hostile_streams;
 mod jobs;
 mod jobs_killed;
+mod jobs_limits;
 mod jobs_priority;
 mod jobs_work;
 mod keys;
