@@ -19,6 +19,7 @@ mod healthy_robot;
 mod jobs;
 mod jobs_end_to_end;
 mod jobs_killed;
+mod jobs_limits;
 mod jobs_priority;
 mod keys;
 mod malformed_requests;
