@@ -34,10 +34,10 @@ fn kill(process: u32) {
 
 /// The child that works on the job's given attempt.
 fn child_of(served: &RunningServer, attempt: u64) -> u32 {
-    served.job_until("job-1", |job| {
+    served.wait_for_job("job-1", |job| {
         job["attempts"].as_u64() >= Some(attempt) && job["state"] == "running"
     });
-    served.job_until("job-1", |_| !children(served.program.id()).is_empty());
+    served.wait_for_job("job-1", |_| !children(served.program.id()).is_empty());
     children(served.program.id())[0]
 }
 
@@ -69,7 +69,7 @@ fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
     let limit = limits.lines().find(|line| line.starts_with("Max data size")).unwrap();
     assert!(limit.contains(&(4000u64 << 20).to_string()), "{limits}");
     served.terminate();
-    served.ended();
+    served.wait_for_exit();
 }
 
 #[test]
