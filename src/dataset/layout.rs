@@ -15,6 +15,8 @@ pub const INFO: &str = "meta/info.json";
 pub const STAMP: &str = "meta/foreframe.json";
 /// The arguments of the collection; written first.
 pub(super) const ARGUMENTS: &str = "meta/collect.json";
+/// The source and options of an import; written first.
+pub(super) const IMPORT_ARGUMENTS: &str = "meta/import.json";
 /// Figures of every column.
 pub(super) const STATS: &str = "meta/stats.json";
 /// The one task.
@@ -79,7 +81,8 @@ impl CollectionStamp {
     pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
-            return Err(match std::fs::read_to_string(arguments) {
+            let found = std::fs::read_to_string(arguments);
+            return Err(match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
                 Ok(text) => DatasetError::Unfinished {
                     path: directory.to_owned(),
                     arguments: one_line(&text),

@@ -18,6 +18,7 @@ mod fixtures;
 mod hostile_names;
 mod hostile_requests;
 mod hostile_streams;
+mod import;
 mod jobs;
 mod jobs_killed;
 mod jobs_priority;
