@@ -12,6 +12,7 @@ mod interrupt;
 mod keys;
 mod predict;
 mod progress;
+mod run_job;
 mod serve;
 mod settings;
 mod train;
@@ -64,6 +65,9 @@ enum Command {
     Healthcheck(healthcheck::HealthcheckArgs),
     /// Work on jobs without serving
     Worker(worker::WorkerArgs),
+    /// Run one job for a server or worker, which starts this command
+    #[command(hide = true)]
+    RunJob,
     /// Describe a model or a data set
     Inspect(inspect::InspectArgs),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -100,6 +104,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::RunJob => run_job::run(),
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }

@@ -7,8 +7,8 @@ pub mod types;
 
 pub mod files;
 
+pub mod error_text;
 pub mod telemetry;
-pub mod wording;
 
 pub mod frame;
 

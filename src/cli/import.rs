@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::{CliError, DATASETS_DIR, interrupt, progress::ProgressLine, say};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
 
 /// How many left-out items are printed.
@@ -135,7 +135,7 @@ fn name(args: &ImportArgs) -> String {
 
 impl From<ImportError> for CliError {
     fn from(error: ImportError) -> Self {
-        let text = sentence(&error);
+        let text = with_causes(&error);
         match error {
             ImportError::Cancelled { .. } => Self::Interrupted(text),
             ImportError::UnknownSource(_)

@@ -169,7 +169,7 @@ fn damaged(change: impl Fn(&Path)) -> (String, usize) {
         ..small()
     };
     let imported = run(&source, &dir.path().join("skipping"), options).unwrap();
-    (foreframe::wording::sentence(&error), imported.skipped.len())
+    (foreframe::error_text::with_causes(&error), imported.skipped.len())
 }
 
 #[test]
@@ -224,5 +224,5 @@ fn a_used_directory_and_other_options_are_refused() {
     let error = run(&source, &source, small()).unwrap_err().to_string();
     assert!(error.contains("other files"), "{error}");
     let error = run(&dir.path().join("none"), &dir.path().join("c"), small()).unwrap_err();
-    assert!(foreframe::wording::sentence(&error).contains("none"), "{error}");
+    assert!(foreframe::error_text::with_causes(&error).contains("none"), "{error}");
 }

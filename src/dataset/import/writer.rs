@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::super::files::{sha256_of_file, write_atomically};
-use super::super::layout::{CollectionStamp, IMPORT_ARGUMENTS, INFO, shard_path};
+use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use super::super::shard::{EncodedEpisode, ShardStart, build};
 use super::super::shard_reader::records;
 use super::super::store::{FinishedShard, complete};
@@ -18,7 +18,7 @@ use super::super::{DatasetError, DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording};
 use super::timing::{ImportPlan, PlannedFrame};
 use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
-use crate::files::{remove_abandoned, sha256_hex};
+use crate::files::{remove_stale_partials, sha256_hex};
 use crate::frame::fit::fit;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.
@@ -75,7 +75,7 @@ impl<'a> Directory<'a> {
             TryLockError::WouldBlock => ImportError::Dataset(DatasetError::Busy { path: out.clone() }),
             TryLockError::Error(source) => ImportError::io("lock", &path)(source),
         })?;
-        remove_abandoned(out);
+        remove_stale_partials(out);
         Ok(Self { config, _lock: lock })
     }
 
@@ -85,7 +85,7 @@ impl<'a> Directory<'a> {
             return Ok(None);
         }
         Ok(Some(Imported {
-            info: CollectionStamp::read(&self.config.out)?.info(),
+            info: DatasetMetadata::read(&self.config.out)?.info_in(&self.config.out)?,
             skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
         }))
     }
