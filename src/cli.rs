@@ -6,6 +6,7 @@ mod error;
 mod evaluate;
 mod export;
 mod healthcheck;
+mod import;
 mod inspect;
 mod interrupt;
 mod keys;
@@ -46,6 +47,8 @@ struct Cli {
 enum Command {
     /// Simulate trials and store their frames, actions and states
     Collect(collect::CollectArgs),
+    /// Turn a recording of a real robot into a data set
+    Import(import::ImportArgs),
     /// Train a model on a data set
     Train(train::TrainArgs),
     /// Measure a model on held-out trials: report, figures, GIF
@@ -92,6 +95,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
     };
     match command {
         Command::Collect(args) => collect::run(args),
+        Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),

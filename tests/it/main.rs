@@ -16,6 +16,7 @@ mod environments;
 mod evaluation;
 mod fixtures;
 mod healthy_robot;
+mod import;
 mod jobs;
 mod jobs_end_to_end;
 mod jobs_killed;
