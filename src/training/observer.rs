@@ -66,6 +66,11 @@ pub enum TrainingEvent {
         /// Whether it is the lowest so far, whose weights are kept.
         is_best: bool,
     },
+    /// A checkpoint is damaged and is not used.
+    CheckpointDamaged {
+        /// Whether it is the one before the latest; then the training starts from the beginning.
+        is_previous: bool,
+    },
     /// The state was written to disk.
     Checkpointed {
         /// In this stage.
