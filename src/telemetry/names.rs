@@ -19,7 +19,7 @@ macro_rules! names {
 
 /// Shows what seldom happens as 0 until it does, so that its first time is seen as a rise.
 pub(super) fn begin() {
-    for name in [HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
+    for name in [INFERENCE_PANICS, HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
         counter!(name).increment(0);
     }
 }
@@ -45,6 +45,9 @@ names! {
     describe_gauge PREDICTIONS_WAITING = "foreframe_predictions_waiting" in Count: "Predictions in the queue.";
     describe_counter PREDICTIONS_REFUSED = "foreframe_predictions_refused_total" in Count:
         "Predictions that were not computed, by reason: full, deadline, abandoned or error.";
+
+    describe_counter INFERENCE_PANICS = "foreframe_inference_panics_total" in Count:
+        "Panics of the inference thread; each failed one batch, and the thread was restarted.";
 
     describe_gauge STREAMS = "foreframe_streams_active" in Count: "Open WebSocket streams.";
     describe_gauge SESSIONS = "foreframe_sessions_active" in Count: "Sessions that hold state.";
