@@ -33,6 +33,15 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     }
 }
 
+/// Opens a lock file and leaves its content. A symbolic link is refused, because another file would be locked.
+pub(crate) fn open_lock(path: &Path) -> io::Result<File> {
+    if path.symlink_metadata().is_ok_and(|found| found.is_symlink()) {
+        return Err(io::Error::other("the lock file is a symbolic link; delete it"));
+    }
+    let mut options = File::options();
+    options.read(true).write(true).create(true).truncate(false).open(path)
+}
+
 /// Where a file is written before it takes its name: another place each time, since several may write it at once.
 fn partial_path(path: &Path) -> io::Result<PathBuf> {
     let mut name = path.file_name().unwrap_or_default().to_owned();

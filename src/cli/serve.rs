@@ -60,7 +60,10 @@ async fn listen(config: Config) -> Result<(), CliError> {
         info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs, or copy there what foreframe train made");
     }
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
+    let store = app.store().clone();
     server::serve(listener, app, server::shutdown::requested()).await;
+    // From now on the database file alone is complete.
+    store.close().await?;
     Ok(())
 }
 

@@ -53,5 +53,6 @@ async fn work(config: &ServerConfig) -> Result<(), CliError> {
     if jobs.finish_stop(deadline).await {
         info!("stopped");
     }
+    store.close().await?;
     Ok(())
 }

@@ -125,7 +125,9 @@ impl ChildExecutor {
         cancelled: &AtomicBool,
     ) -> Result<Option<Result<JobResult, JobFailure>>, JobFailure> {
         let (Some(mut stdin), Some(stdout)) = (child.stdin.take(), child.stdout.take()) else {
-            return Err(JobFailure::Crashed("the job's process has no standard streams".to_owned()));
+            return Err(JobFailure::Crashed(
+                "the job's process has no standard streams".to_owned(),
+            ));
         };
         let failed = |error: &dyn std::error::Error| crashed("could not send its order to", error);
         let mut order = serde_json::to_vec(&self.order(spec, report.lease())).map_err(|error| failed(&error))?;
@@ -144,7 +146,9 @@ impl ChildExecutor {
             result
         });
         wait(child, stdin, &|| reader.is_finished(), cancelled);
-        reader.join().map_err(|_| JobFailure::Failed("the reader of the job's report panicked".to_owned()))
+        reader
+            .join()
+            .map_err(|_| JobFailure::Failed("the reader of the job's report panicked".to_owned()))
     }
 
     fn order(&self, spec: &JobSpec, lease: Lease) -> JobOrder {
@@ -186,14 +190,19 @@ fn ended_without_result(status: ExitStatus) -> JobFailure {
             "the job's process was killed by signal {signal} (out of memory?); the server's log can say more"
         ));
     }
-    JobFailure::Failed(format!("the job's process ended with {status}; the server's log says why"))
+    JobFailure::Failed(format!(
+        "the job's process ended with {status}; the server's log says why"
+    ))
 }
 
 /// The child process: reads its order from standard input, does the work and writes its report to standard output.
 /// Errors: a sentence, if there is no order.
 pub fn run() -> Result<(), String> {
     let mut line = String::new();
-    let read = std::io::stdin().lock().read_line(&mut line).map_err(|error| error.to_string())?;
+    let read = std::io::stdin()
+        .lock()
+        .read_line(&mut line)
+        .map_err(|error| error.to_string())?;
     if read == 0 {
         return Err("run-job is started by the server, which sends it the job".to_owned());
     }

@@ -21,7 +21,11 @@ const PRINCIPAL_COPIES: u64 = 4;
 #[must_use]
 pub fn default_limit_mb() -> u64 {
     let limits = [machine_bytes(), cgroup_bytes()];
-    limits.into_iter().flatten().min().map_or(0, |bytes| bytes / MIB * 3 / 4)
+    limits
+        .into_iter()
+        .flatten()
+        .min()
+        .map_or(0, |bytes| bytes / MIB * 3 / 4)
 }
 
 fn machine_bytes() -> Option<u64> {
@@ -40,7 +44,9 @@ fn cgroup_bytes() -> Option<u64> {
         "/sys/fs/cgroup/memory.max".to_owned(),
         "/sys/fs/cgroup/memory/memory.limit_in_bytes".to_owned(),
     ];
-    let limits = files.iter().filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok());
+    let limits = files
+        .iter()
+        .filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok());
     limits.min()
 }
 

@@ -1,8 +1,8 @@
 //! Claims jobs one after another. Runs each on its own threads, renews its lease, writes its reports, and records its
 //! outcome.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures_util::future::BoxFuture;
@@ -78,9 +78,11 @@ pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: Thread
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     while !*stop.borrow() {
-        let now_s = unix_s();
-        let until_s = now_s + shared.limits.lease.as_secs_f64();
-        match shared.store.claim(&instance.id, now_s, until_s).await {
+        match shared
+            .store
+            .claim(&instance.id, shared.limits.lease.as_secs_f64())
+            .await
+        {
             Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
@@ -221,8 +223,8 @@ impl<'a> JobRun<'a> {
     async fn renew(&mut self) {
         let report = self.take_report();
         let (lines, losses) = (report.lines.clone(), report.losses.clone());
-        let until_s = unix_s() + self.shared.limits.lease.as_secs_f64();
-        match self.shared.store.renew(self.report.lease(), until_s, report).await {
+        let lease_s = self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease(), lease_s, report).await {
             Ok(Some(cancelling)) => self.cancel_requested |= cancelling,
             Ok(None) => self.lease_lost = true,
             Err(error) => {

@@ -173,7 +173,8 @@ impl From<ServingError> for ApiError {
                 retry_after_s,
             },
             ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
-            ServingError::Model { .. }
+            ServingError::Panicked
+            | ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
             | ServingError::Thread(_) => Self::Internal(sentence(&error)),
@@ -241,6 +242,7 @@ impl From<JobError> for ApiError {
             | JobError::Occupied { .. }
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
+            JobError::Store(ref store) if store.is_unavailable() => Self::unavailable(sentence(&error)),
             JobError::Record { .. }
             | JobError::Instance(_)
             | JobError::Threads(_)
@@ -258,6 +260,7 @@ impl From<VersionError> for ApiError {
             VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
+            VersionError::Store(ref store) if store.is_unavailable() => Self::unavailable(sentence(&error)),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
                 Self::Internal(sentence(&error))
             }

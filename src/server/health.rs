@@ -28,6 +28,9 @@ pub(super) async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>,
     if app.is_draining() {
         return Err(ApiError::unavailable("the server is stopping"));
     }
+    if let Err(error) = app.store().check_writable().await {
+        return Err(ApiError::unavailable(format!("the store cannot be written: {error}")));
+    }
     if !app.predictor().is_ready() {
         return Err(ApiError::unavailable("the models are warming up"));
     }

@@ -131,7 +131,7 @@ impl Keys {
     pub async fn refresh(&self) -> Result<(), StoreError> {
         let Some(store) = &self.shared.store else { return Ok(()) };
         let rows = store.list_keys().await?;
-        let were_made = !rows.is_empty();
+        let were_made = !rows.is_empty() || store.keys_were_created();
         let hashes: HashMap<_, _> = rows
             .into_iter()
             .filter(|row| row.revoked_s.is_none())

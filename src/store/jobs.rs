@@ -256,8 +256,15 @@ impl Store {
             .collect()
     }
 
-    /// Claims the oldest job that is queued or whose lease has expired. Errors: `Query`.
-    pub async fn claim(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+    /// Claims the oldest job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds.
+    /// Errors: `Query`.
+    pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.claim_at(owner, now_s, now_s + lease_s).await
+    }
+
+    /// As [`Self::claim`], at a given time. Errors: `Query`.
+    pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
              ORDER BY number LIMIT 1";
@@ -288,7 +295,13 @@ impl Store {
 
     /// Renews a lease and writes the report. Returns whether the job was asked to stop; if the lease is lost, writes nothing
     /// and returns `None`. Errors: `Query`.
-    pub async fn renew(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+    pub async fn renew(&self, lease: Lease, lease_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.renew_at(lease, now_s + lease_s, report).await
+    }
+
+    /// As [`Self::renew`], until a given time. Errors: `Query`.
+    pub async fn renew_at(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4, \
              checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \

@@ -222,7 +222,7 @@ async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
     let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
     until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
     // To another process whose clock says that the lease has long run out.
-    let (row, thief) = app.store().claim("another", 1e12, 2e12).await.unwrap().unwrap();
+    let (row, thief) = app.store().claim_at("another", 1e12, 2e12).await.unwrap().unwrap();
     assert_eq!((row.number, thief.token), (1, 2));
     post(&app, JOBS, &collect("b")).await;
     // The runner is free for the next job once it has seen that it lost this one.

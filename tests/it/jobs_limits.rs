@@ -17,18 +17,33 @@ fn collect(name: &str, trials: u64) -> Value {
 fn children(process: u32) -> Vec<u32> {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
     let lists = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("children")).ok());
-    let ids = lists.map(|list| list.split_whitespace().map(|id| id.parse().unwrap()).collect::<Vec<u32>>());
+    let ids = lists.map(|list| {
+        list.split_whitespace()
+            .map(|id| id.parse().unwrap())
+            .collect::<Vec<u32>>()
+    });
     ids.flatten().collect()
 }
 
+/// The niceness of a process's first thread: the 19th field of its status, the 17th after its name.
+fn niceness(process: u32) -> i64 {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
+    let (_, rest) = stat.rsplit_once(") ").unwrap();
+    rest.split(' ').nth(16).unwrap().parse().unwrap()
+}
+
 fn kill(process: u32) {
-    let killed = std::process::Command::new("kill").args(["-KILL", &process.to_string()]).status();
+    let killed = std::process::Command::new("kill")
+        .args(["-KILL", &process.to_string()])
+        .status();
     assert!(killed.unwrap().success());
 }
 
 /// The child that works on the job's given attempt.
 fn child_of(served: &Served, attempt: u64) -> u32 {
-    served.job_until("job-1", |job| job["attempts"].as_u64() >= Some(attempt) && job["state"] == "running");
+    served.job_until("job-1", |job| {
+        job["attempts"].as_u64() >= Some(attempt) && job["state"] == "running"
+    });
     served.job_until("job-1", |_| !children(served.program.id()).is_empty());
     children(served.program.id())[0]
 }
@@ -41,13 +56,19 @@ fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
     served.ask("POST", JOBS, &collect("seen", 1_000_000));
     let first = child_of(&served, 1);
     let limits = std::fs::read_to_string(format!("/proc/{first}/limits")).unwrap();
+    let low = (niceness(served.program.id()) + 10).min(19);
+    assert_eq!(niceness(first), low);
     for attempt in 1..=3 {
         let child = child_of(&served, attempt);
         kill(child);
         served.wait_while_alive(child);
     }
     let job = served.ended_job("job-1");
-    assert_eq!((&job["state"], &job["attempts"]), (&json!("failed"), &json!(3)), "{job}");
+    assert_eq!(
+        (&job["state"], &job["attempts"]),
+        (&json!("failed"), &json!(3)),
+        "{job}"
+    );
     let error = job["error"].as_str().unwrap();
     assert!(
         error.starts_with("3 attempts in a row ended without progress") && error.contains("killed by signal 9"),
@@ -85,7 +106,9 @@ impl Served {
     }
 
     fn ended_job(&self, id: &str) -> Value {
-        self.job_until_any(id, |job| ["failed", "succeeded", "cancelled"].contains(&job["state"].as_str().unwrap()))
+        self.job_until_any(id, |job| {
+            ["failed", "succeeded", "cancelled"].contains(&job["state"].as_str().unwrap())
+        })
     }
 
     /// As `job_until`, also of a job that has failed.
@@ -149,5 +172,8 @@ async fn an_attempt_beyond_the_time_limit_fails() {
     let job = ended(&app, "job-1").await;
     assert_eq!(job["state"], "failed");
     let error = job["error"].as_str().unwrap();
-    assert!(error.contains("the time limit of 1 s (setting job_time_limit_s)"), "{error}");
+    assert!(
+        error.contains("the time limit of 1 s (setting job_time_limit_s)"),
+        "{error}"
+    );
 }
