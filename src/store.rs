@@ -9,8 +9,11 @@ pub mod objects;
 pub mod reports;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
+use tokio::sync::Mutex;
 
 use self::database::Database;
 pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
@@ -22,7 +25,9 @@ pub use self::reports::{JobReport, LogRow, LossRow};
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
 /// The time limit of a write check.
-const WRITE_CHECK_LIMIT: std::time::Duration = std::time::Duration::from_secs(2);
+const WRITE_CHECK_LIMIT: Duration = Duration::from_secs(2);
+/// How long a successful write check is valid.
+const WRITE_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// The file in the data directory that says that API keys were created.
 const KEYS_MARKER: &str = "api-keys-created";
 
@@ -122,6 +127,8 @@ pub struct StoreConfig {
 pub struct Store {
     database: Database,
     objects: Objects,
+    /// When the database was written last by a check.
+    last_write_check: Arc<Mutex<Option<Instant>>>,
 }
 
 impl Store {
@@ -146,13 +153,20 @@ impl Store {
         Ok(Self {
             database,
             objects: Objects::open(data_dir, config.objects.as_deref())?,
+            last_write_check: Arc::default(),
         })
     }
 
-    /// Checks that the database can be written. Errors: `Query`.
+    /// Checks that the database can be written, by a write at most once a second. Errors: `Query`.
     pub async fn check_writable(&self) -> Result<(), StoreError> {
+        let mut last = self.last_write_check.lock().await;
+        if last.is_some_and(|last| last.elapsed() < WRITE_CHECK_INTERVAL) {
+            return Ok(());
+        }
         let checked = tokio::time::timeout(WRITE_CHECK_LIMIT, self.write_nothing()).await;
-        checked.unwrap_or(Err(StoreError::Query(sqlx::Error::PoolTimedOut)))
+        checked.unwrap_or(Err(StoreError::Query(sqlx::Error::PoolTimedOut)))?;
+        *last = Some(Instant::now());
+        Ok(())
     }
 
     async fn write_nothing(&self) -> Result<(), StoreError> {

@@ -63,7 +63,9 @@ async fn listen(config: Config) -> Result<(), CliError> {
     let store = app.store().clone();
     server::serve(listener, app, server::shutdown::requested()).await;
     // From now on the database file alone is complete.
-    store.close().await?;
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
+    }
     Ok(())
 }
 

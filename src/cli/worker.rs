@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::settings::{StoreSettings, checked};
 use super::{CliError, say};
@@ -53,6 +53,8 @@ async fn work(config: &ServerConfig) -> Result<(), CliError> {
     if jobs.finish_stop(deadline).await {
         info!("stopped");
     }
-    store.close().await?;
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
+    }
     Ok(())
 }

@@ -68,6 +68,8 @@ async fn writes_work_again_after_a_full_disk() {
         !errors.is_empty() && errors.iter().all(StoreError::is_unavailable),
         "{errors:?}"
     );
+    // A successful check is valid for a second.
+    tokio::time::sleep(Duration::from_millis(1100)).await;
     assert!(store.check_writable().await.unwrap_err().is_unavailable());
     std::fs::remove_file(filler).unwrap();
     let deadline = Instant::now() + Duration::from_secs(5);
