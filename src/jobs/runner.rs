@@ -210,6 +210,10 @@ impl<'a> JobRun<'a> {
                 () = stop_requested(&mut stop), if !is_stopping => {
                     is_stopping = true;
                     self.cancelled.store(true, Ordering::Release);
+                    // If the process ends before the work has stopped, that is no failure of the job.
+                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                        warn!(%error, "could not mark an attempt as stopped");
+                    }
                 }
                 _ = ticks.tick() => {
                     self.renew().await;

@@ -272,8 +272,8 @@ impl Store {
         let Some(row) = rows.first() else { return Ok(None) };
         let number: i64 = row.get("number")?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
-             claimed_checkpoint = checkpoint, stalled_attempts = CASE WHEN state = 'queued' THEN stalled_attempts \
-             WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
+             claimed_checkpoint = checkpoint, stalled_attempts = CASE \
+             WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4) WHERE number = $1 RETURNING *";
         let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
         let row = first_job(&tx.fetch(sql, values).await?)?;
@@ -321,14 +321,21 @@ impl Store {
         Ok(Some(cancelling))
     }
 
+    /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
+    pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
+        let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
+        let values = vec![lease.number.into(), lease.token.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
     /// Writes the outcome of an attempt. If the lease is lost, writes nothing and returns false. Errors: `Query`.
     pub async fn end(&self, lease: Lease, outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
              cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \
              checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
-             stalled_attempts = CASE WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 \
-             ELSE stalled_attempts + $9 END, \
+             stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
+             WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
         let values = vec![
             lease.number.into(),

@@ -46,6 +46,7 @@ mod shared_datasets;
 mod sim;
 mod sim_refusals;
 mod store;
+mod store_attempts;
 mod store_faults;
 mod store_objects;
 mod stream;
