@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::settings::{StoreSettings, checked};
 use super::{CliError, say};
@@ -52,6 +52,9 @@ async fn work(config: &ServerConfig) -> Result<(), CliError> {
     let deadline = Instant::now() + Duration::from_millis(config.shutdown_deadline_ms);
     if jobs.finish_stop(deadline).await {
         info!("stopped");
+    }
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
     }
     Ok(())
 }
