@@ -3,7 +3,7 @@
 use super::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 
-/// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
+/// One moment: three frames of the same time, `steps_ahead` after the last frame seen.
 #[derive(Clone, Debug)]
 pub struct AnimationFrame {
     /// The true frame.
