@@ -143,7 +143,7 @@ impl EvaluationStage {
     }
 }
 
-/// How far the evaluation is.
+/// Progress of the evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluationProgress {
     /// The set.

@@ -11,6 +11,7 @@ use super::page::Page;
 use super::predict::PredictError;
 use super::{App, blocking};
 use crate::dataset::{self, Dataset, DatasetInfo};
+use crate::evaluation::figures::animation::enlarged_gif;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::jobs::{JobError, datasets};
@@ -179,7 +180,7 @@ pub(super) async fn animation(
 ) -> Result<impl IntoResponse, ApiError> {
     let gif = picture(&app, &name, episode, |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
-        codec::encode_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+        enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
     });
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
 }
