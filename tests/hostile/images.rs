@@ -44,7 +44,7 @@ fn the_size_that_an_image_states_is_refused_before_it_is_allocated() {
         let refused = within(3 << 20, &sample.name, || predict(&sample.name, &sample.bytes));
         assert_eq!(
             refused.detail(422),
-            "frames[0] is 65535×65535 px; model \"plain\" takes 16×12"
+            "frames[0] is 65535×65535 px; model \"plain\" takes 16×12; set fit to crop, letterbox or stretch to resize it"
         );
     }
 }

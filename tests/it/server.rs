@@ -117,7 +117,7 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
         (
             PLAIN,
             json!({"frames": with_large}),
-            "frames[2] is 80×60 px; model \"plain\" takes 16×12",
+            "frames[2] is 80×60 px; model \"plain\" takes 16×12; set fit to crop, letterbox or stretch to resize it",
         ),
         (
             PLAIN,
