@@ -163,7 +163,7 @@ async fn what_is_no_object_or_no_number_is_refused_in_words() {
     let path = post(&app, "/v1/models/plain/versions/x/activate", &Value::Null).await;
     assert_eq!(
         path.detail(400),
-        "\"x\" in the path is no whole number, or too great a one"
+        "\"x\" in the path is not a whole number, or too large"
     );
 }
 
