@@ -188,7 +188,9 @@ fn names_of(path: &str) -> (Vec<String>, &str) {
 /// Every path that begins here, with those in braces spread out.
 fn paths(text: &str) -> Vec<Vec<String>> {
     let (names, rest) = names_of(text);
-    let Some(inner) = rest.strip_prefix('{') else { return vec![names] };
+    let Some(inner) = rest.strip_prefix('{') else {
+        return vec![names];
+    };
     let (mut depth, mut start, mut found) = (0, 0, Vec::new());
     for (at, letter) in inner.char_indices() {
         match letter {
@@ -244,7 +246,9 @@ fn server_uses(sources: &[(String, String)]) -> Vec<(Vec<String>, Vec<String>)> 
     let files: Vec<Vec<String>> = modules.iter().map(|(module, _)| module.clone()).collect();
     let mut uses = Vec::new();
     for (module, text) in &modules {
-        let used = server_paths(module, text).into_iter().filter_map(|path| file_of(&path, &files));
+        let used = server_paths(module, text)
+            .into_iter()
+            .filter_map(|path| file_of(&path, &files));
         let apart = used.filter(|used| !used.starts_with(module) && !module.starts_with(used));
         uses.extend(apart.map(|used| (module.clone(), used)));
     }
@@ -274,7 +278,10 @@ fn server_faults(sources: &[(String, String)]) -> Vec<String> {
             break;
         }
     }
-    faults.extend(left.iter().map(|(user, used)| format!("a circle goes through {} and {}", user.join("/"), used.join("/"))));
+    faults.extend(
+        left.iter()
+            .map(|(user, used)| format!("a circle goes through {} and {}", user.join("/"), used.join("/"))),
+    );
     faults
 }
 
@@ -298,11 +305,20 @@ fn a_use_against_the_order_or_in_a_circle_is_found() {
         with("server/http/extract.rs", "use crate::server::state::App;"),
         ["server/http/extract uses server/state"]
     );
-    let upward = with("server/blocking.rs", "use super::{config, routes::{jobs, models::list}};");
+    let upward = with(
+        "server/blocking.rs",
+        "use super::{config, routes::{jobs, models::list}};",
+    );
     assert_eq!(
         upward[..2],
-        ["server/blocking uses server/routes/jobs", "server/blocking uses server/routes/models"]
+        [
+            "server/blocking uses server/routes/jobs",
+            "server/blocking uses server/routes/models"
+        ]
     );
     let circle = with("server/http/problem.rs", "use super::keys::Keys;");
-    assert!(circle.iter().any(|fault| fault.contains("http/problem and http/keys")), "{circle:?}");
+    assert!(
+        circle.iter().any(|fault| fault.contains("http/problem and http/keys")),
+        "{circle:?}"
+    );
 }

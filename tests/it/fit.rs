@@ -30,7 +30,11 @@ fn files(frames: &[Frame]) -> Vec<String> {
 async fn a_prediction_resizes_its_frames_as_asked() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    for (name, way) in [("crop", Fit::Crop), ("letterbox", Fit::Letterbox), ("stretch", Fit::Stretch)] {
+    for (name, way) in [
+        ("crop", Fit::Crop),
+        ("letterbox", Fit::Letterbox),
+        ("stretch", Fit::Stretch),
+    ] {
         let fitted: Vec<Frame> = large_frames()
             .iter()
             .map(|frame| fit(frame, WIDTH, HEIGHT, way).unwrap())
@@ -38,7 +42,10 @@ async fn a_prediction_resizes_its_frames_as_asked() {
         let expected = post(&app, PREDICT, &json!({"frames": files(&fitted)})).await.json();
         let body = json!({"frames": files(&large_frames()), "fit": name});
         let answer = post(&app, PREDICT, &body).await.json();
-        assert!(answer["frames"].is_array() && answer["frames"] == expected["frames"], "{answer}");
+        assert!(
+            answer["frames"].is_array() && answer["frames"] == expected["frames"],
+            "{answer}"
+        );
     }
 }
 
@@ -60,7 +67,10 @@ async fn rollouts_resize_their_frames_as_asked() {
     let path = "/v1/models/moving/rollouts";
     let expected = post(&app, path, &body(&fitted, None)).await.json();
     let answer = post(&app, path, &body(&large_frames(), Some("crop"))).await.json();
-    assert!(answer["futures"].is_array() && answer["futures"] == expected["futures"], "{answer}");
+    assert!(
+        answer["futures"].is_array() && answer["futures"] == expected["futures"],
+        "{answer}"
+    );
 }
 
 #[tokio::test]
@@ -76,8 +86,12 @@ async fn a_session_resizes_its_frames_as_asked() {
     };
     let with_fit = Opened::open(&app, &json!({"model": "moving", "fit": "letterbox"})).await;
     let without = Opened::open(&app, &json!({"model": "moving"})).await;
-    let mut resized = Client::connect(server.address, &with_fit.path("/stream"), Codec::Msgpack).await.unwrap();
-    let mut exact = Client::connect(server.address, &without.path("/stream"), Codec::Json).await.unwrap();
+    let mut resized = Client::connect(server.address, &with_fit.path("/stream"), Codec::Msgpack)
+        .await
+        .unwrap();
+    let mut exact = Client::connect(server.address, &without.path("/stream"), Codec::Json)
+        .await
+        .unwrap();
     for (seq, frame) in large_frames().iter().enumerate() {
         let seq = seq as u64;
         let fitted = fit(frame, WIDTH, HEIGHT, Fit::Letterbox).unwrap();
@@ -123,6 +137,8 @@ async fn an_image_too_large_to_resize_is_refused() {
         detail,
         "frames[0] is 4096×2000 px; an image to resize has at most 4194304 pixels"
     );
-    let unknown = post(&app, PREDICT, &json!({"frames": [], "fit": "zoom"})).await.detail(422);
+    let unknown = post(&app, PREDICT, &json!({"frames": [], "fit": "zoom"}))
+        .await
+        .detail(422);
     assert!(unknown.contains("`crop`, `letterbox`, `stretch`"), "{unknown}");
 }

@@ -115,7 +115,7 @@ async fn candidates_that_do_not_fit_are_refused_by_field() {
         (
             with(json!([])),
             422,
-            "candidates is empty; give at least one sequence of future actions",
+            "candidates is empty; give at least one plan",
         ),
         (
             with(json!([[[0, 0]]])),
@@ -135,7 +135,7 @@ async fn candidates_that_do_not_fit_are_refused_by_field() {
         (
             with(json!(candidates(5))),
             413,
-            "the futures would be 1920 bytes of images; this server predicts at most 1536 for a request",
+            "the rollouts would be 1920 bytes of images; this server predicts at most 1536 in a request",
         ),
     ] {
         assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
@@ -161,7 +161,7 @@ async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
         let early = post(&app, &path, &body).await.detail(409);
         assert_eq!(
             early,
-            format!("the session has {seq} frames of the 3 that a prediction takes; send it more")
+            format!("the session has {seq} of the 3 frames that a prediction takes; send more frames")
         );
         client.ask(&send_frame(seq)).await;
     }

@@ -156,7 +156,12 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let task = state.futures(conditioning(request.candidates, robot_state, &model.manifest, app.config())?);
+    let task = state.futures(conditioning(
+        request.candidates,
+        robot_state,
+        &model.manifest,
+        app.config(),
+    )?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &model, &[], &computed);
     app.blocking().run(encode).await?

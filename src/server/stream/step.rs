@@ -9,7 +9,9 @@ use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
-use crate::serving::{ConditioningInput, InputError, RawConditioning, STEP, ServingError, SessionState, Task, TaskOutput};
+use crate::serving::{
+    ConditioningInput, InputError, RawConditioning, STEP, ServingError, SessionState, Task, TaskOutput,
+};
 use crate::types::{Action, RobotState, ValueError};
 
 /// A frame that fits the model.
