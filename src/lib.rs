@@ -8,7 +8,7 @@ pub mod types;
 pub mod files;
 
 pub mod telemetry;
-pub mod wording;
+pub mod error_text;
 
 pub mod frame;
 

@@ -12,7 +12,7 @@ use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
 use crate::types::{Action, RobotState};
-use crate::wording;
+use crate::error_text;
 
 /// Predict the frames that follow those in a directory.
 ///
@@ -77,7 +77,7 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     } else if spec.action_inputs().is_some() {
         return Err(CliError::Usage(format!(
             "--actions is missing; model {name:?} takes {}",
-            wording::listed(&spec.actions)
+            error_text::comma_separated(&spec.actions)
         )));
     }
     let predicted = serving::predict(&loaded, &[&input])?.remove(0);
@@ -149,7 +149,7 @@ fn read_frames(dir: &Path, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, 
 fn read_frame(path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
     let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
     let frame = codec::decode(&bytes)
-        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), wording::sentence(&error))))?;
+        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error))))?;
     if (frame.width(), frame.height()) != (spec.frame_width_px, spec.frame_height_px) {
         return Err(CliError::Usage(format!(
             "{} is {}×{} px; model {model:?} takes {}×{}",

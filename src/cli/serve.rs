@@ -26,7 +26,7 @@ pub(super) struct ServeArgs {
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let config = checked(args.settings.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
-    telemetry::record();
+    telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         // Each such thread keeps memory, and many that decode would leave the one that predicts few turns.

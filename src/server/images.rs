@@ -10,7 +10,7 @@ use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::serving::{InputError, check_size};
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 /// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
 /// small body can take.
@@ -117,7 +117,7 @@ pub(in crate::server) enum ImageError {
 impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
-            ImageError::Encode(_) => Self::Internal(sentence(&error)),
+            ImageError::Encode(_) => Self::Internal(with_causes(&error)),
             _ => Self::Unprocessable(error.to_string()),
         }
     }

@@ -1,36 +1,36 @@
-//! The layout's one direction: a module uses only those before it in reading order, and some crates stay in their rooms.
+//! The module order: a module uses only earlier modules, and some dependencies are used only in certain modules.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// What each module may use of the crate.
+/// The modules that each module may use.
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
     ("files", &[]),
-    ("wording", &[]),
+    ("error_text", &[]),
     ("telemetry", &[]),
     ("frame", &["types"]),
     ("nn", &["types", "frame"]),
     ("sim", &["types", "frame"]),
-    ("dataset", &["types", "files", "wording", "frame", "sim"]),
-    ("registry", &["types", "files", "wording", "nn"]),
+    ("dataset", &["types", "files", "error_text", "frame", "sim"]),
+    ("registry", &["types", "files", "error_text", "nn"]),
     ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
-        &["types", "files", "wording", "frame", "nn", "sim", "dataset", "registry"],
+        &["types", "files", "error_text", "frame", "nn", "sim", "dataset", "registry"],
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
     (
         "versions",
-        &["types", "files", "wording", "telemetry", "registry", "serving", "store"],
+        &["types", "files", "error_text", "telemetry", "registry", "serving", "store"],
     ),
     (
         "jobs",
         &[
             "types",
             "files",
-            "wording",
+            "error_text",
             "telemetry",
             "frame",
             "nn",
@@ -48,7 +48,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         "server",
         &[
             "types",
-            "wording",
+            "error_text",
             "telemetry",
             "frame",
             "nn",
@@ -66,8 +66,8 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("config", &["telemetry", "server"]),
 ];
 
-/// Where a crate may be used, by path prefixes under `src/`.
-const ROOMS: &[(&str, &[&str])] = &[
+/// The modules in which a dependency may be used.
+const USED_IN: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
     ("hyper", &["server"]),
@@ -97,7 +97,7 @@ fn sources() -> Vec<(String, String)> {
             }
         }
     }
-    assert!(files.len() > 50, "only {} sources were found", files.len());
+    assert!(files.len() > 50, "only {} source files were found", files.len());
     files
 }
 
@@ -105,7 +105,7 @@ fn module(file: &str) -> &str {
     file.split('/').next().unwrap().trim_end_matches(".rs")
 }
 
-/// The code above the unit tests.
+/// The lines of code before the unit tests, without comments.
 fn code(text: &str) -> impl Iterator<Item = &str> {
     text.lines()
         .take_while(|line| line.trim() != "#[cfg(test)]")
@@ -113,7 +113,7 @@ fn code(text: &str) -> impl Iterator<Item = &str> {
 }
 
 #[test]
-fn a_module_uses_only_those_before_it() {
+fn modules_use_only_earlier_modules() {
     for (file, text) in sources() {
         let Some((_, allowed)) = MAY_USE.iter().find(|(name, _)| *name == module(&file)) else {
             continue;
@@ -129,11 +129,11 @@ fn a_module_uses_only_those_before_it() {
 }
 
 #[test]
-fn a_crate_stays_in_its_rooms() {
+fn dependencies_are_used_only_in_their_modules() {
     for (file, text) in sources() {
-        for (name, rooms) in ROOMS.iter().filter(|(_, rooms)| !rooms.contains(&module(&file))) {
+        for (name, modules) in USED_IN.iter().filter(|(_, modules)| !modules.contains(&module(&file))) {
             let uses = |line: &str| line.trim_start().starts_with(&format!("use {name}"));
-            assert!(!code(&text).any(uses), "{file} uses {name}, which belongs to {rooms:?}");
+            assert!(!code(&text).any(uses), "{file} uses {name}, which is for {modules:?} only");
         }
     }
 }

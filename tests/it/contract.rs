@@ -1,4 +1,4 @@
-//! What all answers of the service have in common: its contract, one shape of refusals, ids, readiness.
+//! Common to all responses of the service: the API contract, problem details, request ids, readiness.
 
 use std::collections::BTreeMap;
 
@@ -7,12 +7,12 @@ use axum::http::Request;
 use foreframe::server::{App, ServerConfig, openapi_document};
 use serde_json::{Value, json};
 
-use crate::service::{app, get, post, post_text, send, until};
+use crate::service::{app, get, post, post_text, send, poll_until};
 
 const PLAIN: &str = "/v1/models/plain/predict";
 
 #[tokio::test]
-async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
+async fn invalid_requests_are_answered_with_problem_details() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let json = "*/*";
@@ -33,7 +33,7 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
     assert!(get(&app, PLAIN).await.detail(405).contains("openapi.json"));
     assert!(get(&app, "/nothing").await.detail(404).contains("openapi.json"));
     let none = get(&app, "/v1/models/movin").await.detail(404);
-    assert_eq!(none, "no model is named \"movin\"; there are: moving, plain");
+    assert_eq!(none, "there is no model \"movin\"; there are: moving, plain");
     assert!(
         get(&app, "/v1/models/plain/stream")
             .await
@@ -43,7 +43,7 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
 }
 
 #[tokio::test]
-async fn every_answer_carries_the_requests_id() {
+async fn every_response_has_a_request_id() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let request = |id: &str| {
@@ -66,11 +66,11 @@ async fn every_answer_carries_the_requests_id() {
 }
 
 #[tokio::test]
-async fn the_server_is_ready_once_its_models_are_warm() {
+async fn the_server_is_ready_after_warming_its_models() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/livez").await.status, 200);
-    until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
+    poll_until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
     let models = get(&app, "/v1/models").await.json();
     let names: Vec<&Value> = models["models"]
         .as_array()
@@ -91,7 +91,7 @@ async fn the_server_is_ready_once_its_models_are_warm() {
 }
 
 #[test]
-fn the_committed_contract_is_the_codes() {
+fn the_committed_openapi_document_is_current() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
     let document = openapi_document();
     if std::env::var_os("UPDATE_OPENAPI").is_some() {
@@ -100,13 +100,13 @@ fn the_committed_contract_is_the_codes() {
     let committed = std::fs::read_to_string(path).unwrap_or_default();
     assert!(
         committed == document,
-        "openapi/openapi.json differs from the code; write it anew by\n  \
-         UPDATE_OPENAPI=1 cargo test --release --test it the_committed_contract_is_the_codes"
+        "openapi/openapi.json differs from the code; update it with\n  \
+         UPDATE_OPENAPI=1 cargo test --release --test it the_committed_openapi_document_is_current"
     );
 }
 
 #[tokio::test]
-async fn the_contract_of_the_streams_is_served_and_refusals_are_described_as_they_come() {
+async fn the_contracts_are_served_and_describe_refusals() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert!(get(&app, "/asyncapi.yaml").await.body.starts_with(b"asyncapi: 3"));
@@ -126,7 +126,7 @@ async fn the_contract_of_the_streams_is_served_and_refusals_are_described_as_the
 }
 
 #[tokio::test]
-async fn lists_come_in_pages() {
+async fn lists_are_paged() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let (mut seen, mut after) = (Vec::new(), String::new());
@@ -155,7 +155,7 @@ async fn lists_come_in_pages() {
 }
 
 #[tokio::test]
-async fn what_is_no_object_or_no_number_is_refused_in_words() {
+async fn wrong_types_are_refused_with_an_explanation() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let list = post(&app, "/v1/sessions", &json!(["plain"])).await.detail(422);
@@ -168,7 +168,7 @@ async fn what_is_no_object_or_no_number_is_refused_in_words() {
 }
 
 #[tokio::test]
-async fn every_path_of_the_contract_is_answered() {
+async fn every_documented_path_exists() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let contract = get(&app, "/openapi.json").await.json();

@@ -17,7 +17,7 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::types::Channel;
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -243,7 +243,7 @@ impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
             DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(sentence(&error)),
+            _ => Self::Internal(with_causes(&error)),
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::store::{LogRow, LossRow};
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
@@ -328,7 +328,7 @@ impl From<JobError> for ApiError {
             | JobError::Threads(_)
             | JobError::Dataset(_)
             | JobError::Versions(_)
-            | JobError::Store(_) => Self::Internal(sentence(&error)),
+            | JobError::Store(_) => Self::Internal(with_causes(&error)),
         }
     }
 }

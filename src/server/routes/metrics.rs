@@ -57,6 +57,6 @@ pub(in crate::server) async fn keep_folded() -> Infallible {
     let mut ticks = tokio::time::interval(FOLD_INTERVAL);
     loop {
         ticks.tick().await;
-        telemetry::fold();
+        telemetry::run_upkeep();
     }
 }

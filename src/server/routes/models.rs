@@ -14,7 +14,7 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::versions::VersionError;
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -192,7 +192,7 @@ impl From<VersionError> for ApiError {
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(sentence(&error))
+                Self::Internal(with_causes(&error))
             }
         }
     }

@@ -6,7 +6,7 @@ use axum::response::{IntoResponse, Response};
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::server::http::problem::ApiError;
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 /// How long an animation stays on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;
@@ -22,7 +22,7 @@ impl From<PictureError> for ApiError {
             FrameError::Size { .. } => {
                 Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
             }
-            _ => Self::Internal(sentence(&error)),
+            _ => Self::Internal(with_causes(&error)),
         }
     }
 }

@@ -21,7 +21,7 @@ use crate::server::state::App;
 use crate::server::stream::protocol::Timing;
 use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
 use crate::types::{Action, RobotState, ValueError};
-use crate::wording::sentence;
+use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(predict))
@@ -232,7 +232,7 @@ impl From<ServingError> for ApiError {
             ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(sentence(&error)),
+            | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
         }
     }
 }

@@ -150,7 +150,7 @@ async fn session_rollouts(
 ) -> Result<Response, ApiError> {
     let model = Arc::clone(session.model());
     let (state, format) = (session.state().0, request.format);
-    let (have, need) = (state.have(), model.manifest.spec.context);
+    let (have, need) = (state.frame_count(), model.manifest.spec.context);
     if have < need {
         return Err(PredictError::Buffering { have, need }.into());
     }
@@ -212,7 +212,7 @@ fn answer(
     seen: &[Frame],
     computed: &TaskOutput,
 ) -> Result<Response, ApiError> {
-    let futures = &computed.futures;
+    let futures = &computed.predictions;
     let encoded = |format| {
         futures
             .iter()

@@ -161,7 +161,7 @@ impl SessionDescription {
             model: manifest.name.clone(),
             version: manifest.version,
             next_seq: state.next_seq(),
-            have: state.have(),
+            have: state.frame_count(),
             need: manifest.spec.context,
             connected: session.is_connected(),
             expires_in_ms: left.map(|left| left.as_millis() as u64),

@@ -1,4 +1,4 @@
-//! What the simulated world refuses, and what it says then; an environment's episodes.
+//! Errors of the simulator, and the episodes of an environment.
 
 use foreframe::sim::{Environment, Scenario, SimError, TrialParameters, World, WorldConfig};
 use foreframe::types::{Action, Seed};
@@ -6,7 +6,7 @@ use foreframe::types::{Action, Seed};
 use crate::sim::{action, small};
 
 #[test]
-fn an_unknown_scenario_is_answered_with_those_there_are() {
+fn an_unknown_scenario_is_refused_with_the_known_ones() {
     let error = "static".parse::<Scenario>().unwrap_err();
     assert_eq!(
         error.to_string(),
@@ -44,7 +44,7 @@ fn settings_out_of_range_are_refused_with_their_range() {
 }
 
 #[test]
-fn trial_parameters_that_name_no_place_are_refused() {
+fn invalid_trial_parameters_are_refused() {
     let refusal = |change: fn(&mut TrialParameters)| {
         let mut parameters = TrialParameters::draw(Scenario::MovingObserver, Seed(1), 0);
         change(&mut parameters);
@@ -59,18 +59,18 @@ fn trial_parameters_that_name_no_place_are_refused() {
 }
 
 #[test]
-fn an_action_of_another_length_is_refused() {
+fn an_action_of_the_wrong_length_is_refused() {
     let mut world = World::new(Scenario::MovingObserver, &small(), Seed(1), 0).unwrap();
     let error = world.step(&Action::try_from(vec![0.0; 3]).unwrap()).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "an action of 3 components was given; it takes 2: linear (m/s) and angular (rad/s)"
+        "the action has 3 components; it must have 2: linear (m/s) and angular (rad/s)"
     );
     assert!(Action::try_from(vec![0.0, f32::NAN]).is_err());
 }
 
 #[test]
-fn an_environment_is_reset_before_and_after_an_episode() {
+fn an_environment_must_be_reset_before_each_episode() {
     let mut environment = Environment::new(Scenario::StaticObserver, small()).unwrap();
     let still = action(0.0, 0.0);
     assert!(matches!(environment.step(&still), Err(SimError::NotReset)));

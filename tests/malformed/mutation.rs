@@ -1,28 +1,28 @@
-//! What happens to a file: damage of one kind or another.
+//! Mutations of a file's bytes.
 
 use proptest::prelude::*;
 use proptest::sample::Index;
 
-/// Bytes of what comes out at most, so that a long run stays a quick one.
+/// Maximum size of a mutated file, so that long runs stay fast.
 const MAX_BYTES: usize = 1 << 18;
 
 #[derive(Clone, Debug)]
 pub(crate) enum Mutation {
-    /// A bit is another.
+    /// Flips a bit.
     Flip(Index, u8),
-    /// The rest is missing.
+    /// Removes the end.
     Cut(Index),
-    /// A piece is missing.
+    /// Removes a piece.
     Drop(Index, Index),
-    /// A piece comes again, many times, elsewhere.
+    /// Inserts a piece many times at another position.
     Repeat(Index, Index, Index, u16),
-    /// Four bytes are those of a huge length.
+    /// Sets four bytes to 0xFF, as in a huge length.
     Inflate(Index),
-    /// A number is another one.
+    /// Replaces a number.
     Number(Index, &'static str),
-    /// What is between two commas or braces is there twice.
+    /// Duplicates the text between two commas or braces.
     Twice(Index),
-    /// A value is deep inside others.
+    /// Inserts deeply nested lists.
     Nest(Index, u16),
 }
 
@@ -52,7 +52,7 @@ fn mutation() -> impl Strategy<Value = Mutation> {
     ]
 }
 
-/// One to three of them.
+/// One to three mutations.
 pub(crate) fn mutations() -> impl Strategy<Value = Vec<Mutation>> {
     proptest::collection::vec(mutation(), 1..4)
 }

@@ -1,4 +1,4 @@
-//! Streams predict what single requests do, whoever shares their batches.
+//! Streams predict the same as single requests, whatever else is in their batches.
 
 use std::path::Path;
 
@@ -12,26 +12,26 @@ use foreframe::types::{Action, RobotState, Seed};
 use rand::Rng as _;
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened};
-use crate::service::{self, Running, get, run, with_data};
+use crate::client::{Client, SessionHandle};
+use crate::service::{self, InProcessServer, get, run, with_data};
 
 fn shipped(name: &str) -> LoadedModel {
     registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
 }
 
-/// What one robot saw and did.
-struct Trip {
+/// Frames, actions and states of one robot.
+struct Recording {
     frames: Vec<Frame>,
     actions: Vec<Vec<f32>>,
     states: Vec<Vec<f32>>,
 }
 
-impl Trip {
-    /// The frames that come with the program.
+impl Recording {
+    /// The frames in `examples`.
     fn example() -> Self {
         let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/frames");
-        let told: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
-        let numbers = |field: &str| serde_json::from_value::<Vec<Vec<f32>>>(told[field].clone()).unwrap();
+        let recorded: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
+        let numbers = |field: &str| serde_json::from_value::<Vec<Vec<f32>>>(recorded[field].clone()).unwrap();
         let frame = |index| codec::decode(&std::fs::read(dir.join(format!("frame-{index:03}.png"))).unwrap()).unwrap();
         Self {
             frames: (0..15).map(frame).collect(),
@@ -40,7 +40,7 @@ impl Trip {
         }
     }
 
-    /// Noise, different for every robot.
+    /// Random frames, actions and states, different for each robot.
     fn noise(model: &LoadedModel, robot: u64, steps: usize) -> Self {
         let spec = &model.manifest.spec;
         let mut rng = Seed(11).derive("robot", robot).rng();
@@ -74,7 +74,7 @@ impl Trip {
         })
     }
 
-    /// The prediction after frame `seq` without any session.
+    /// The prediction after frame `seq`, computed without a session.
     fn stateless(&self, model: &LoadedModel, seq: usize) -> Vec<Frame> {
         let input = PredictionInput {
             frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
@@ -85,7 +85,7 @@ impl Trip {
         serving::predict(model, &[&input]).unwrap().remove(0)
     }
 
-    /// Whether a prediction is the stateless one: 1e-5 apart, so at most one intensity after rounding.
+    /// Checks a prediction against the stateless one. They differ by at most 1e-5, so by at most one intensity after rounding.
     fn check(&self, model: &LoadedModel, seq: usize, frames: &[ImageBytes]) {
         let expected = self.stateless(model, seq);
         assert_eq!(frames.len(), expected.len());
@@ -96,7 +96,7 @@ impl Trip {
         }
     }
 
-    /// Whether an exported state holds the features of the last frames, to 1e-5.
+    /// Checks that an exported state has the features of the last frames, within 1e-5.
     fn check_state(&self, model: &LoadedModel, state: &Value) {
         let spec = &model.manifest.spec;
         let features: Vec<Vec<f32>> = serde_json::from_value(state["memory"]["features"].clone()).unwrap();
@@ -112,15 +112,15 @@ impl Trip {
     }
 }
 
-async fn start(dir: &Path, models: &[LoadedModel]) -> (App, Running) {
+async fn start(dir: &Path, models: &[LoadedModel]) -> (App, InProcessServer) {
     let app = service::start(with_data(dir, ServerConfig::default()), models.to_vec());
     let server = run(app.clone()).await;
     (app, server)
 }
 
 #[tokio::test]
-async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_request_does() {
-    let (dir, trip) = (tempfile::tempdir().unwrap(), Trip::example());
+async fn shipped_models_predict_the_same_in_streams_and_requests() {
+    let (dir, recording) = (tempfile::tempdir().unwrap(), Recording::example());
     let models = [shipped("moving"), shipped("paper")];
     let (app, server) = start(dir.path(), &models).await;
     for (model, codec) in models
@@ -128,24 +128,24 @@ async fn after_any_number_of_frames_a_stream_of_a_shipped_model_predicts_what_a_
         .flat_map(|model| [(model, Codec::Json), (model, Codec::Msgpack)])
     {
         let name = &model.manifest.name;
-        let session = Opened::open(&app, &json!({"model": name})).await;
+        let session = SessionHandle::open(&app, &json!({"model": name})).await;
         let mut client = Client::connect(server.address, &session.path("/stream"), codec)
             .await
             .unwrap();
-        for seq in 0..trip.frames.len() {
-            match client.ask(&trip.message(seq)).await {
+        for seq in 0..recording.frames.len() {
+            match client.ask(&recording.message(seq)).await {
                 ServerMessage::Buffering { have, .. } => assert_eq!(have, seq + 1),
-                ServerMessage::Prediction { frames, .. } => trip.check(model, seq, &frames),
+                ServerMessage::Prediction { frames, .. } => recording.check(model, seq, &frames),
                 other => panic!("{other:?}"),
             }
         }
-        trip.check_state(model, &get(&app, &session.path("/state")).await.json());
+        recording.check_state(model, &get(&app, &session.path("/state")).await.json());
     }
     server.stop().await;
 }
 
 #[test]
-fn a_batch_of_many_windows_is_predicted_to_1e_5_as_each_alone() {
+fn batched_predictions_equal_single_ones_within_1e_5() {
     for model in [shipped("moving"), shipped("paper")] {
         let spec = &model.manifest.spec;
         let mut rng = Seed(5).rng();
@@ -180,10 +180,11 @@ fn a_batch_of_many_windows_is_predicted_to_1e_5_as_each_alone() {
     }
 }
 
-/// A robot that sends when it likes, some frames ahead of their answers; every prediction is held against the stateless.
+/// A robot that sends frames at random times, some ahead of their answers. Every prediction is checked against the
+/// stateless one.
 async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, robot: u64, steps: usize) {
-    let trip = Trip::noise(model, robot, steps);
-    let session = Opened::open(app, &json!({"model": "moving"})).await;
+    let recording = Recording::noise(model, robot, steps);
+    let session = SessionHandle::open(app, &json!({"model": "moving"})).await;
     let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
@@ -192,7 +193,7 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
     for answered in 0..steps {
         let ahead = rng.random_range(1..8usize);
         while sent < steps && sent < answered + ahead {
-            client.send(&trip.message(sent)).await;
+            client.send(&recording.message(sent)).await;
             sent += 1;
         }
         for _ in 0..rng.random_range(0..4u8) {
@@ -206,17 +207,17 @@ async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, ro
             }
             other => panic!("{other:?}"),
         }
-        // In one go, so that the robots keep the server busy together.
+        // Check many at once, so that all robots keep the server busy at the same time.
         if unchecked.len() == 50 || answered + 1 == steps {
             for (seq, frames) in unchecked.drain(..) {
-                trip.check(model, seq, &frames);
+                recording.check(model, seq, &frames);
             }
         }
     }
-    trip.check_state(model, &get(app, &session.path("/state")).await.json());
+    recording.check_state(model, &get(app, &session.path("/state")).await.json());
 }
 
-async fn interleaved(steps: usize) {
+async fn run_interleaved(steps: usize) {
     let dir = tempfile::tempdir().unwrap();
     let model = shipped("moving");
     let (app, server) = start(dir.path(), std::slice::from_ref(&model)).await;
@@ -226,13 +227,13 @@ async fn interleaved(steps: usize) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn sixty_four_interleaved_sessions_predict_what_each_would_alone() {
-    interleaved(12).await;
+async fn sixty_four_interleaved_sessions_equal_single_predictions() {
+    run_interleaved(12).await;
 }
 
 /// `cargo test --release --test it -- --ignored sixty_four_interleaved_sessions_for_a_thousand_steps`
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[ignore = "64,000 predictions twice over: minutes"]
+#[ignore = "64,000 predictions, each computed twice, take minutes"]
 async fn sixty_four_interleaved_sessions_for_a_thousand_steps() {
-    interleaved(1000).await;
+    run_interleaved(1000).await;
 }

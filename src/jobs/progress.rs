@@ -1,4 +1,5 @@
-//! What a job's work says of itself between two writes to the store. Pure: the time is an argument, in seconds since 1970.
+//! Buffers the report of a running job between two writes to the store. Pure: the time is an argument, in seconds since
+//! 1970.
 
 use std::collections::VecDeque;
 
@@ -6,21 +7,21 @@ use serde::{Deserialize, Serialize};
 
 use crate::store::LossRow;
 
-/// Lines and points that wait for the next write, at most; the oldest go first.
+/// How many lines and points are buffered at most; the oldest are dropped first.
 const MAX_WAITING: usize = 1000;
 
-/// How far a job is.
+/// How much of a job is done.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct JobProgress {
     /// Units done: trials of a collection, steps of a training, windows of an evaluation.
     pub done: u64,
-    /// Units in all; 0 until it is known.
+    /// Units in total; 0 until it is known.
     pub total: u64,
-    /// Units a second since the job, or the stage of its training, was taken up.
+    /// Units per second in this attempt, or in this stage of a training.
     pub rate_per_s: Option<f64>,
-    /// Seconds to go at that rate.
+    /// Seconds left at that rate.
     pub remaining_s: Option<f64>,
-    /// What is being done.
+    /// What the job is doing.
     pub message: String,
 }
 
@@ -33,40 +34,40 @@ pub struct Losses {
     pub validation: Option<f64>,
 }
 
-/// What the store keeps of a job's progress.
+/// A job's progress as the store keeps it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct StoredProgress {
-    /// How far it is.
+    /// How much is done.
     pub progress: JobProgress,
     /// The latest losses.
     pub losses: Losses,
 }
 
-/// The notes of a job that runs.
+/// The part of a running job's report that is not yet written to the store.
 #[derive(Debug, Default)]
-pub(super) struct JobProgressLog {
-    standing: StoredProgress,
+pub(super) struct ReportBuffer {
+    stored: StoredProgress,
     lines: VecDeque<(f64, String)>,
     points: VecDeque<LossRow>,
-    /// When the rate's measurement began, and the units that were there then, for example from a checkpoint.
+    /// When the rate measurement started, and how many units were done then, for example in an earlier attempt.
     measured_from: Option<(f64, u64)>,
 }
 
-impl JobProgressLog {
-    /// Goes on from what the store kept.
-    pub(super) fn new(standing: StoredProgress) -> Self {
+impl ReportBuffer {
+    /// Continues from the stored progress.
+    pub(super) fn new(stored: StoredProgress) -> Self {
         Self {
-            standing,
+            stored,
             ..Self::default()
         }
     }
 
-    /// Notes units done of a total, and what is being done.
+    /// Sets the units done, their total, and what the job is doing.
     pub(super) fn progress(&mut self, (done, total): (u64, u64), message: &str, now_s: f64) {
         let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
         let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
         let rate = (gained > 0.0 && elapsed_s > 0.0).then(|| gained / elapsed_s);
-        self.standing.progress = JobProgress {
+        self.stored.progress = JobProgress {
             done,
             total,
             rate_per_s: rate,
@@ -75,17 +76,17 @@ impl JobProgressLog {
         };
     }
 
-    /// Measures the rate anew, for a stage whose units take another time.
+    /// Restarts the rate measurement, because the units of a new stage take a different time.
     pub(super) fn stage(&mut self) {
         self.measured_from = None;
     }
 
-    /// Notes the latest losses; those not given keep their last value.
+    /// Sets the latest losses. A loss that is `None` keeps its last value.
     pub(super) fn losses(&mut self, losses: Losses) {
-        let known = self.standing.losses;
-        self.standing.losses = Losses {
-            train: losses.train.or(known.train),
-            validation: losses.validation.or(known.validation),
+        let last = self.stored.losses;
+        self.stored.losses = Losses {
+            train: losses.train.or(last.train),
+            validation: losses.validation.or(last.validation),
         };
     }
 
@@ -99,17 +100,17 @@ impl JobProgressLog {
         push(&mut self.points, point);
     }
 
-    /// How far it is.
-    pub(super) fn standing(&self) -> &StoredProgress {
-        &self.standing
+    /// The progress to store.
+    pub(super) fn stored(&self) -> &StoredProgress {
+        &self.stored
     }
 
-    /// The lines and points since the last call.
-    pub(super) fn take(&mut self) -> (Vec<(f64, String)>, Vec<LossRow>) {
+    /// Removes and returns the buffered lines and points.
+    pub(super) fn drain(&mut self) -> (Vec<(f64, String)>, Vec<LossRow>) {
         (self.lines.drain(..).collect(), self.points.drain(..).collect())
     }
 
-    /// Puts back what could not be written, before what came since.
+    /// Puts back what could not be written, before what was added since.
     pub(super) fn restore_unwritten(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
         let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
         lines
@@ -135,30 +136,30 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rate_and_time_left_count_only_what_this_run_did() {
-        let mut notes = JobProgressLog::default();
-        notes.progress((100, 200), "", 10.0);
-        notes.progress((120, 200), "", 20.0);
-        let progress = &notes.standing().progress;
+    fn rate_and_time_left_count_only_this_attempt() {
+        let mut buffer = ReportBuffer::default();
+        buffer.progress((100, 200), "", 10.0);
+        buffer.progress((120, 200), "", 20.0);
+        let progress = &buffer.stored().progress;
         assert_eq!((progress.rate_per_s, progress.remaining_s), (Some(2.0), Some(40.0)));
     }
 
     #[test]
-    fn what_could_not_be_written_comes_before_what_came_since() {
-        let mut notes = JobProgressLog::default();
-        notes.line("one".to_owned(), 1.0);
-        let (lines, points) = notes.take();
-        notes.line("two".to_owned(), 2.0);
-        notes.restore_unwritten(lines, points);
-        let (lines, _) = notes.take();
+    fn unwritten_lines_come_before_later_ones() {
+        let mut buffer = ReportBuffer::default();
+        buffer.line("one".to_owned(), 1.0);
+        let (lines, points) = buffer.drain();
+        buffer.line("two".to_owned(), 2.0);
+        buffer.restore_unwritten(lines, points);
+        let (lines, _) = buffer.drain();
         assert_eq!(lines, [(1.0, "one".to_owned()), (2.0, "two".to_owned())]);
     }
 
     #[test]
-    fn a_store_that_cannot_be_reached_does_not_fill_the_memory() {
-        let mut notes = JobProgressLog::default();
-        (0..5000).for_each(|i| notes.line(i.to_string(), 0.0));
-        let (lines, _) = notes.take();
+    fn the_buffer_is_bounded_while_the_store_is_unreachable() {
+        let mut buffer = ReportBuffer::default();
+        (0..5000).for_each(|i| buffer.line(i.to_string(), 0.0));
+        let (lines, _) = buffer.drain();
         assert_eq!((lines.len(), lines[0].1.as_str()), (MAX_WAITING, "4000"));
     }
 }

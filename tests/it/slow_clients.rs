@@ -1,4 +1,4 @@
-//! Clients that read slowly or never, beside others.
+//! Stream clients that read slowly or never, and their effect on others.
 
 use std::time::{Duration, Instant};
 
@@ -7,15 +7,15 @@ use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMess
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 
 use crate::client::Client;
-use crate::service::{self, PATIENCE, Running, model, run, spec, until, with_data};
+use crate::service::{self, TIMEOUT, InProcessServer, model, run, spec, poll_until, with_data};
 
 const SIDE: u32 = 256;
-const SEND: Duration = Duration::from_millis(500);
+const SEND_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// A server of a model whose answers, half a megabyte each, soon fill a socket.
-async fn start(dir: &std::path::Path) -> Running {
+/// A server with a model whose answers are so large (half a megabyte) that they soon fill a socket.
+async fn start(dir: &std::path::Path) -> InProcessServer {
     let config = ServerConfig {
-        stream_send_ms: SEND.as_millis() as u64,
+        stream_send_ms: SEND_TIMEOUT.as_millis() as u64,
         max_stream_buffer_bytes: 1 << 20,
         ..with_data(dir, ServerConfig::default())
     };
@@ -29,7 +29,7 @@ async fn start(dir: &std::path::Path) -> Running {
     run(service::start(config, vec![model(dir, "large", large)])).await
 }
 
-async fn connect(server: &Running) -> Client {
+async fn connect(server: &InProcessServer) -> Client {
     Client::connect(server.address, "/v1/models/large/stream", Codec::Msgpack)
         .await
         .unwrap()
@@ -47,29 +47,30 @@ fn frame(seq: u64) -> ClientMessage {
     })
 }
 
-/// Reads nothing for longer than the server waits, then everything: the end, as far as it could still be told.
-async fn read_nothing_then_all(server: &Running) -> (Option<ClosingReason>, Option<u16>) {
+/// Reads nothing for longer than the server waits, then everything. Returns the reason and code of the close, if they
+/// arrived.
+async fn read_nothing_then_all(server: &InProcessServer) -> (Option<ClosingReason>, Option<u16>) {
     let mut client = connect(server).await;
     client.ask(&frame(0)).await;
-    // The kept answer is sent again for each.
+    // The server sends the cached answer for each.
     let flood = async { while client.try_send(&frame(0)).await.is_ok() {} };
-    let _ = tokio::time::timeout(SEND + SEND / 2, flood).await;
-    let end = tokio::time::timeout(4 * SEND, client.end()).await;
+    let _ = tokio::time::timeout(SEND_TIMEOUT + SEND_TIMEOUT / 2, flood).await;
+    let end = tokio::time::timeout(4 * SEND_TIMEOUT, client.end()).await;
     end.unwrap_or_default()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_reads_nothing_is_told_so_and_left() {
+async fn a_client_that_never_reads_is_closed_with_1013() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
-    // On a busy machine the client may begin to read before the server's patience is over, or after it has hung up.
+    // On a busy machine the client may start to read before the server's time limit, or after the connection has ended.
     let slow = (Some(ClosingReason::Slow), Some(1013));
-    until(async || (read_nothing_then_all(&server).await == slow).then_some(())).await;
+    poll_until(async || (read_nothing_then_all(&server).await == slow).then_some(())).await;
     server.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
+async fn a_slow_client_is_told_how_many_predictions_were_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
     let mut client = connect(&server).await;
@@ -78,11 +79,11 @@ async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
     for _ in 0..sent {
         client.send(&frame(0)).await;
     }
-    let (mut told, mut read, mut is_warned) = (0, 0, false);
-    while told + read < sent {
+    let (mut dropped_total, mut read, mut is_warned) = (0, 0, false);
+    while dropped_total + read < sent {
         match client.receive().await {
             ServerMessage::Prediction { dropped, .. } => {
-                told += dropped;
+                dropped_total += dropped;
                 read += 1;
             }
             ServerMessage::Warning { code, .. } => {
@@ -92,16 +93,16 @@ async fn a_client_that_reads_late_is_told_how_many_predictions_it_missed() {
             other => panic!("{other:?}"),
         }
     }
-    assert!(told > 0 && is_warned, "{told} dropped of {sent}");
+    assert!(dropped_total > 0 && is_warned, "{dropped_total} dropped of {sent}");
     server.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn others_are_answered_while_one_reads_nothing() {
+async fn a_slow_client_does_not_delay_others() {
     let dir = tempfile::tempdir().unwrap();
     let server = start(dir.path()).await;
-    let mut stuck = connect(&server).await;
-    let flood = tokio::spawn(async move { while stuck.try_send(&frame(0)).await.is_ok() {} });
+    let mut slow = connect(&server).await;
+    let flood = tokio::spawn(async move { while slow.try_send(&frame(0)).await.is_ok() {} });
     let others = (0..20).map(|_| async {
         let mut client = connect(&server).await;
         let mut slowest = Duration::ZERO;
@@ -116,7 +117,7 @@ async fn others_are_answered_while_one_reads_nothing() {
         slowest
     });
     for slowest in futures_util::future::join_all(others).await {
-        assert!(slowest < PATIENCE / 4, "{slowest:?}");
+        assert!(slowest < TIMEOUT / 4, "{slowest:?}");
     }
     flood.abort();
     server.stop().await;

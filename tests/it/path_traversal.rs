@@ -1,4 +1,4 @@
-//! Names that would leave the data directory, wherever a name can be given.
+//! Names that could leave the data directory, in every place that takes a name.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::neighbour::Scene;
+use crate::healthy_robot::ServerWithRobot;
 use crate::service::{get, post, send};
 
 const NAMES: [&str; 8] = [
@@ -46,7 +46,7 @@ const PATHS: [(&str, &str); 19] = [
     ("DELETE", "/v1/environments/NAME"),
 ];
 
-/// Every file below, with its length, but the store's own, which grows.
+/// Every file below a directory with its length, without the store's own files, which grow.
 fn files(dir: &Path) -> Vec<(String, u64)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir).unwrap().flatten() {
@@ -62,9 +62,9 @@ fn files(dir: &Path) -> Vec<(String, u64)> {
 }
 
 #[tokio::test]
-async fn no_name_in_a_path_leaves_the_data_directory() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (app, before) = (scene.app.clone(), files(scene.dir.path()));
+async fn names_in_paths_cannot_leave_the_data_directory() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (app, before) = (setup.app.clone(), files(setup.dir.path()));
     let asking = async {
         for (method, path) in PATHS {
             for name in NAMES {
@@ -80,15 +80,15 @@ async fn no_name_in_a_path_leaves_the_data_directory() {
             }
         }
     };
-    scene.beside(asking).await;
-    assert_eq!(files(scene.dir.path()), before);
-    scene.close().await;
+    setup.while_robot_streams(asking).await;
+    assert_eq!(files(setup.dir.path()), before);
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn a_path_with_dots_is_not_resolved() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let address = scene.address();
+async fn dots_in_paths_are_not_resolved() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let address = setup.address();
     for path in [
         "/../../etc/passwd",
         "/v1/../livez",
@@ -103,20 +103,20 @@ async fn a_path_with_dots_is_not_resolved() {
             client.read_to_string(&mut answer).await.unwrap();
             answer
         };
-        let answer = scene.beside(asking).await;
+        let answer = setup.while_robot_streams(asking).await;
         assert!(answer.starts_with("HTTP/1.1 404"), "{path}: {answer}");
     }
-    scene.close().await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn no_name_in_a_job_leaves_the_data_directory_and_a_key_is_only_a_key() {
+async fn names_in_jobs_cannot_leave_the_data_directory() {
     let config = ServerConfig {
         no_jobs: true,
         ..ServerConfig::default()
     };
-    let mut scene = Scene::open(config).await;
-    let (app, before) = (scene.app.clone(), files(scene.dir.path()));
+    let mut setup = ServerWithRobot::open(config).await;
+    let (app, before) = (setup.app.clone(), files(setup.dir.path()));
     let collect = json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 1});
     let train = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "a"});
     let evaluate = json!({"kind": "evaluate", "model": "plain", "dataset": "a", "twin": "plain"});
@@ -147,7 +147,7 @@ async fn no_name_in_a_job_leaves_the_data_directory_and_a_key_is_only_a_key() {
         }
         get(&app, "/v1/jobs/job-1/files/..%2fforeframe.db").await.detail(404);
     };
-    scene.beside(asking).await;
-    assert_eq!(files(scene.dir.path()), before);
-    scene.close().await;
+    setup.while_robot_streams(asking).await;
+    assert_eq!(files(setup.dir.path()), before);
+    setup.close().await;
 }

@@ -1,7 +1,6 @@
-//! The real work of jobs over HTTP: what is collected trains models, whose versions serve, are measured and deleted.
+//! Real jobs over HTTP: collection, training, evaluation, and the model versions and data sets that they create.
 
 use std::path::Path;
-use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::Request;
@@ -9,7 +8,7 @@ use foreframe::server::{App, ServerConfig};
 use futures_util::FutureExt as _;
 use serde_json::{Value, json};
 
-use crate::service::{Answer, app, context, get, post, send, store, until, with_data};
+use crate::service::{Answer, app, context, get, post, send, store, poll_until, with_data};
 
 const JOBS: &str = "/v1/jobs";
 
@@ -24,12 +23,12 @@ fn train(name: &str, steps: usize) -> Value {
     json!({"kind": "train", "name": name, "preset": "paper", "dataset": "seen", "settings": settings})
 }
 
-/// Asks for a job and waits until it has succeeded.
-async fn done(app: &App, body: &Value) -> Value {
+/// Creates a job and waits until it has succeeded.
+async fn run_job(app: &App, body: &Value) -> Value {
     let taken = post(app, JOBS, body).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
-    until(async || {
+    poll_until(async || {
         let job = get(app, &path).await.json();
         assert!(job["state"] != "failed" && job["state"] != "cancelled", "{job}");
         (job["state"] == "succeeded").then_some(job)
@@ -37,17 +36,17 @@ async fn done(app: &App, body: &Value) -> Value {
     .await
 }
 
-async fn collected(app: &App) -> Value {
+async fn collect_data_set(app: &App) -> Value {
     let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
-    done(app, &seen).await
+    run_job(app, &seen).await
 }
 
 async fn delete(app: &App, path: &str) -> Answer {
     send(app, Request::delete(path).body(Body::empty()).unwrap()).await
 }
 
-async fn serves(app: &App, model: &str, version: u32) -> Value {
-    until(async || {
+async fn wait_for_version(app: &App, model: &str, version: u32) -> Value {
+    poll_until(async || {
         let answer = get(app, &format!("/v1/models/{model}")).await;
         let description = (answer.status == 200).then(|| answer.json())?;
         (description["active_version"] == version).then_some(description)
@@ -56,14 +55,14 @@ async fn serves(app: &App, model: &str, version: u32) -> Value {
 }
 
 #[tokio::test]
-async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measured() {
+async fn a_collected_data_set_trains_a_served_model() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let done_collecting = collected(&app).await;
+    let collection = collect_data_set(&app).await;
     assert_eq!(
         (
-            &done_collecting["progress"]["done"],
-            &done_collecting["progress"]["total"]
+            &collection["progress"]["done"],
+            &collection["progress"]["total"]
         ),
         (&json!(40), &json!(40))
     );
@@ -71,7 +70,7 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
     let exists = post(&app, JOBS, &again).await.detail(409);
     assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
 
-    let first = done(&app, &train("fresh", 3)).await;
+    let first = run_job(&app, &train("fresh", 3)).await;
     assert!(
         first["losses"]["train"].is_number() && first["losses"]["validation"].is_number(),
         "{first}"
@@ -80,7 +79,7 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
         (&first["result"]["model"], &first["result"]["version"]),
         (&json!("fresh"), &json!(1))
     );
-    let description = serves(&app, "fresh", 1).await;
+    let description = wait_for_version(&app, "fresh", 1).await;
     assert_eq!(description["lineage"]["dataset"], "static-observer-40-seed-1");
     let misfit = post(&app, "/v1/models/fresh/predict", &json!({"frames": context()}))
         .await
@@ -99,7 +98,7 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
     assert_eq!(has_validation, [false, true, true, false, true, true]);
 
     let body = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 40, "resamples": 100});
-    let measured = done(&app, &body).await;
+    let measured = run_job(&app, &body).await;
     assert!(measured["result"]["scores"]["test"]["skill"].is_number(), "{measured}");
     let report = get(&app, "/v1/jobs/job-3/files/report.json").await;
     assert_eq!(report.headers["content-type"], "application/json");
@@ -120,49 +119,23 @@ async fn a_collected_data_set_trains_models_whose_versions_serve_and_are_measure
 }
 
 #[tokio::test]
-async fn the_jobs_in_the_readme_run() {
+async fn a_cancelled_evaluation_leaves_no_report() {
     let dir = tempfile::tempdir().unwrap();
-    let app = app(dir.path(), ServerConfig::default());
-    let readme = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md")).unwrap();
-    let bodies = readme
-        .lines()
-        .filter_map(|line| line.trim().strip_prefix("-d '")?.strip_suffix('\''));
-    let jobs: Vec<Value> = bodies
-        .map(|body| serde_json::from_str(body).unwrap())
-        .filter(|body: &Value| body["kind"].is_string())
-        .collect();
-    assert!(jobs.len() >= 2, "{jobs:?}");
-    for job in jobs {
-        // Longer than the others: it trains in earnest.
-        tokio::time::timeout(Duration::from_mins(10), async {
-            let taken = post(&app, JOBS, &job).await;
-            let path = format!("{JOBS}/{}/events", taken.json()["id"].as_str().unwrap());
-            let events = get(&app, &path).await;
-            assert!(String::from_utf8_lossy(&events.body).contains("\"state\":\"succeeded\""));
-        })
-        .await
-        .unwrap();
-    }
-}
-
-#[tokio::test]
-async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
-    let dir = tempfile::tempdir().unwrap();
-    // The shipped models, which take frames as they are collected.
+    // The shipped models take frames of the collected size.
     let config = ServerConfig {
         data_dir: dir.path().to_owned(),
         job_lease_ms: 1000,
         ..ServerConfig::default()
     };
     let app = App::open(config).await.unwrap();
-    // So many that it takes longer than the job's standing is written and looked at.
+    // Enough trials that the evaluation is still running when it is cancelled.
     let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 100});
-    done(&app, &seen).await;
+    run_job(&app, &seen).await;
     let body =
         json!({"kind": "evaluate", "model": "static", "dataset": "seen", "windows": 100_000, "resamples": 10_000});
     post(&app, JOBS, &body).await;
     let becomes = async |state: &str| {
-        until(async || {
+        poll_until(async || {
             let job = get(&app, "/v1/jobs/job-2").await.json();
             assert!(job["state"] != "succeeded" && job["state"] != "failed", "{job}");
             (job["state"] == state && job["progress"]["message"] != "").then_some(job)
@@ -181,13 +154,13 @@ async fn a_running_evaluation_can_be_cancelled_and_leaves_no_report() {
 }
 
 #[tokio::test]
-async fn versions_are_swapped_refused_deleted_and_remembered() {
+async fn model_versions_are_activated_refused_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    collected(&app).await;
-    // "plain" was shipped as version 1 and goes on serving until told otherwise.
+    collect_data_set(&app).await;
+    // "plain" was shipped as version 1, which stays active until another version is activated.
     for (name, steps, version) in [("plain", 2, 2), ("plain", 4, 3), ("plain", 6, 4)] {
-        let job = done(&app, &train(name, steps)).await;
+        let job = run_job(&app, &train(name, steps)).await;
         assert_eq!(job["result"]["version"], version);
         let progress = &job["progress"];
         assert!(
@@ -208,11 +181,11 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
         (&swapped["active_version"], &swapped["spec"]["frame_width_px"]),
         (&json!(2), &json!(64))
     );
-    // Who asks and goes is obeyed all the same.
+    // The activation completes even if the client disconnects.
     let and_gone = post(&app, "/v1/models/plain/versions/1/activate", &Value::Null).now_or_never();
     assert!(and_gone.is_none());
-    serves(&app, "plain", 1).await;
-    until(async || (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(()))
+    wait_for_version(&app, "plain", 1).await;
+    poll_until(async || (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(()))
         .await;
     post(&app, "/v1/models/plain/versions/2/activate", &Value::Null)
         .await
@@ -229,11 +202,11 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
         refused.starts_with("version 3 of model \"plain\" is refused:") && refused.contains("SHA-256"),
         "{refused}"
     );
-    misshape(&dir.path().join("models/plain/4"));
+    change_spec(&dir.path().join("models/plain/4"));
     let refused = post(&app, "/v1/models/plain/versions/4/activate", &Value::Null)
         .await
         .detail(422);
-    assert!(refused.contains("do not fit their manifest"), "{refused}");
+    assert!(refused.contains("do not match their manifest"), "{refused}");
     assert_eq!(get(&app, "/v1/models/plain").await.json()["active_version"], 2);
 
     let unknown = post(&app, "/v1/models/plain/versions/7/activate", &Value::Null)
@@ -265,17 +238,17 @@ async fn versions_are_swapped_refused_deleted_and_remembered() {
         (&description["versions"], &description["active_version"]),
         (&json!([1, 2, 3]), &json!(2))
     );
-    // What another server activates is followed, and what it activated in vain is not served after a restart either.
+    // A version that another server activates is loaded. If it is invalid, the previous one is served, also after a restart.
     store(dir.path()).set_active("plain", 1, 0.0).await.unwrap();
-    serves(&next, "plain", 1).await;
+    wait_for_version(&next, "plain", 1).await;
     store(dir.path()).set_active("plain", 3, 0.0).await.unwrap();
     let third = App::open(config).await.unwrap();
     assert_eq!(get(&third, "/v1/models/plain").await.json()["active_version"], 1);
-    assert_eq!(done(&third, &train("plain", 2)).await["result"]["version"], 5);
+    assert_eq!(run_job(&third, &train("plain", 2)).await["result"]["version"], 5);
 }
 
-/// Has a manifest promise other shapes than the weights have.
-fn misshape(model_dir: &Path) {
+/// Changes a manifest so that its shapes differ from the weights'.
+fn change_spec(model_dir: &Path) {
     let path = model_dir.join("manifest.json");
     let text = std::fs::read_to_string(&path).unwrap();
     let mut manifest: Value = serde_json::from_str(&text).unwrap();
@@ -284,13 +257,13 @@ fn misshape(model_dir: &Path) {
 }
 
 #[tokio::test]
-async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_that_name() {
+async fn files_of_a_cancelled_collection_can_be_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let collect = |trials: u32| json!({"kind": "collect", "name": "d", "scenario": "crowded", "trials": trials});
     post(&app, JOBS, &collect(100_000)).await;
-    let becomes = async |has_come: &dyn Fn(&Value) -> bool| {
-        until(async || has_come(&get(&app, "/v1/jobs/job-1").await.json()).then_some(())).await;
+    let becomes = async |is_reached: &dyn Fn(&Value) -> bool| {
+        poll_until(async || is_reached(&get(&app, "/v1/jobs/job-1").await.json()).then_some(())).await;
     };
     becomes(&|job| job["progress"]["done"].as_u64().is_some_and(|done| done > 0)).await;
     assert_eq!(delete(&app, "/v1/datasets/d").await.status, 409);
@@ -300,16 +273,16 @@ async fn what_a_cancelled_collection_left_can_be_deleted_to_collect_another_of_t
     assert!(occupied.contains("trials: 100000 there, 2 asked"), "{occupied}");
     assert_eq!(delete(&app, "/v1/datasets/d").await.status, 204);
     assert_eq!(std::fs::read_dir(dir.path().join("datasets")).unwrap().count(), 0);
-    done(&app, &collect(2)).await;
+    run_job(&app, &collect(2)).await;
     assert_eq!(get(&app, "/v1/datasets/d").await.json()["episodes"], 2);
 }
 
 #[tokio::test]
-async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
+async fn data_sets_are_described_shown_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/v1/datasets").await.json(), json!({"datasets": []}));
-    collected(&app).await;
+    collect_data_set(&app).await;
     let list = get(&app, "/v1/datasets").await.json();
     let described = get(&app, "/v1/datasets/seen").await.json();
     assert_eq!(list, json!({"datasets": [described]}));
@@ -333,10 +306,10 @@ async fn data_sets_are_told_of_shown_and_deleted_unless_a_job_needs_them() {
     let needed = delete(&app, "/v1/datasets/seen").await.detail(409);
     assert_eq!(
         needed,
-        "data set \"seen\" is in use by job-2; wait for its end or cancel it"
+        "data set \"seen\" is in use by job-2; wait until that job has ended, or cancel it"
     );
     post(&app, "/v1/jobs/job-2/cancel", &Value::Null).await;
-    until(async || (get(&app, "/v1/jobs/job-2").await.json()["state"] == "cancelled").then_some(())).await;
+    poll_until(async || (get(&app, "/v1/jobs/job-2").await.json()["state"] == "cancelled").then_some(())).await;
     assert_eq!(delete(&app, "/v1/datasets/seen").await.status, 204);
     assert!(!dir.path().join("datasets/seen").exists());
     assert_eq!(delete(&app, "/v1/datasets/seen").await.status, 404);

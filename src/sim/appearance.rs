@@ -1,22 +1,22 @@
-//! What the robots look like: a few upright cylinders and boxes each.
+//! Appearance of the robots: each consists of a few upright cylinders and boxes.
 
-use super::cast::{Block, UprightCylinder};
+use super::ray_cast::{Block, UprightCylinder};
 
-/// A simple solid.
+/// A solid shape.
 pub(super) enum Solid {
     Cylinder(UprightCylinder),
     Block(Block),
 }
 
-/// A solid with its gray, 0…1.
+/// A solid with its gray value, 0…1.
 pub(super) struct ShadedSolid {
     pub(super) solid: Solid,
     pub(super) albedo: f32,
 }
 
-/// A robot's body.
+/// The shape of a robot.
 pub(super) struct RobotAppearance {
-    /// Of its round base, which is what bumps into things.
+    /// Radius of the round base, which is what collides with other things.
     pub(super) radius_m: f32,
     pub(super) height_m: f32,
     pub(super) parts: &'static [ShadedSolid],
@@ -29,9 +29,9 @@ const fn cylinder(radius: f32, bottom: f32, top: f32, albedo: f32) -> ShadedSoli
     }
 }
 
-const fn block(middle: [f32; 3], half: [f32; 3], albedo: f32) -> ShadedSolid {
+const fn block(center: [f32; 3], half: [f32; 3], albedo: f32) -> ShadedSolid {
     ShadedSolid {
-        solid: Solid::Block(Block { middle, half }),
+        solid: Solid::Block(Block { center, half }),
         albedo,
     }
 }
@@ -48,8 +48,8 @@ pub(super) static TURTLEBOT: RobotAppearance = RobotAppearance {
     ],
 };
 
-/// A light one with a dark plate.
-static PALE: RobotAppearance = RobotAppearance {
+/// A light robot with a dark plate.
+static LIGHT_TURTLEBOT: RobotAppearance = RobotAppearance {
     radius_m: 0.177,
     height_m: 0.42,
     parts: &[
@@ -81,11 +81,11 @@ static TALL: RobotAppearance = RobotAppearance {
     ],
 };
 
-/// Tb2 is a TurtleBot; those after it differ.
-pub(super) fn of_mover(index: usize) -> &'static RobotAppearance {
+/// Appearance of the robots besides Tb1: index 0 is Tb2, a TurtleBot; the others look different.
+pub(super) fn of_other_robot(index: usize) -> &'static RobotAppearance {
     match index {
         0 => &TURTLEBOT,
-        1 => &PALE,
+        1 => &LIGHT_TURTLEBOT,
         2 => &CART,
         _ => &TALL,
     }

@@ -1,4 +1,4 @@
-//! What jobs say of themselves while they run: a bounded log, and the loss curves of trainings.
+//! The reports of running jobs: a bounded log, and the loss curves of trainings.
 
 use super::database::{DatabaseRow, Tx};
 use super::{Store, StoreError};
@@ -8,7 +8,7 @@ use super::{Store, StoreError};
 pub struct LossRow {
     /// `pretrain` or `fit`.
     pub stage: String,
-    /// Updates made in that stage.
+    /// Steps done in that stage.
     pub step: i64,
     /// On the step's training windows.
     pub train: Option<f64>,
@@ -19,7 +19,7 @@ pub struct LossRow {
 /// A line of a job's log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogRow {
-    /// Counts the lines of a job, from 1.
+    /// The line's number in its job, from 1.
     pub seq: i64,
     /// When, in seconds since 1970.
     pub time_s: f64,
@@ -27,21 +27,21 @@ pub struct LogRow {
     pub line: String,
 }
 
-/// What is written of a running job at one time.
+/// What a running job writes to the store at one time.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct JobUpdate {
-    /// How far it is.
+pub struct JobReport {
+    /// Its progress, as JSON.
     pub progress: String,
-    /// Lines for its log: when, and what.
+    /// New lines of its log: time in seconds since 1970, and text.
     pub lines: Vec<(f64, String)>,
-    /// Points for its curves; one that is there is replaced.
+    /// New points of its curves; they replace existing points of the same step.
     pub losses: Vec<LossRow>,
-    /// Lines of its log that are kept at most.
+    /// How many lines of its log are kept.
     pub max_lines: i64,
 }
 
 impl Store {
-    /// The lines of a job's log after one, the oldest first. Errors: `Query`.
+    /// The lines of a job's log after line number `after`, the oldest first. Errors: `Query`.
     pub async fn job_log(&self, number: i64, after: i64, limit: i64) -> Result<Vec<LogRow>, StoreError> {
         let sql = "SELECT * FROM job_logs WHERE job = $1 AND seq > $2 ORDER BY seq LIMIT $3";
         let values = vec![number.into(), after.into(), limit.into()];
@@ -72,17 +72,17 @@ impl Store {
     }
 }
 
-/// Writes it in the transaction that has found the lease to hold.
-pub(super) async fn write_account(tx: &mut Tx, number: i64, account: JobUpdate) -> Result<(), StoreError> {
-    for (time_s, line) in account.lines {
+/// Writes the report in the transaction that has checked the lease.
+pub(super) async fn write_report(tx: &mut Tx, number: i64, report: JobReport) -> Result<(), StoreError> {
+    for (time_s, line) in report.lines {
         let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
              SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";
         tx.execute(sql, vec![number.into(), time_s.into(), line.into()]).await?;
         let sql = "DELETE FROM job_logs WHERE job = $1 AND \
              seq <= (SELECT MAX(seq) FROM job_logs WHERE job = $1) - $2";
-        tx.execute(sql, vec![number.into(), account.max_lines.into()]).await?;
+        tx.execute(sql, vec![number.into(), report.max_lines.into()]).await?;
     }
-    for point in account.losses {
+    for point in report.losses {
         let sql = "INSERT INTO job_losses (job, stage, step, train, validation) VALUES ($1, $2, $3, $4, $5) \
              ON CONFLICT (job, stage, step) DO UPDATE SET train = excluded.train, validation = excluded.validation";
         let values = vec![

@@ -1,4 +1,4 @@
-//! Clients whose streams break the rules, beside one whose does not.
+//! Malformed messages on streams, while a healthy robot streams.
 
 use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, ErrorCode, FrameMessage, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
@@ -8,9 +8,9 @@ use tokio_tungstenite::tungstenite::Message;
 
 use futures_util::SinkExt as _;
 
-use crate::client::{Client, send_frame, step};
-use crate::neighbour::Scene;
-use crate::service::{get, until};
+use crate::client::{Client, numbered_frame, numbered_message};
+use crate::healthy_robot::ServerWithRobot;
+use crate::service::{get, poll_until};
 
 const CODECS: [Codec; 2] = [Codec::Json, Codec::Msgpack];
 
@@ -21,25 +21,25 @@ fn refusal(message: &ServerMessage) -> (ErrorCode, &str, u64) {
     }
 }
 
-fn kept(name: &str) -> Vec<u8> {
+fn corpus_file(name: &str) -> Vec<u8> {
     std::fs::read(format!("{}/tests/corpus/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap()
 }
 
 #[tokio::test]
-async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009() {
-    let mut scene = Scene::open(ServerConfig {
+async fn a_message_over_the_limit_closes_with_1009() {
+    let mut setup = ServerWithRobot::open(ServerConfig {
         max_body_bytes: 4096,
         ..ServerConfig::default()
     })
     .await;
-    let (address, session) = (scene.address(), scene.session().await);
+    let (address, session) = (setup.address(), setup.session().await);
     for (answered, codec) in CODECS.into_iter().enumerate() {
-        let greedy = async {
+        let bad_client = async {
             let mut client = Client::connect(address, &session.path("/stream"), codec).await.unwrap();
-            client.send(&send_frame(answered as u64)).await;
+            client.send(&numbered_message(answered as u64)).await;
             let image = ImageBytes(vec![0; 3 << 20]);
             client
-                .send(&ClientMessage::Frame(FrameMessage { image, ..step(9) }))
+                .send(&ClientMessage::Frame(FrameMessage { image, ..numbered_frame(9) }))
                 .await;
             assert!(matches!(client.receive().await, ServerMessage::Buffering { .. }));
             let refused = client.receive().await;
@@ -51,29 +51,29 @@ async fn a_message_over_the_limit_is_refused_and_its_connection_closed_with_1009
             );
             assert_eq!(client.end().await, (Some(ClosingReason::TooLong), Some(1009)));
         };
-        scene.beside(greedy).await;
+        setup.while_robot_streams(bad_client).await;
     }
     let client = Client::connect(address, &session.path("/stream"), Codec::Json).await;
     assert_eq!(client.unwrap().next_seq, 2);
-    scene.close().await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn what_breaks_the_websockets_own_rules_is_told_so_and_closed() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (address, session) = (scene.address(), scene.session().await);
+async fn websocket_protocol_errors_are_reported_before_closing() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (address, session) = (setup.address(), setup.session().await);
     for (bytes, reason, code) in [
-        // Text that is not masked.
+        // A text frame without a mask.
         (&b"\x81\x01x"[..], ClosingReason::Malformed, 1002),
-        // An operation that there is not.
+        // An unknown opcode.
         (b"\x83\x80\0\0\0\0", ClosingReason::Malformed, 1002),
-        // The rest of nothing.
+        // A continuation frame without a first frame.
         (b"\x80\x80\0\0\0\0", ClosingReason::Malformed, 1002),
-        // A reserved bit, as of compression, which is not spoken here.
+        // A reserved bit, as set by compression, which was not negotiated.
         (b"\xC1\x80\0\0\0\0", ClosingReason::Malformed, 1002),
         (b"\x81\x82\0\0\0\0\xFF\xFE", ClosingReason::NotUtf8, 1007),
     ] {
-        let breaking = async {
+        let bad_client = async {
             let mut client = Client::connect(address, &session.path("/stream"), Codec::Json)
                 .await
                 .unwrap();
@@ -81,20 +81,20 @@ async fn what_breaks_the_websockets_own_rules_is_told_so_and_closed() {
             assert_eq!(refusal(&client.receive().await).0, ErrorCode::Malformed);
             assert_eq!(client.end().await, (Some(reason), Some(code)), "{bytes:?}");
         };
-        scene.beside(breaking).await;
+        setup.while_robot_streams(bad_client).await;
     }
-    scene.close().await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_goes_on() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (address, session) = (scene.address(), scene.session().await);
+async fn a_message_of_the_wrong_type_is_refused() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (address, session) = (setup.address(), setup.session().await);
     for (codec, message, kind) in [
         (Codec::Msgpack, Message::text(r#"{"type":"ping"}"#), "binary"),
         (Codec::Json, Message::binary(vec![0x80]), "text"),
     ] {
-        let confused = async {
+        let bad_client = async {
             let mut client = Client::connect(address, &session.path("/stream"), codec).await.unwrap();
             let seq = client.next_seq;
             client.socket.send(message).await.unwrap();
@@ -102,27 +102,27 @@ async fn text_in_the_binary_protocol_and_the_reverse_are_refused_and_the_stream_
             let detail = format!("{} takes {kind} messages", codec.name());
             assert_eq!(refusal(&answer), (ErrorCode::Malformed, detail.as_str(), seq));
             assert!(matches!(
-                client.ask(&send_frame(seq)).await,
+                client.ask(&numbered_message(seq)).await,
                 ServerMessage::Buffering { .. }
             ));
         };
-        scene.beside(confused).await;
+        setup.while_robot_streams(bad_client).await;
     }
-    scene.close().await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_goes_on() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (address, session) = (scene.address(), scene.session().await);
+async fn an_invalid_frame_is_refused_with_the_field() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (address, session) = (setup.address(), setup.session().await);
     let frame = |change: &dyn Fn(&mut FrameMessage)| {
-        let mut message = step(0);
+        let mut message = numbered_frame(0);
         change(&mut message);
         ClientMessage::Frame(message)
     };
     let image = |name: &'static str| {
         move |message: &mut FrameMessage| {
-            message.image = ImageBytes(kept(&format!("images/{name}")));
+            message.image = ImageBytes(corpus_file(&format!("images/{name}")));
             message.format = ImageFormat::Png;
         }
     };
@@ -148,7 +148,7 @@ async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_go
             "image is not a readable",
         ),
     ];
-    let lying = async {
+    let bad_client = async {
         let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
             .await
             .unwrap();
@@ -163,24 +163,24 @@ async fn a_frame_with_values_that_are_none_is_refused_by_field_and_the_stream_go
             "refused-deep.msgpack",
             "refused-half.msgpack",
         ] {
-            let bytes = kept(&format!("messages/{name}"));
+            let bytes = corpus_file(&format!("messages/{name}"));
             client.socket.send(Message::binary(bytes)).await.unwrap();
             assert_eq!(refusal(&client.receive().await).0, ErrorCode::Malformed, "{name}");
         }
         assert!(matches!(
-            client.ask(&send_frame(0)).await,
+            client.ask(&numbered_message(0)).await,
             ServerMessage::Buffering { .. }
         ));
     };
-    scene.beside(lying).await;
-    scene.close().await;
+    setup.while_robot_streams(bad_client).await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn what_a_client_sent_is_not_quoted_back_at_length() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (address, session) = (scene.address(), scene.session().await);
-    let verbose = async {
+async fn refusals_quote_only_a_short_part_of_a_message() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (address, session) = (setup.address(), setup.session().await);
+    let bad_client = async {
         let mut client = Client::connect(address, &session.path("/stream"), Codec::Json)
             .await
             .unwrap();
@@ -193,38 +193,38 @@ async fn what_a_client_sent_is_not_quoted_back_at_length() {
             "{detail}"
         );
     };
-    scene.beside(verbose).await;
-    scene.close().await;
+    setup.while_robot_streams(bad_client).await;
+    setup.close().await;
 }
 
 #[tokio::test]
-async fn a_socket_that_ends_in_the_midst_of_a_frame_leaves_its_session_where_it_was() {
-    let mut scene = Scene::open(ServerConfig::default()).await;
-    let (address, session) = (scene.address(), scene.session().await);
-    // A binary message of 16 KiB of which ten bytes come; half a header; the first of many fragments.
+async fn a_partial_message_does_not_change_the_session() {
+    let mut setup = ServerWithRobot::open(ServerConfig::default()).await;
+    let (address, session) = (setup.address(), setup.session().await);
+    // Part of a binary message of 16 KiB; half a header; the first of several fragments.
     for part in [
         &b"\x82\xFE\x40\0\0\0\0\0half a mess"[..],
         b"\x82",
         b"\x02\x83\0\0\0\0abc",
     ] {
-        let broken = async {
+        let bad_client = async {
             let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)
                 .await
                 .unwrap();
             let seq = client.next_seq;
-            client.ask(&send_frame(seq)).await;
+            client.ask(&numbered_message(seq)).await;
             client.socket.get_mut().write_all(part).await.unwrap();
             client.socket.get_mut().shutdown().await.unwrap();
             drop(client);
             seq + 1
         };
-        let next_seq = scene.beside(broken).await;
+        let next_seq = setup.while_robot_streams(bad_client).await;
         let path = format!("/v1/sessions/{}", session.id);
-        until(async || {
-            let described = get(&scene.app, &path).await.json();
+        poll_until(async || {
+            let described = get(&setup.app, &path).await.json();
             (described["connected"] == false).then(|| assert_eq!(described["next_seq"], next_seq))
         })
         .await;
     }
-    scene.close().await;
+    setup.close().await;
 }

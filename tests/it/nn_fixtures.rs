@@ -32,7 +32,7 @@ pub(crate) fn tiny(conditioning: Conditioning, reconstruction: Reconstruction) -
     }
 }
 
-/// Values of that shape that look random, between −1 and 1.
+/// Deterministic values between −1 and 1 in a tensor of this shape.
 pub(crate) fn values(shape: &[usize], phase: f32) -> Tensor {
     let count = shape.iter().product::<usize>();
     let values: Vec<f32> = (0..count).map(|i| (i as f32 * 12.9898 + phase).sin()).collect();

@@ -1,36 +1,36 @@
-//! Figures as they are printed, and the bounds that they must keep.
+//! Printed measurements, and the bounds that they must keep.
 
 use std::fmt::{Display, Formatter};
 use std::process::ExitCode;
 use std::time::Duration;
 
-/// What a scenario promised, and which of it did not hold.
+/// The bounds of all scenarios. Collects those that failed.
 #[derive(Default)]
 pub(crate) struct Bounds {
-    broken: Vec<String>,
+    failed: Vec<String>,
 }
 
 impl Bounds {
-    /// Prints whether a bound holds, and remembers it if not.
-    pub(crate) fn hold(&mut self, holds: bool, what: impl Into<String>) {
+    /// Prints whether a bound holds, and records it if it does not.
+    pub(crate) fn check(&mut self, holds: bool, what: impl Into<String>) {
         let what = what.into();
-        println!("{} {what}", if holds { "  holds: " } else { "  BROKEN:" });
+        println!("{} {what}", if holds { "  ok:    " } else { "  FAILED:" });
         if !holds {
-            self.broken.push(what);
+            self.failed.push(what);
         }
     }
 
-    /// The exit code.
-    pub(crate) fn conclude(self) -> ExitCode {
-        if self.broken.is_empty() {
+    /// Success if every bound holds.
+    pub(crate) fn exit_code(self) -> ExitCode {
+        if self.failed.is_empty() {
             return ExitCode::SUCCESS;
         }
-        println!("BROKEN: {}", self.broken.join("; "));
+        println!("FAILED: {}", self.failed.join("; "));
         ExitCode::FAILURE
     }
 }
 
-/// Times, of which shares are told in milliseconds.
+/// Latencies, sorted; quantiles are in milliseconds.
 pub(crate) struct Latencies(Vec<Duration>);
 
 impl Latencies {
@@ -44,7 +44,7 @@ impl Latencies {
         self.0.len()
     }
 
-    /// What that share of them stays within, in milliseconds; of none, infinitely long.
+    /// The quantile at `share` in milliseconds; infinite if there are no latencies.
     pub(crate) fn at_ms(&self, share: f64) -> f64 {
         let last = self.0.len().saturating_sub(1);
         let time = self.0.get((last as f64 * share).ceil() as usize);
@@ -54,12 +54,12 @@ impl Latencies {
 
 impl Display for Latencies {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
-        let [p50, p90, p99, most] = [0.5, 0.9, 0.99, 1.0].map(|share| self.at_ms(share));
-        write!(f, "p50 {p50:.2} ms, p90 {p90:.2}, p99 {p99:.2}, most {most:.2}")
+        let [p50, p90, p99, max] = [0.5, 0.9, 0.99, 1.0].map(|share| self.at_ms(share));
+        write!(f, "p50 {p50:.2} ms, p90 {p90:.2}, p99 {p99:.2}, max {max:.2}")
     }
 }
 
-/// The one in the middle.
+/// The median; NaN if there are no values.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_unstable_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(f64::NAN)

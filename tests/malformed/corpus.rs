@@ -1,17 +1,17 @@
-//! The kept files.
+//! The files of the corpus.
 
 use std::fs;
 use std::path::Path;
 
-/// One file: `STATUS-…` or `ok-…` or `refused-…`.
+/// One file, named `STATUS-…`, `ok-…` or `refused-…`.
 #[derive(Clone, Debug)]
-pub(crate) struct Sample {
+pub(crate) struct CorpusFile {
     pub(crate) name: String,
     pub(crate) bytes: Vec<u8>,
 }
 
-impl Sample {
-    /// The name's part before that `-`, counted from 0, without what follows the point.
+impl CorpusFile {
+    /// Part `index` of the name without its extension, separated by `-` and counted from 0.
     pub(crate) fn part(&self, index: usize) -> &str {
         let stem = self.name.split('.').next().unwrap();
         stem.split('-').nth(index).unwrap()
@@ -22,18 +22,18 @@ impl Sample {
     }
 }
 
-/// Every file of a folder of `tests/corpus`, in the order of their names.
-pub(crate) fn samples(folder: &str) -> Vec<Sample> {
+/// All files of a folder of `tests/corpus`, sorted by name.
+pub(crate) fn files(folder: &str) -> Vec<CorpusFile> {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(folder);
-    let mut samples: Vec<Sample> = fs::read_dir(dir)
+    let mut files: Vec<CorpusFile> = fs::read_dir(dir)
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        .map(|path| Sample {
+        .map(|path| CorpusFile {
             name: path.file_name().unwrap().to_str().unwrap().to_owned(),
             bytes: fs::read(&path).unwrap(),
         })
         .collect();
-    samples.sort_by(|a, b| a.name.cmp(&b.name));
-    assert!(samples.len() > 10, "{folder} holds only {}", samples.len());
-    samples
+    files.sort_by(|a, b| a.name.cmp(&b.name));
+    assert!(files.len() > 10, "{folder} has only {} files", files.len());
+    files
 }

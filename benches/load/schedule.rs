@@ -1,24 +1,24 @@
-//! Doing things at their times.
+//! Calls at scheduled times.
 
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// A thing that is due: the how-manyth it is, and the time it was scheduled for.
+/// One scheduled call: its index from 0, and the time that it was scheduled for.
 #[derive(Clone, Copy)]
 pub(crate) struct Tick {
     pub(crate) index: u64,
     pub(crate) scheduled: Instant,
 }
 
-/// When ticks come: evenly from `begin` on.
+/// Evenly spaced ticks from `begin` on.
 #[derive(Clone, Copy)]
-pub(crate) struct Pace {
+pub(crate) struct Schedule {
     pub(crate) begin: Instant,
     pub(crate) rate_hz: f64,
     pub(crate) count: u64,
 }
 
-impl Pace {
+impl Schedule {
     pub(crate) fn lasting(begin: Instant, rate_hz: f64, time: Duration) -> Self {
         Self {
             begin,
@@ -27,8 +27,8 @@ impl Pace {
         }
     }
 
-    /// Calls `due` at each tick from a thread of its own, for an async timer is a millisecond coarse. Late ones follow at
-    /// once; none is left out.
+    /// Calls `due` at each tick from its own thread, because an async timer has a resolution of only a millisecond. Late
+    /// ticks follow immediately; none is left out.
     pub(crate) fn start(self, mut due: impl FnMut(Tick) + Send + 'static) -> JoinHandle<()> {
         std::thread::spawn(move || {
             for index in 0..self.count {

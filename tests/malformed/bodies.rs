@@ -1,4 +1,4 @@
-//! Bodies of requests, JSON and forms, and the state that a session is imported from.
+//! Request bodies (JSON and forms), and exported session states.
 
 use std::sync::LazyLock;
 
@@ -7,17 +7,17 @@ use proptest::prelude::*;
 use proptest::sample::Index;
 use serde_json::{Value, json};
 
-use crate::alone;
-use crate::corpus::{Sample, samples};
+use crate::exclusive;
+use crate::corpus::{CorpusFile, files};
 use crate::mutation::{mutated, mutations};
 use crate::service::Answer;
-use crate::world::WORLD;
+use crate::test_service::SERVICE;
 
-/// An environment that is stepped; where an episode ends, the next begins.
+/// The environment that is stepped. When an episode ends, it is reset.
 static ENVIRONMENT: LazyLock<String> = LazyLock::new(|| {
     let world = json!({"frame_width_px": 16, "frame_height_px": 12});
     let asked = json!({"scenario": "moving-observer", "world": world}).to_string();
-    let answer = WORLD.json("an environment", "/v1/environments", asked.into());
+    let answer = SERVICE.json("an environment", "/v1/environments", asked.into());
     answer.json()["id"].as_str().unwrap().to_owned()
 });
 
@@ -29,18 +29,18 @@ fn path(endpoint: &str) -> String {
     }
 }
 
-/// Asks, and gives back what was taken.
-fn ask(sample: &Sample, bytes: Vec<u8>) -> Answer {
-    let endpoint = sample.part(1);
+/// Sends a body, and releases what the request created.
+fn ask(file: &CorpusFile, bytes: Vec<u8>) -> Answer {
+    let endpoint = file.part(1);
     let path = path(endpoint);
-    let answer = if sample.is("form") {
-        WORLD.post(&sample.name, &path, "multipart/form-data; boundary=X", bytes)
+    let answer = if file.is("form") {
+        SERVICE.post(&file.name, &path, "multipart/form-data; boundary=X", bytes)
     } else {
-        WORLD.json(&sample.name, &path, bytes)
+        SERVICE.json(&file.name, &path, bytes)
     };
     match (endpoint, answer.status.as_u16()) {
-        ("environments", 201) => WORLD.delete(answer.headers["location"].to_str().unwrap()),
-        // Or its name would be taken.
+        ("environments", 201) => SERVICE.delete(answer.headers["location"].to_str().unwrap()),
+        // Otherwise its name would stay in use.
         ("jobs", 202) => cancel(answer.json()["id"].as_str().unwrap()),
         ("step", 200) if answer.json()["truncated"] == true => reset(),
         _ => {}
@@ -50,75 +50,75 @@ fn ask(sample: &Sample, bytes: Vec<u8>) -> Answer {
 
 fn cancel(job: &str) {
     let path = format!("/v1/jobs/{job}/cancel");
-    assert_eq!(WORLD.json("a cancellation", &path, Vec::new()).status, 202);
+    assert_eq!(SERVICE.json("a cancellation", &path, Vec::new()).status, 202);
 }
 
 fn reset() {
     let path = format!("/v1/environments/{}/reset", *ENVIRONMENT);
-    assert_eq!(WORLD.json("a reset", &path, b"{}".to_vec()).status, 200);
+    assert_eq!(SERVICE.json("a reset", &path, b"{}".to_vec()).status, 200);
 }
 
-/// Opens a session with a state; where it is taken, it also predicts from there.
+/// Opens a session with a state; if it is accepted, also asks for a rollout.
 fn import(name: &str, state: &str) -> Answer {
-    let weights = &WORLD.app.predictor().model("moving").unwrap().weights_sha256;
+    let weights = &SERVICE.app.predictor().model("moving").unwrap().weights_sha256;
     let body = format!(r#"{{"state":{}}}"#, state.replace("WEIGHTS", weights));
-    let answer = WORLD.json(name, "/v1/sessions", body.into());
+    let answer = SERVICE.json(name, "/v1/sessions", body.into());
     if answer.status == 201 {
         let session = answer.json();
         let text = |field: &str| session[field].as_str().unwrap().to_owned();
         let path = |rest| format!("/v1/sessions/{}{rest}?token={}", text("id"), text("token"));
         let candidates = json!({"candidates": [[[0.5, 0.0], [0.0, 0.5]]], "format": "raw"}).to_string();
-        let ahead = WORLD.json(name, &path("/rollouts"), candidates.into());
+        let ahead = SERVICE.json(name, &path("/rollouts"), candidates.into());
         let expected = if session["have"] == session["need"] { 200 } else { 409 };
         assert_eq!(ahead.status, expected, "{name}");
-        WORLD.delete(&path(""));
+        SERVICE.delete(&path(""));
     }
     answer
 }
 
-fn assert_status(sample: &Sample, answer: &Answer) {
+fn assert_status(file: &CorpusFile, answer: &Answer) {
     let text = String::from_utf8_lossy(&answer.body);
-    assert_eq!(answer.status.as_str(), sample.part(0), "{}: {text}", sample.name);
+    assert_eq!(answer.status.as_str(), file.part(0), "{}: {text}", file.name);
 }
 
 #[test]
-fn every_kept_body_is_answered_with_the_status_in_its_name() {
-    let _alone = alone();
-    for sample in samples("bodies") {
-        assert_status(&sample, &ask(&sample, sample.bytes.clone()));
+fn corpus_bodies_get_the_status_in_their_name() {
+    let _alone = exclusive();
+    for file in files("bodies") {
+        assert_status(&file, &ask(&file, file.bytes.clone()));
     }
 }
 
 #[test]
-fn every_kept_state_is_taken_or_refused_as_its_name_says() {
-    let _alone = alone();
-    for sample in samples("states") {
-        let text = String::from_utf8(sample.bytes.clone()).unwrap();
-        assert_status(&sample, &import(&sample.name, &text));
+fn corpus_states_get_the_status_in_their_name() {
+    let _alone = exclusive();
+    for file in files("states") {
+        let text = String::from_utf8(file.bytes.clone()).unwrap();
+        assert_status(&file, &import(&file.name, &text));
     }
 }
 
 proptest! {
     #[test]
-    fn a_mutated_body_is_answered_as_the_contract_says(which: Index, mutations in mutations()) {
-        let _alone = alone();
-        let samples = samples("bodies");
-        let sample = which.get(&samples);
-        ask(sample, mutated(&sample.bytes, &mutations));
+    fn mutated_bodies_get_a_documented_status(which: Index, mutations in mutations()) {
+        let _alone = exclusive();
+        let files = files("bodies");
+        let file = which.get(&files);
+        ask(file, mutated(&file.bytes, &mutations));
     }
 
     #[test]
-    fn a_mutated_state_is_taken_or_refused(which: Index, mutations in mutations()) {
-        let _alone = alone();
-        let samples = samples("states");
-        let sample = which.get(&samples);
-        import(&sample.name, &String::from_utf8_lossy(&mutated(&sample.bytes, &mutations)));
+    fn mutated_states_are_accepted_or_refused(which: Index, mutations in mutations()) {
+        let _alone = exclusive();
+        let files = files("states");
+        let file = which.get(&files);
+        import(&file.name, &String::from_utf8_lossy(&mutated(&file.bytes, &mutations)));
     }
 }
 
 #[test]
-fn a_body_takes_no_more_memory_than_its_length_allows() {
-    let _alone = alone();
+fn request_memory_is_bounded_by_the_body_length() {
+    let _alone = exclusive();
     let filled = |head: &str, item: &str, bytes: usize| head.to_owned() + &item.repeat(bytes / item.len());
     let long = 1 << 20;
     for (path, body) in [
@@ -144,17 +144,17 @@ fn a_body_takes_no_more_memory_than_its_length_allows() {
         ("/v1/jobs", filled(r#"{"colour":["#, "0,", long)),
         ("/v1/environments", filled(r#"{"scenario":["#, "0,", long)),
     ] {
-        let refused = WORLD.json(&body[..40], path, body.clone().into()).status.as_u16();
+        let refused = SERVICE.json(&body[..40], path, body.clone().into()).status.as_u16();
         assert!([400, 413, 422].contains(&refused), "{refused}: {}", &body[..40]);
     }
 }
 
 #[test]
-fn a_request_for_a_job_over_its_limit_is_refused() {
-    let _alone = alone();
+fn a_job_over_the_size_limit_is_refused() {
+    let _alone = exclusive();
     let limit = ServerConfig::default().max_job_bytes;
     let settings: Value = (0..limit / 8).map(|number| (format!("s{number}"), json!(0))).collect();
     let asked = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "none", "settings": settings});
-    let answer = WORLD.json("a long job", "/v1/jobs", asked.to_string().into());
+    let answer = SERVICE.json("a long job", "/v1/jobs", asked.to_string().into());
     assert_eq!(answer.detail(413), "the body is longer than this server takes");
 }

@@ -1,17 +1,17 @@
-//! Both sub-protocols' codec.
+//! Stream messages in both sub-protocols.
 
 use axum::extract::ws::Message;
 use foreframe::server::protocol::{ClientMessage, Codec};
 use proptest::prelude::*;
 use proptest::sample::Index;
 
-use crate::corpus::samples;
+use crate::corpus::files;
 use crate::mutation::{mutated, mutations};
-use crate::{alone, within};
+use crate::{exclusive, within_memory};
 
-/// Bytes of memory for each byte of a message at most, and beside them: what it holds, and a list of lists of numbers.
-const PER_BYTE: usize = 4;
-const BESIDE: usize = 1 << 20;
+/// Limit of memory: this many bytes per byte of the message, plus `BASE_BYTES`.
+const BYTES_PER_BYTE: usize = 4;
+const BASE_BYTES: usize = 1 << 20;
 
 fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     if is_text {
@@ -24,11 +24,11 @@ fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     }
 }
 
-/// What becomes of a message; an error names the sub-protocol.
+/// Decodes a message within the memory limit. An error must name the sub-protocol.
 fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, String> {
-    let limit = BESIDE + PER_BYTE * bytes.len();
+    let limit = BASE_BYTES + BYTES_PER_BYTE * bytes.len();
     let (codec, message) = message(is_text, bytes);
-    let decoded = within(limit, name, || {
+    let decoded = within_memory(limit, name, || {
         codec.decode(&message).map_err(|error| error.to_string())
     });
     if let Err(error) = &decoded {
@@ -38,27 +38,27 @@ fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, St
 }
 
 #[test]
-fn every_kept_message_is_read_or_refused_as_its_name_says() {
-    let _alone = alone();
-    for sample in samples("messages") {
-        let decoded = decode(&sample.name, sample.is("json"), sample.bytes.clone());
-        assert_eq!(decoded.is_ok(), sample.part(0) == "ok", "{}: {decoded:?}", sample.name);
+fn corpus_messages_are_accepted_or_refused_as_named() {
+    let _alone = exclusive();
+    for file in files("messages") {
+        let decoded = decode(&file.name, file.is("json"), file.bytes.clone());
+        assert_eq!(decoded.is_ok(), file.part(0) == "ok", "{}: {decoded:?}", file.name);
     }
 }
 
 proptest! {
     #[test]
-    fn a_mutated_message_is_read_or_refused(which: Index, mutations in mutations()) {
-        let _alone = alone();
-        let samples = samples("messages");
-        let sample = which.get(&samples);
-        let _ = decode(&sample.name, sample.is("json"), mutated(&sample.bytes, &mutations));
+    fn mutated_messages_are_decoded_or_refused(which: Index, mutations in mutations()) {
+        let _alone = exclusive();
+        let files = files("messages");
+        let file = which.get(&files);
+        let _ = decode(&file.name, file.is("json"), mutated(&file.bytes, &mutations));
     }
 }
 
 #[test]
-fn a_message_takes_no_more_memory_than_its_length_allows() {
-    let _alone = alone();
+fn decoding_memory_is_bounded_by_the_message_length() {
+    let _alone = exclusive();
     let filled = |head: &[u8], item: &[u8]| [head, &item.repeat((1 << 20) / item.len())].concat();
     for (is_text, bytes) in [
         (true, filled(br#"{"type":"frame","plan":["#, b"[],")),

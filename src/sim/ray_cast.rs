@@ -1,10 +1,11 @@
-//! Solids for parry's ray casts that it has not or casts more slowly: an upright cylinder in closed form, a placed box.
+//! Solids for ray casting that parry does not have or computes more slowly: an upright cylinder in closed form, and a box at
+//! any position.
 
 use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
 use rapier3d::parry::shape::{Cuboid, FeatureId};
 use rapier3d::prelude::Vector;
 
-/// A cylinder about the z axis. parry's own lies along y and is cast by iteration.
+/// A cylinder around the z axis. parry's own cylinder lies along y and is computed by iteration.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct UprightCylinder {
     pub(super) radius: f32,
@@ -12,11 +13,11 @@ pub(super) struct UprightCylinder {
     pub(super) top: f32,
 }
 
-/// An interval of a ray's time with the faces it begins and ends at: 0 = side, 1 = top, 2 = bottom.
+/// The interval of ray time inside a solid, with the faces where it starts and ends: 0 = side, 1 = top, 2 = bottom.
 type Span = [(f32, u32); 2];
 
 impl UprightCylinder {
-    /// When the ray is inside, or nothing if it misses.
+    /// The interval of ray time inside the cylinder, or none if the ray misses it.
     #[inline]
     fn span(&self, ray: &Ray) -> Option<Span> {
         let (o, d) = (ray.origin, ray.dir);
@@ -24,7 +25,7 @@ impl UprightCylinder {
         let a = d.x * d.x + d.y * d.y;
         let b = o.x * d.x + o.y * d.y;
         let under_root = b * b - a * outside;
-        // Most rays end here: past the cylinder, or going away from it.
+        // Most rays return here: they miss the cylinder, or lead away from it.
         if under_root < 0.0 || (outside > 0.0 && b >= 0.0) {
             return None;
         }
@@ -53,14 +54,14 @@ impl UprightCylinder {
 
 impl RayCast for UprightCylinder {
     #[inline]
-    fn cast_local_ray_and_get_normal(&self, ray: &Ray, most: f32, solid: bool) -> Option<RayIntersection> {
+    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
         let [first, last] = self.span(ray)?;
         let (time, face, outward) = match (first.0 >= 0.0, solid) {
             (true, _) => (first.0, first.1, 1.0),
             (false, true) => (0.0, first.1, 0.0),
             (false, false) => (last.0, last.1, -1.0),
         };
-        if time > most {
+        if time > max_time {
             return None;
         }
         let normal = match face {
@@ -75,18 +76,18 @@ impl RayCast for UprightCylinder {
     }
 }
 
-/// A box with its sides along the axes.
+/// A box with its sides parallel to the axes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block {
-    pub(super) middle: [f32; 3],
+    pub(super) center: [f32; 3],
     pub(super) half: [f32; 3],
 }
 
 impl RayCast for Block {
     #[inline]
-    fn cast_local_ray_and_get_normal(&self, ray: &Ray, most: f32, solid: bool) -> Option<RayIntersection> {
-        let moved = ray.translate_by(-Vector::from_array(self.middle));
-        Cuboid::new(Vector::from_array(self.half)).cast_local_ray_and_get_normal(&moved, most, solid)
+    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
+        let moved = ray.translate_by(-Vector::from_array(self.center));
+        Cuboid::new(Vector::from_array(self.half)).cast_local_ray_and_get_normal(&moved, max_time, solid)
     }
 }
 
@@ -99,7 +100,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn an_upright_cylinder_is_hit_where_parrys_own_is(
+        fn an_upright_cylinder_is_hit_where_parrys_cylinder_is(
             from in proptest::array::uniform3(-3.0f32..3.0),
             to in proptest::array::uniform3(-0.6f32..0.6),
         ) {
@@ -116,12 +117,12 @@ mod tests {
             match (ours, theirs) {
                 (Some(ours), Some(theirs)) => prop_assert!((ours - theirs).abs() < 2e-3, "{ours} {theirs}"),
                 (None, None) => {}
-                // A graze: the ray just misses one of the two.
+                // The ray touches only the edge, and misses one of the two.
                 (ours, theirs) => {
                     let grown = UprightCylinder { radius: radius + 2e-3, bottom: -half - 2e-3, top: half + 2e-3 };
                     let shrunk = UprightCylinder { radius: radius - 2e-3, bottom: -half + 2e-3, top: half - 2e-3 };
-                    let graze = grown.span(&ray).is_some() && shrunk.span(&ray).is_none();
-                    prop_assert!(graze, "{ours:?} {theirs:?}");
+                    let is_at_edge = grown.span(&ray).is_some() && shrunk.span(&ray).is_none();
+                    prop_assert!(is_at_edge, "{ours:?} {theirs:?}");
                 }
             }
         }

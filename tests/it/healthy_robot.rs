@@ -1,4 +1,4 @@
-//! A robot that streams beside bad clients, and is answered as if there were none.
+//! A robot that streams while bad clients misbehave. Its predictions must not change.
 
 use std::cell::Cell;
 use std::net::SocketAddr;
@@ -13,32 +13,32 @@ use foreframe::serving::{self, PredictionInput};
 use foreframe::types::{Action, RobotState};
 use serde_json::json;
 
-use crate::client::{Client, Opened, send_frame, step};
-use crate::service::{CONTEXT, HEIGHT, Running, WIDTH, app, model, run, spec};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
+use crate::service::{CONTEXT, HEIGHT, InProcessServer, WIDTH, app, model, run, spec};
 
-/// From one frame to the next.
+/// Time between two frames.
 const PERIOD: Duration = Duration::from_millis(5);
 
 /// A running server with a robot that streams.
-pub(crate) struct Scene {
+pub(crate) struct ServerWithRobot {
     pub(crate) dir: tempfile::TempDir,
     pub(crate) app: App,
-    pub(crate) server: Running,
+    pub(crate) server: InProcessServer,
     model: LoadedModel,
     robot: Client,
 }
 
-impl Scene {
+impl ServerWithRobot {
     pub(crate) async fn open(config: ServerConfig) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let app = app(dir.path(), config);
         let server = run(app.clone()).await;
         let model = model(&dir.path().join("again"), "moving", spec(Conditioning::StateAction));
-        let session = Opened::open(&app, &json!({"model": "moving"})).await;
+        let session = SessionHandle::open(&app, &json!({"model": "moving"})).await;
         let robot = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
             .await
             .unwrap();
-        let mut scene = Self {
+        let mut setup = Self {
             dir,
             app,
             server,
@@ -46,43 +46,43 @@ impl Scene {
             robot,
         };
         for _ in 0..CONTEXT {
-            scene.step().await;
+            setup.step().await;
         }
-        scene
+        setup
     }
 
     pub(crate) fn address(&self) -> SocketAddr {
         self.server.address
     }
 
-    /// A session of its own for a bad client.
-    pub(crate) async fn session(&self) -> Opened {
-        Opened::open(&self.app, &json!({"model": "moving"})).await
+    /// Opens a session for a bad client.
+    pub(crate) async fn session(&self) -> SessionHandle {
+        SessionHandle::open(&self.app, &json!({"model": "moving"})).await
     }
 
-    /// Does the bad thing while the robot streams; the robot notices nothing, neither meanwhile nor afterwards.
-    pub(crate) async fn beside<T>(&mut self, bad: impl Future<Output = T>) -> T {
-        let is_over = Cell::new(false);
-        let bad = async {
-            let result = bad.await;
-            is_over.set(true);
+    /// Runs the bad client while the robot streams. Checks the robot's predictions during that time and once afterwards.
+    pub(crate) async fn while_robot_streams<T>(&mut self, bad_client: impl Future<Output = T>) -> T {
+        let is_done = Cell::new(false);
+        let bad_client = async {
+            let result = bad_client.await;
+            is_done.set(true);
             result
         };
         let robot = async {
-            while !is_over.get() {
+            while !is_done.get() {
                 self.step().await;
                 tokio::time::sleep(PERIOD).await;
             }
             self.step().await;
         };
-        tokio::join!(bad, robot).0
+        tokio::join!(bad_client, robot).0
     }
 
-    /// Sends the robot's next frame; the answer is what the model predicts when it is asked alone.
+    /// Sends the robot's next frame and compares the answer with a direct prediction of the model.
     async fn step(&mut self) {
         let seq = self.robot.next_seq;
         self.robot.next_seq += 1;
-        let answer = self.robot.ask(&send_frame(seq)).await;
+        let answer = self.robot.ask(&numbered_message(seq)).await;
         let Some(first) = (seq + 1).checked_sub(CONTEXT as u64) else {
             assert!(matches!(answer, ServerMessage::Buffering { .. }), "{answer:?}");
             return;
@@ -90,11 +90,11 @@ impl Scene {
         let ServerMessage::Prediction { frames, .. } = answer else {
             panic!("{answer:?}")
         };
-        let image = |seq| Frame::new(WIDTH, HEIGHT, step(seq).image.0).unwrap();
+        let image = |seq| Frame::new(WIDTH, HEIGHT, numbered_frame(seq).image.0).unwrap();
         let input = PredictionInput {
             frames: (first..=seq).map(image).collect(),
-            actions: vec![Action::try_from(step(seq).action.unwrap()).unwrap()],
-            state: RobotState::try_from(step(seq).state.unwrap()).ok(),
+            actions: vec![Action::try_from(numbered_frame(seq).action.unwrap()).unwrap()],
+            state: RobotState::try_from(numbered_frame(seq).state.unwrap()).ok(),
             future_actions: None,
         };
         let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0);

@@ -1,24 +1,24 @@
-//! What a process takes, read from `/proc`.
+//! Memory, file descriptors, threads and processor time of a process, read from `/proc`.
 
 use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Ticks of `/proc/PID/stat` in a second: the same on every Linux that people run.
+/// Ticks of `/proc/PID/stat` per second: the same on all common Linux systems.
 const TICKS_PER_S: f64 = 100.0;
-/// What the database's files are named.
+/// Part of the names of the database's files.
 const DATABASE: &str = "foreframe.db";
-/// How the names of its connections' threads begin.
+/// Prefix of the names of the database's threads.
 const DATABASE_THREAD: &str = "sqlx-";
 
 /// A process, by its number or `self`.
 #[derive(Clone)]
 pub(crate) struct Process(pub(crate) String);
 
-/// What a process takes at a time. Of descriptors and threads without those of the connections to its database: they are
-/// a bounded number, and come when they are needed.
+/// Resources that a process uses at one time. File descriptors and threads of database connections are not counted: their
+/// number is bounded, and they are opened on demand.
 #[derive(Clone, Copy)]
-pub(crate) struct Taken {
+pub(crate) struct Usage {
     pub(crate) rss_mb: f64,
     pub(crate) peak_rss_mb: f64,
     pub(crate) descriptors: usize,
@@ -31,18 +31,18 @@ impl Process {
         fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path}: {error}; has the server ended?"))
     }
 
-    pub(crate) fn taken(&self) -> Taken {
+    pub(crate) fn usage(&self) -> Usage {
         let status = self.read("status");
         let field = |name: &str| {
             let line = status.lines().find_map(|line| line.strip_prefix(name));
             let number = line.and_then(|line| line.split_whitespace().next());
             number.and_then(|number| number.parse::<f64>().ok()).unwrap()
         };
-        Taken {
+        Usage {
             rss_mb: field("VmRSS:") / 1024.0,
             peak_rss_mb: field("VmHWM:") / 1024.0,
             descriptors: self.count("fd", |entry| {
-                // One that is closed meanwhile counts no more.
+                // A descriptor that was closed in the meantime does not count.
                 fs::read_link(entry).is_ok_and(|target| !target.to_string_lossy().contains(DATABASE))
             }),
             threads: self.count("task", |entry| {
@@ -58,10 +58,10 @@ impl Process {
             .count()
     }
 
-    /// Processor time so far.
+    /// Processor time used so far.
     pub(crate) fn cpu(&self) -> Duration {
         let stat = self.read("stat");
-        // After the name, which may hold anything, but no bracket later.
+        // The name comes first and may contain anything; the last bracket ends it.
         let (_, fields) = stat.rsplit_once(')').unwrap();
         let ticks: f64 = fields
             .split_whitespace()
@@ -73,7 +73,7 @@ impl Process {
     }
 }
 
-/// The share of a core that a process takes.
+/// Processor time that a process uses in an interval.
 pub(crate) struct CpuShare {
     process: Process,
     since: Instant,
@@ -89,12 +89,12 @@ impl CpuShare {
         }
     }
 
-    /// In percent since it began.
+    /// Percent of a core since the start of the interval.
     pub(crate) fn percent(&self) -> f64 {
         100.0 * self.used().as_secs_f64() / self.since.elapsed().as_secs_f64()
     }
 
-    /// Processor time since it began for each of so many, in microseconds.
+    /// Microseconds of processor time per item, for `count` items since the start of the interval.
     pub(crate) fn each_us(&self, count: usize) -> f64 {
         1e6 * self.used().as_secs_f64() / count as f64
     }

@@ -1,4 +1,4 @@
-//! A service in this process, and what its answers must be like.
+//! A service in this process, and the checks of its responses.
 
 use std::sync::LazyLock;
 
@@ -9,24 +9,24 @@ use tempfile::TempDir;
 use tokio::runtime::Runtime;
 
 use crate::service::{Answer, app, send};
-use crate::within;
+use crate::within_memory;
 
-/// Bytes of memory for each byte of a body at most, and beside them: the service's own work, and the longest request for a
-/// job, of which a byte may take more.
-const PER_BYTE: usize = 32;
-const BESIDE: usize = 12 << 20;
+/// Limit of memory: this many bytes per byte of the body, plus `BASE_BYTES` for the service's own work and for the longest
+/// job request, which may need more per byte.
+const BYTES_PER_BYTE: usize = 32;
+const BASE_BYTES: usize = 12 << 20;
 
-/// The statuses with which a body can be answered.
+/// The documented statuses.
 const STATUSES: [u16; 11] = [200, 201, 202, 400, 404, 406, 409, 413, 415, 422, 503];
 
-pub(crate) struct World {
+pub(crate) struct TestService {
     runtime: Runtime,
     pub(crate) app: App,
     _dir: TempDir,
 }
 
-/// One for all tests of this binary. Its jobs are taken and never run.
-pub(crate) static WORLD: LazyLock<World> = LazyLock::new(|| {
+/// One service for all tests of this binary. It accepts jobs and never runs them.
+pub(crate) static SERVICE: LazyLock<TestService> = LazyLock::new(|| {
     let dir = tempfile::tempdir().unwrap();
     let runtime = Runtime::new().unwrap();
     let config = ServerConfig {
@@ -37,27 +37,27 @@ pub(crate) static WORLD: LazyLock<World> = LazyLock::new(|| {
         ..ServerConfig::default()
     };
     let app = runtime.block_on(async { app(dir.path(), config) });
-    World {
+    TestService {
         runtime,
         app,
         _dir: dir,
     }
 });
 
-impl World {
-    /// Asks; the answer is one of the contract's, and took no more memory than it may.
+impl TestService {
+    /// Sends a body; checks the status, the detail of a refusal, and the memory limit.
     pub(crate) fn post(&self, name: &str, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
-        let limit = BESIDE + PER_BYTE * body.len();
+        let limit = BASE_BYTES + BYTES_PER_BYTE * body.len();
         let request = Request::post(path)
             .header(header::CONTENT_TYPE, media_type)
             .body(Body::from(body));
-        let answer = within(limit, name, || self.send(request.unwrap()));
+        let answer = within_memory(limit, name, || self.send(request.unwrap()));
         let status = answer.status.as_u16();
         let text = String::from_utf8_lossy(&answer.body);
         assert!(STATUSES.contains(&status), "{name}: {status} {text}");
         if status >= 400 {
             let detail = answer.detail(status);
-            assert!(detail.len() < 1100 && names_something(&detail), "{name}: {detail}");
+            assert!(detail.len() < 1100 && names_a_place(&detail), "{name}: {detail}");
         }
         answer
     }
@@ -76,8 +76,8 @@ impl World {
     }
 }
 
-/// Whether a detail says where: a field, a place in the body, or what was longer than it may be.
-fn names_something(detail: &str) -> bool {
+/// Whether a detail names the cause: a field, a position in the body, or what is too long.
+fn names_a_place(detail: &str) -> bool {
     let words = ["line ", "field `", "body", "model", "request", "name", "kind"];
     let is_field = |word: &str| word.contains(['_', '[', '.', ':']) || FIELDS.contains(&word);
     words.iter().any(|word| detail.contains(word)) || detail.split_whitespace().any(is_field)

@@ -1,4 +1,4 @@
-//! What is sent: the frames in `examples`, as a model takes them.
+//! Frames and requests made from the frames in `examples`, in the form that a model takes.
 
 use std::fs;
 use std::path::Path;
@@ -16,20 +16,20 @@ use crate::http::Request;
 const FRAMES: usize = 15;
 const BOUNDARY: &str = "frame-by-frame";
 
-/// Frames and requests for one model.
-pub(crate) struct Material {
+/// The frames of `examples` and the model that they are sent to.
+pub(crate) struct Workload {
     model: String,
     spec: ModelSpec,
-    /// The frames' files.
+    /// The frames as PNG files.
     files: Vec<Vec<u8>>,
-    /// Their pixels.
+    /// The frames as raw pixels.
     images: Vec<Vec<u8>>,
 }
 
-impl Material {
+impl Workload {
     pub(crate) fn of(model: &str) -> Self {
         let project = Path::new(env!("CARGO_MANIFEST_DIR"));
-        let manifest = manifest::read(&project.join("models").join(model)).expect("a shipped model");
+        let manifest = manifest::read(&project.join("models").join(model)).expect("the model is shipped");
         let file = |index| fs::read(project.join(format!("examples/frames/frame-{index:03}.png"))).unwrap();
         let files: Vec<Vec<u8>> = (0..FRAMES).map(file).collect();
         let pixels = |file: &Vec<u8>| codec::decode(file).unwrap().pixels().to_vec();
@@ -45,12 +45,12 @@ impl Material {
         &self.model
     }
 
-    /// Frames that a session takes before it predicts, and one more.
+    /// Frames that a session takes before its first prediction.
     pub(crate) fn context(&self) -> u64 {
         self.spec.context as u64
     }
 
-    /// A frame of a stream.
+    /// The stream message with frame `seq`.
     pub(crate) fn frame(&self, seq: u64) -> Message {
         message(&ClientMessage::Frame(FrameMessage {
             seq,
@@ -63,22 +63,22 @@ impl Material {
         }))
     }
 
-    /// A prediction with images as base64.
+    /// A prediction request in JSON with base64 images.
     pub(crate) fn predict_json(&self) -> Request {
-        let mut body = self.premise();
+        let mut body = self.conditioning();
         let images = self.files.iter().take(self.spec.context);
         body["frames"] = images.map(|file| json!(ImageBytes(file.clone()))).collect();
         Request::json(&self.predict_path(), &body)
     }
 
-    /// The same with images as files.
+    /// The same request as a multipart form.
     pub(crate) fn predict_form(&self) -> Request {
         let mut body = Vec::new();
         let head = |name: &str| format!("--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n");
         for file in self.files.iter().take(self.spec.context) {
             body.extend([head("frames").as_bytes(), file, b"\r\n"].concat());
         }
-        let end = format!("{}{}\r\n--{BOUNDARY}--\r\n", head("request"), self.premise());
+        let end = format!("{}{}\r\n--{BOUNDARY}--\r\n", head("request"), self.conditioning());
         body.extend(end.as_bytes());
         let content_type = format!("multipart/form-data; boundary={BOUNDARY}");
         Request::post(&self.predict_path(), &content_type, &body)
@@ -88,15 +88,15 @@ impl Material {
         format!("/v1/models/{}/predict", self.model)
     }
 
-    fn premise(&self) -> Value {
-        let mut premise = json!({});
+    fn conditioning(&self) -> Value {
+        let mut conditioning = json!({});
         if let Some(count) = self.spec.action_inputs() {
-            premise["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
+            conditioning["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
         }
         if let Some(count) = self.spec.state_inputs() {
-            premise["state"] = json!(vec![0.1; count]);
+            conditioning["state"] = json!(vec![0.1; count]);
         }
-        premise
+        conditioning
     }
 }
 
