@@ -14,6 +14,7 @@ mod dataset_collect;
 mod dataset_sampler;
 mod environments;
 mod evaluation;
+mod fit;
 mod fixtures;
 mod healthy_robot;
 mod import;
