@@ -1,7 +1,8 @@
-//! A gray camera image of checked size, and what is done with one: [`codec`] to and from files, [`preprocess`] to and
-//! from the model's space, [`quality`] to compare two.
+//! A gray camera image of checked size, and what is done with one: [`codec`] to and from files, [`fit`] to another size,
+//! [`preprocess`] to and from the model's space, [`quality`] to compare two.
 
 pub mod codec;
+pub mod fit;
 pub mod preprocess;
 pub mod quality;
 
