@@ -17,6 +17,7 @@ mod shard_reader;
 mod stats;
 mod store;
 mod tables;
+mod unfinished;
 
 use std::ops::Range;
 

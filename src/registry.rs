@@ -1,13 +1,13 @@
 //! Trained models on disk, one directory each: `NAME/model.safetensors` (weights, f16) and `NAME/manifest.json` (what they
-//! are and how they were made). [`manifest`] describes one, [`loader`] verifies and builds it; here they are listed, found
-//! and published.
+//! are and how they were made). In a directory of models, the name of a model's own directory is its name, whatever the
+//! manifest says. [`manifest`] describes one, [`loader`] verifies and builds it; here they are listed, found and published.
 
 pub mod loader;
 pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
-pub use self::loader::{LoadedModel, load};
+pub use self::loader::{LoadedModel, load, load_as};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
@@ -32,7 +32,7 @@ pub enum RegistryError {
         known: Vec<String>,
     },
     /// A name that could leave the directory or confuse a shell.
-    #[error("{0:?} is no model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
+    #[error("{0:?} is not a model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
     Name(String),
     /// The path leads to no model.
     #[error("{} holds no model ({MANIFEST_FILE} is missing); name one that `foreframe train` made", .0.display())]
@@ -94,24 +94,40 @@ pub fn is_valid_name(name: &str) -> bool {
 
 /// The models in a directory, by name, sorted. An absent directory holds none. Errors: `Io` if it can't be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
+    let named = directories(models_dir)?.into_iter().map(|path| (directory_name(&path), path));
+    let mut models: Vec<_> = named
+        .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
+        .collect();
+    models.sort();
+    Ok(models)
+}
+
+/// The directories that hold a model but have no valid name, sorted: [`list`] leaves them out. Errors: `Io`.
+pub fn misnamed(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    let mut paths = directories(models_dir)?;
+    paths.retain(|path| !is_valid_name(&directory_name(path)) && path.join(MANIFEST_FILE).is_file());
+    paths.sort();
+    Ok(paths)
+}
+
+/// Everything in a directory; an absent one holds nothing. Errors: `Io`.
+fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
     if !models_dir.exists() {
         return Ok(Vec::new());
     }
-    let unlisted = |source| RegistryError::Io {
+    let entries = std::fs::read_dir(models_dir).and_then(|entries| {
+        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+        paths.collect::<Result<Vec<_>, _>>()
+    });
+    entries.map_err(|source| RegistryError::Io {
         action: "list",
         path: models_dir.to_owned(),
         source,
-    };
-    let mut models = Vec::new();
-    for entry in std::fs::read_dir(models_dir).map_err(unlisted)? {
-        let path = entry.map_err(unlisted)?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if is_valid_name(&name) && path.join(MANIFEST_FILE).is_file() {
-            models.push((name, path));
-        }
-    }
-    models.sort();
-    Ok(models)
+    })
+}
+
+fn directory_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// The directory of the model of that name. Errors: `Name`, `Unknown` with the names there are.
@@ -131,17 +147,17 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     })
 }
 
-/// The directory of the model called `what`: a path that leads to one, or else a name below `models_dir`.
-/// Errors: those of [`find`], `NotAModel`.
-pub fn locate(models_dir: &Path, what: &str) -> Result<PathBuf, RegistryError> {
-    let given = Path::new(what);
-    if given.join(MANIFEST_FILE).is_file() {
-        return Ok(given.to_owned());
+/// The model's directory if `model` is a path to one, and none if it can only be a name. Errors: `NotAModel` for a path
+/// that leads to something else.
+pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
+    let path = Path::new(model);
+    if path.join(MANIFEST_FILE).is_file() {
+        return Ok(Some(path.to_owned()));
     }
-    if !is_valid_name(what) && (what.contains('/') || given.exists()) {
-        return Err(RegistryError::NotAModel(given.to_owned()));
+    if !is_valid_name(model) && (model.contains('/') || path.exists()) {
+        return Err(RegistryError::NotAModel(path.to_owned()));
     }
-    find(models_dir, what)
+    Ok(None)
 }
 
 /// Writes weights (as f16) and manifest into `model_dir`, the manifest last and with the weights' hash filled in.
@@ -201,6 +217,18 @@ mod tests {
             assert!(!is_valid_name(name), "{name:?} was accepted");
         }
         assert!(is_valid_name("moving-2"));
+    }
+
+    #[test]
+    fn a_directory_with_an_invalid_name_is_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["my_model", "paper"] {
+            std::fs::create_dir(dir.path().join(name)).unwrap();
+            std::fs::write(dir.path().join(name).join(MANIFEST_FILE), "{}").unwrap();
+        }
+        std::fs::create_dir(dir.path().join("Pictures")).unwrap();
+        assert_eq!(misnamed(dir.path()).unwrap(), [dir.path().join("my_model")]);
+        assert_eq!(list(dir.path()).unwrap().len(), 1);
     }
 
     #[test]

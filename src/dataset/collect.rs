@@ -1,7 +1,8 @@
 //! Simulates trials into a data set on disk, on several threads, so that nothing finished is lost when it is stopped.
 //!
-//! Threads simulate whole shards of consecutive trials; the calling thread writes them in order, each as a whole. What
-//! is written depends on the seed and the trial alone, not on threads or interruptions.
+//! Threads simulate whole shards of consecutive trials; the calling thread writes them in order, each as a whole. If the
+//! collection is stopped, the finished trials of the other shards are kept beside them. The finished data set depends on
+//! the seed and the trials alone, not on threads or interruptions.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -87,7 +88,7 @@ impl CollectConfig {
 /// How far a collection is, in trials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CollectProgress {
-    /// Trials simulated, with those found when it was taken up again.
+    /// Trials simulated, those of earlier calls included.
     pub done: u64,
     /// Trials asked for.
     pub total: u64,
@@ -128,8 +129,11 @@ pub fn collect(
         crew.failed.store(written.is_err(), Ordering::Relaxed);
         written
     });
-    written?;
+    let unwritten = written?;
     if collection.shard_count() < config.shard_count() {
+        for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
+            collection.keep(*shard, episodes)?;
+        }
         return Err(DatasetError::Cancelled {
             done: collection.trial_count(),
             total: config.trials,
@@ -138,19 +142,26 @@ pub fn collect(
     collection.complete()
 }
 
-/// A shard's number and what became of it.
+/// A shard's number and its finished trials: all of them, unless the collection was stopped.
 type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
 
-/// Writes shards as they come, each once those before it are written.
-fn write_in_order(collection: &mut Collection<'_>, deliveries: Receiver<ShardResult>) -> Result<(), DatasetError> {
-    let mut early = BTreeMap::new();
+/// Writes whole shards as they come, each once those before it are written. Returns the trials that could not be written:
+/// those of shards that are not whole, and of shards after one that is not.
+fn write_in_order(
+    collection: &mut Collection<'_>,
+    deliveries: Receiver<ShardResult>,
+) -> Result<BTreeMap<usize, Vec<EncodedEpisode>>, DatasetError> {
+    let mut waiting = BTreeMap::new();
     for (shard, episodes) in deliveries {
-        early.insert(shard, episodes?);
-        while let Some(episodes) = early.remove(&collection.shard_count()) {
-            collection.write(&episodes)?;
+        waiting.insert(shard, episodes?);
+        while let Some(entry) = waiting.first_entry()
+            && *entry.key() == collection.shard_count()
+            && collection.is_whole(*entry.key(), entry.get())
+        {
+            collection.write(&entry.remove())?;
         }
     }
-    Ok(())
+    Ok(waiting)
 }
 
 /// What the simulating threads share.
@@ -183,29 +194,24 @@ impl CollectWorkers<'_> {
             if shard >= self.config.shard_count() {
                 return;
             }
-            let delivery = match self.simulate_shard(shard) {
-                Ok(Some(episodes)) => Ok(episodes),
-                Ok(None) => return,
-                Err(error) => Err(error),
-            };
-            if sender.send((shard, delivery)).is_err() {
+            if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
                 return;
             }
         }
     }
 
-    /// The trials of a shard; none when stopped.
-    fn simulate_shard(&self, shard: usize) -> Result<Option<Vec<EncodedEpisode>>, DatasetError> {
-        let mut episodes = Vec::new();
-        for trial in self.config.shard_trials(shard) {
+    /// The trials of a shard; only those finished so far when stopped.
+    fn simulate_shard(&self, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
+        let mut episodes = Collection::kept_episodes(self.config, &self.info, shard);
+        for trial in self.config.shard_trials(shard).skip(episodes.len()) {
             let simulated = self.simulate(trial);
             let Some(data) = simulated.map_err(|source| DatasetError::Simulation { trial, source })? else {
-                return Ok(None);
+                break;
             };
             episodes.push(EncodedEpisode::new(&self.info, trial as usize, data)?);
             self.report(1);
         }
-        Ok(Some(episodes))
+        Ok(episodes)
     }
 
     /// A trial from its start to its end; none when stopped.

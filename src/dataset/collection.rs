@@ -12,7 +12,7 @@ use super::layout::{ARGUMENTS, CollectionStamp, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
-use super::{DatasetError, DatasetInfo};
+use super::{DatasetError, DatasetInfo, unfinished};
 use crate::files::{is_partial_of, remove_abandoned, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
@@ -51,7 +51,7 @@ pub enum CollectionStatus {
     New,
     /// So many trials are there already.
     PendingStep {
-        /// Trials in finished shards.
+        /// Trials that are simulated already.
         trials: u64,
     },
     /// Everything is there.
@@ -80,8 +80,14 @@ impl CollectionStatus {
         if out.join(INFO).exists() {
             return Ok(Self::Finished(Box::new(CollectionStamp::read(out)?.info())));
         }
-        let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
-        let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
+        let shards = config.shard_count();
+        let whole = (0..shards)
+            .take_while(|&shard| out.join(shard_path(shard)).exists())
+            .count();
+        let trials = (0..whole).map(|shard| config.shard_trials(shard).count() as u64).sum::<u64>()
+            + (whole..shards)
+                .map(|shard| unfinished::count(out, shard) as u64)
+                .sum::<u64>();
         Ok(Self::PendingStep { trials })
     }
 }
@@ -192,9 +198,30 @@ impl<'a> Collection<'a> {
         self.shards.len()
     }
 
-    /// Trials that are there.
+    /// Trials that are there, those of unfinished shards included.
     pub(super) fn trial_count(&self) -> u64 {
-        self.start.episode as u64
+        let unfinished = (self.shards.len()..self.config.shard_count())
+            .map(|shard| unfinished::count(&self.config.out, shard))
+            .sum::<usize>();
+        (self.start.episode + unfinished) as u64
+    }
+
+    /// The trials of an unfinished shard that are there.
+    pub(super) fn kept_episodes(config: &CollectConfig, info: &DatasetInfo, shard: usize) -> Vec<EncodedEpisode> {
+        let mut episodes = unfinished::load(info, &config.out, shard);
+        episodes.truncate(config.shard_trials(shard).count());
+        episodes
+    }
+
+    /// Whether these are all trials of a shard.
+    pub(super) fn is_whole(&self, shard: usize, episodes: &[EncodedEpisode]) -> bool {
+        episodes.len() == self.config.shard_trials(shard).count()
+    }
+
+    /// Keeps the finished trials of a shard until a later call finishes it. Errors: `Io`.
+    pub(super) fn keep(&self, shard: usize, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
+        let first = self.config.shard_trials(shard).start;
+        unfinished::save(&self.info, &self.config.out, (shard, first), episodes)
     }
 
     /// The next shard, if it is on the disk and whole; a damaged one is made anew.
@@ -233,6 +260,7 @@ impl<'a> Collection<'a> {
 
     /// Writes the tables and descriptions, once every shard is there.
     pub(super) fn complete(self) -> Result<DatasetInfo, DatasetError> {
+        unfinished::remove_all(&self.config.out)?;
         complete(&self.config.out, self.info, &self.shards)
     }
 }

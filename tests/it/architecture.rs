@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
     ("files", &[]),
+    ("settings", &[]),
     ("wording", &[]),
     ("telemetry", &[]),
     ("frame", &["types"]),
@@ -14,7 +15,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "wording", "frame", "sim"]),
     ("registry", &["types", "files", "wording", "nn"]),
-    ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
+    ("training", &["types", "files", "settings", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
         &["types", "files", "wording", "frame", "nn", "sim", "dataset", "registry"],
@@ -63,7 +64,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "jobs",
         ],
     ),
-    ("config", &["telemetry", "server"]),
+    ("config", &["settings", "telemetry", "server"]),
 ];
 
 /// Where a crate may be used, by path prefixes under `src/`.
@@ -71,7 +72,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
     ("hyper", &["server"]),
-    ("figment", &["config"]),
+    ("figment", &["settings"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
     ("image::", &["frame"]),
     ("tokio", &["server", "jobs", "versions", "store", "serving", "cli"]),

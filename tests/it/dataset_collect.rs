@@ -120,7 +120,8 @@ proptest! {
         for trials in stops {
             if let Err(error) = run_until(&config(&out), trials) {
                 let DatasetError::Cancelled { done, total } = error else { panic!("{error}") };
-                prop_assert!(total == TRIALS && done >= kept_before, "finished shards were lost");
+                prop_assert!(total == TRIALS && done >= kept_before, "finished trials were lost");
+                prop_assert!(done >= trials, "{done} of {trials} finished trials were kept");
                 kept_before = done;
                 prop_assert!(Dataset::open(&out).is_err());
             }
@@ -131,7 +132,7 @@ proptest! {
 }
 
 #[test]
-fn going_on_simulates_only_what_is_missing() {
+fn a_resumed_collection_simulates_only_the_missing_trials() {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("set");
     let one_thread = CollectConfig {
@@ -141,18 +142,18 @@ fn going_on_simulates_only_what_is_missing() {
     let error = run_until(&one_thread, 7).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "stopped with 6 of 11 trials kept; run the same command again to go on"
+        "stopped with 7 of 11 trials kept; run the same command again to go on"
     );
     assert_eq!(
         CollectionStatus::of(&one_thread).unwrap(),
-        CollectionStatus::PendingStep { trials: 6 }
+        CollectionStatus::PendingStep { trials: 7 }
     );
     let first = AtomicU64::new(u64::MAX);
     let told = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
     };
     collect(&one_thread, &told, &AtomicBool::new(false)).unwrap();
-    assert_eq!(first.into_inner(), 6);
+    assert_eq!(first.into_inner(), 7);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The real program in a process of its own, asked over sockets and told to stop.
+//! The real program in a process of its own, asked over sockets and stopped.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -51,6 +51,11 @@ impl Program {
             .read_line(&mut line)
             .unwrap();
         Self { child, line, log }
+    }
+
+    /// The first line that it printed.
+    pub(crate) fn first_line(&self) -> &str {
+        &self.line
     }
 
     pub(crate) fn id(&self) -> u32 {

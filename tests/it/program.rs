@@ -1,4 +1,4 @@
-//! The real program: what it says on the command line, and how it ends.
+//! The real program as a server: its command line, its log and its end.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
-use crate::process::{Served, foreframe, output, text};
+use crate::process::{Program, Served, foreframe, output, text};
 use crate::service::{PATIENCE, context, model, slow_spec, spec};
 
 /// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
@@ -53,7 +53,7 @@ fn is_whole_answer(stream: &mut TcpStream) -> bool {
 }
 
 #[test]
-fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
+fn sigterm_under_load_answers_every_accepted_request() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "slow", slow_spec());
     let served = Served::start(
@@ -63,7 +63,7 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
     let body = json!({"frames": context()}).to_string();
     let (accepted, answered) = (AtomicUsize::new(0), AtomicUsize::new(0));
     let address = served.address;
-    let told = std::thread::scope(|scope| {
+    let asked_to_stop = std::thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| ask_until_refused(address, &body, &accepted, &answered));
         }
@@ -74,7 +74,7 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
         Instant::now()
     });
     let log = served.ended();
-    assert!(told.elapsed() < Duration::from_secs(20), "{log}");
+    assert!(asked_to_stop.elapsed() < Duration::from_secs(20), "{log}");
     assert_eq!(
         accepted.load(Ordering::Relaxed),
         answered.load(Ordering::Relaxed),
@@ -84,7 +84,7 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
 }
 
 #[test]
-fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
+fn metrics_count_by_route_and_logs_have_request_ids() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "plain", spec(Conditioning::None));
     let served = Served::start(dir.path(), &["--log-format", "json"]);
@@ -144,7 +144,7 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
 }
 
 #[test]
-fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
+fn the_exit_code_of_a_health_check_says_whether_a_server_is_ready() {
     let dir = tempfile::tempdir().unwrap();
     let served = Served::start(dir.path(), &[]);
     let bind = served.address.to_string();
@@ -165,7 +165,7 @@ fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
 }
 
 #[test]
-fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it() {
+fn a_reachable_server_needs_a_key() {
     let dir = tempfile::tempdir().unwrap();
     let refused = output(dir.path(), &["serve", "--bind", "0.0.0.0:0"]);
     assert_eq!(refused.status.code(), Some(2));
@@ -204,14 +204,14 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
 }
 
 #[test]
-fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
+fn a_wrong_directory_is_refused_at_the_start() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("file"), "").unwrap();
-    let none = "; name a directory that holds models, or none to serve those in ./models";
+    let none = "; name a directory that holds models, or leave the setting out to serve those in ./models";
     for (arguments, complaint) in [
         (
-            ["serve", "--models", "modles"],
-            format!("models_dir is \"modles\" (--models), which is not there{none}"),
+            ["serve", "--models-dir", "modles"],
+            format!("models_dir is \"modles\" (--models-dir), which does not exist{none}"),
         ),
         (
             ["worker", "--set", "models_dir=file"],
@@ -219,7 +219,7 @@ fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
         ),
         (
             ["serve", "--data-dir", "file"],
-            "data_dir is \"file\" (--data-dir), which is a file; name a directory, which is made if it is not there"
+            "data_dir is \"file\" (--data-dir), which is a file; name a directory; it is created if it does not exist"
                 .to_owned(),
         ),
     ] {
@@ -233,11 +233,15 @@ fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
     let served = Served::start(dir.path(), &[]);
     assert!(served.get("/v1/models").ends_with("{\"models\":[]}"));
     served.terminate();
-    assert!(served.ended().contains("no models there; train one by"));
+    assert!(
+        served
+            .ended()
+            .contains("publish a trained model with `foreframe publish DIR`")
+    );
 }
 
 #[test]
-fn the_configuration_is_printed_with_where_it_comes_from() {
+fn the_configuration_is_printed_with_its_origins() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();
     let printed = foreframe(dir.path())
@@ -260,7 +264,85 @@ fn the_configuration_is_printed_with_where_it_comes_from() {
     std::fs::write(dir.path().join("foreframe.toml"), "max_stream = 7\n").unwrap();
     let refused = output(dir.path(), &["serve"]);
     assert_eq!(refused.status.code(), Some(2));
-    assert!(text(&refused.stderr).contains("max_stream (foreframe.toml) is no field"));
+    assert!(text(&refused.stderr).contains("unknown field `max_stream` (foreframe.toml); `foreframe config` lists"));
+}
+
+#[test]
+fn a_server_listens_on_the_port_and_name_that_it_is_given() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = Served::start(dir.path(), &["--port", "0"]);
+    assert!(served.get("/livez").starts_with("HTTP/1.1 200"));
+    served.terminate();
+    served.ended();
+    let named = Program::start(dir.path(), &["serve", "--bind", "localhost:0"]);
+    assert!(
+        named.first_line().contains("http://127.0.0.1:"),
+        "{}",
+        named.first_line()
+    );
+    named.terminate();
+    named.ended();
+}
+
+#[test]
+fn the_directory_of_a_model_gives_it_its_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let models = dir.path().join("models");
+    model(&models, "plain", spec(Conditioning::None));
+    std::fs::rename(models.join("plain"), models.join("other")).unwrap();
+    model(&models, "my_model", spec(Conditioning::None));
+    let served = Served::start(dir.path(), &[]);
+    assert!(served.get("/v1/models/other").contains("\"name\":\"other\""));
+    served.terminate();
+    let log = served.ended();
+    assert!(log.contains("my_model") && log.contains("is not a model name"), "{log}");
+}
+
+#[test]
+fn a_running_server_serves_what_is_published() {
+    let dir = tempfile::tempdir().unwrap();
+    model(&dir.path().join("models"), "plain", spec(Conditioning::None));
+    let served = Served::start(dir.path(), &[]);
+    let run = |arguments: &[&str]| {
+        let done = output(dir.path(), arguments);
+        assert!(done.status.success(), "{arguments:?}: {}", text(&done.stderr));
+        text(&done.stdout)
+    };
+    let wait_for = |model: &str, version: &str| {
+        let deadline = Instant::now() + PATIENCE;
+        while !served.get(&format!("/v1/models/{model}")).contains(version) {
+            assert!(Instant::now() < deadline, "{model} is not served as {version}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    assert_eq!(
+        run(&["publish", "models/plain", "--name", "mine"]),
+        "published mine@1; it is the active version\n"
+    );
+    wait_for("mine", "\"active_version\":1");
+    assert_eq!(
+        run(&["publish", "models/plain"]),
+        "published plain@2; it is the active version\n"
+    );
+    wait_for("plain", "\"active_version\":2");
+    let listed = run(&["models", "list"]);
+    assert!(
+        listed.contains("mine@1                   active data/models/mine/1\n")
+            && listed.contains("plain@1                         models/plain\n")
+            && listed.contains("plain@2                  active data/models/plain/2\n"),
+        "{listed}"
+    );
+    let refused = output(dir.path(), &["models", "remove", "plain@2"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("is active"));
+    run(&["models", "activate", "plain@1"]);
+    wait_for("plain", "\"active_version\":1");
+    assert_eq!(run(&["models", "remove", "plain@2"]), "removed plain@2\n");
+    assert!(!dir.path().join("data/models/plain/2").exists());
+    assert!(run(&["models", "remove", "mine"]).contains("no version of mine is left"));
+    let refused = output(dir.path(), &["models", "remove", "plain"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("delete its directory there"));
+    served.terminate();
+    served.ended();
 }
 
 #[test]
