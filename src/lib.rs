@@ -10,7 +10,7 @@ pub mod files;
 pub mod settings;
 
 pub mod telemetry;
-pub mod wording;
+pub mod error_text;
 
 pub mod frame;
 

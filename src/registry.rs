@@ -1,6 +1,6 @@
-//! Trained models on disk, one directory each: `NAME/model.safetensors` (weights, f16) and `NAME/manifest.json` (what they
-//! are and how they were made). In a directory of models, the name of a model's own directory is its name, whatever the
-//! manifest says. [`manifest`] describes one, [`loader`] verifies and builds it; here they are listed, found and published.
+//! Trained models on disk. Each model has a directory with `model.safetensors` (weights, f16) and `manifest.json`
+//! (description and origin). In a directory of models, the name of a model's directory is its name, whatever the manifest
+//! says. [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds and publishes models.
 
 pub mod loader;
 pub mod manifest;
@@ -11,31 +11,31 @@ pub use self::loader::{LoadedModel, load, load_as};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
-use crate::wording::those;
+use crate::error_text::existing;
 
-/// The weights' file in a model's directory.
+/// Name of the weights file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";
-/// The manifest's file in a model's directory.
+/// Name of the manifest file in a model's directory.
 pub const MANIFEST_FILE: &str = "manifest.json";
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
 pub enum RegistryError {
-    /// There is no model of that name.
-    #[error("there is no model {name:?} in {}; there {}", dir.display(), those(known))]
+    /// No model has this name.
+    #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]
     Unknown {
         /// The name asked for.
         name: String,
-        /// Where it was looked for.
+        /// The directory that was searched.
         dir: PathBuf,
-        /// The names there are.
+        /// The names of the existing models.
         known: Vec<String>,
     },
-    /// A name that could leave the directory or confuse a shell.
-    #[error("{0:?} is not a model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
+    /// The name is not safe as a directory name or in a URL.
+    #[error("{0:?} is not a valid model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
     Name(String),
-    /// The path leads to no model.
-    #[error("{} holds no model ({MANIFEST_FILE} is missing); name one that `foreframe train` made", .0.display())]
+    /// The directory contains no model.
+    #[error("{} holds no model ({MANIFEST_FILE} is missing); give a directory that `foreframe train` wrote", .0.display())]
     NotAModel(PathBuf),
     /// A file could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
@@ -47,43 +47,43 @@ pub enum RegistryError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The manifest isn't one.
-    #[error("{} is no model manifest: {source}", path.display())]
+    /// The manifest cannot be parsed.
+    #[error("{} is not a valid model manifest: {source}", path.display())]
     Manifest {
         /// The file.
         path: PathBuf,
-        /// Where it went wrong.
+        /// The parser's error.
         source: serde_json::Error,
     },
-    /// The weights are not those that the manifest names.
-    #[error("{} has SHA-256 {found}, its manifest says {expected}: fetch the model again or train it anew", path.display())]
+    /// The weights file has another hash than the manifest states.
+    #[error("{} has SHA-256 {found}, but its manifest states {expected}; download the model or train it again", path.display())]
     Hash {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// As computed.
+        /// Hash of the file.
         found: String,
-        /// As the manifest says.
+        /// Hash in the manifest.
         expected: String,
     },
-    /// The weights don't fit the manifest's spec.
-    #[error("the weights of {} do not fit their manifest: {source}", path.display())]
+    /// The weights do not match the model specification in the manifest.
+    #[error("the weights of {} do not match their manifest: {source}", path.display())]
     Weights {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// What does not fit.
+        /// What does not match.
         source: crate::nn::NnError,
     },
-    /// The weights' file is damaged.
-    #[error("{} is no safetensors file: {source}", path.display())]
+    /// The weights file is damaged.
+    #[error("{} is not a valid safetensors file: {source}", path.display())]
     Safetensors {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// Where it went wrong.
+        /// The reader's error.
         source: candle_core::Error,
     },
 }
 
-/// Whether the name is safe as a directory's and in an address: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
+/// Whether the name is safe as a directory name and in a URL: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
 #[must_use]
 pub fn is_valid_name(name: &str) -> bool {
     let bytes = name.as_bytes();
@@ -92,7 +92,8 @@ pub fn is_valid_name(name: &str) -> bool {
         && bytes.iter().all(|b| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'-'))
 }
 
-/// The models in a directory, by name, sorted. An absent directory holds none. Errors: `Io` if it can't be listed.
+/// Names and directories of the models in a directory, sorted by name. A missing directory contains none. Errors: `Io` if
+/// the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
     let named = directories(models_dir)?.into_iter().map(|path| (directory_name(&path), path));
     let mut models: Vec<_> = named
@@ -130,7 +131,7 @@ fn directory_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// The directory of the model of that name. Errors: `Name`, `Unknown` with the names there are.
+/// The directory of the model with this name. Errors: `Name`, `Unknown` with the existing names.
 pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     if !is_valid_name(name) {
         return Err(RegistryError::Name(name.to_owned()));
@@ -147,8 +148,8 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     })
 }
 
-/// The model's directory if `model` is a path to one, and none if it can only be a name. Errors: `NotAModel` for a path
-/// that leads to something else.
+/// The directory of a model that the user gave as a path; none if the text can only be a name. Errors: `NotAModel` for a
+/// path without a model.
 pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
     let path = Path::new(model);
     if path.join(MANIFEST_FILE).is_file() {
@@ -160,7 +161,8 @@ pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
     Ok(None)
 }
 
-/// Writes weights (as f16) and manifest into `model_dir`, the manifest last and with the weights' hash filled in.
+/// Writes the weights (as f16) and then the manifest into `model_dir`. Fills in the weights' hash and returns the manifest.
+/// Errors: `Weights`, `Manifest`, `Io`.
 pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -> Result<Manifest, RegistryError> {
     let weights_path = model_dir.join(WEIGHTS_FILE);
     let failed = |path: &Path| {
@@ -185,7 +187,7 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
     Ok(manifest)
 }
 
-/// Replaces the metrics of a model's manifest, for example by those that an evaluation measured.
+/// Replaces the metrics in a model's manifest, for example with the results of an evaluation. Errors: `Manifest`, `Io`.
 pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
     let mut manifest = manifest::read(model_dir)?;
     manifest.metrics = metrics;
@@ -232,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_model_is_answered_with_the_names_there_are() {
+    fn the_error_for_an_unknown_model_lists_the_existing_ones() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("paper")).unwrap();
         std::fs::write(dir.path().join("paper").join(MANIFEST_FILE), "{}").unwrap();

@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use crate::dataset::DatasetError;
+use crate::error_text;
 use crate::evaluation::EvaluationError;
 use crate::nn::NnError;
 use crate::registry::RegistryError;
@@ -13,7 +14,6 @@ use crate::serving::ServingError;
 use crate::sim::SimError;
 use crate::telemetry::TelemetryError;
 use crate::training::TrainError;
-use crate::wording;
 
 /// Why a subcommand ended, as a sentence for the user.
 pub(super) enum CliError {
@@ -28,7 +28,7 @@ pub(super) enum CliError {
 impl CliError {
     /// A failure with its causes.
     pub(super) fn failed(error: impl Error) -> Self {
-        Self::Failed(wording::sentence(&error))
+        Self::Failed(error_text::with_causes(&error))
     }
 
     /// A file that cannot be used: `Usage` if the path leads to nothing of the right kind.
@@ -60,7 +60,7 @@ pub(super) trait UsageError: Error {
 
 impl<E: UsageError> From<E> for CliError {
     fn from(error: E) -> Self {
-        let sentence = wording::sentence(&error);
+        let sentence = error_text::with_causes(&error);
         if error.is_usage() {
             Self::Usage(sentence)
         } else {

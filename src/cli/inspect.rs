@@ -5,10 +5,10 @@ use std::path::Path;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
-use crate::dataset::{self, Dataset};
+use crate::dataset::{self, Dataset, DatasetInfo};
+use crate::error_text::{comma_separated, existing};
 use crate::nn::{ChannelScale, ModelSpec, costs};
-use crate::registry::Manifest;
-use crate::wording::listed;
+use crate::registry::{self, Manifest};
 
 /// Describe a model or a data set.
 #[derive(clap::Args)]
@@ -28,7 +28,7 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (name, path) = (args.what.as_str(), Path::new(&args.what));
     let models = workspace.model_names()?;
-    let is_model = crate::registry::directory_of(name).is_ok_and(|dir| dir.is_some());
+    let is_model = registry::directory_of(name).is_ok_and(|dir| dir.is_some());
     if is_model || models.iter().any(|model| name.split('@').next() == Some(model)) {
         let (dir, loaded) = workspace.load_model(name)?;
         return describe_model(&dir, &loaded.manifest);
@@ -36,7 +36,7 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
     let config = workspace.config();
     let models_dir = &config.server.models_dir;
     let misnamed = models_dir.join(name);
-    if misnamed.join(crate::registry::MANIFEST_FILE).is_file() {
+    if misnamed.join(registry::MANIFEST_FILE).is_file() {
         return workspace.load_model(name).map(drop);
     }
     if let Ok(dir) = workspace.find_dataset(path) {
@@ -46,18 +46,10 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
     Err(CliError::Usage(format!(
         "there is no model or data set {name:?}; in {} there {}; in {} there {}",
         models_dir.display(),
-        known(&models),
+        existing(&models),
         datasets_dir.display(),
-        known(&dataset::list(&datasets_dir)?)
+        existing(&dataset::list(&datasets_dir)?)
     )))
-}
-
-fn known(names: &[String]) -> String {
-    if names.is_empty() {
-        "are none".to_owned()
-    } else {
-        format!("are: {}", listed(names))
-    }
 }
 
 fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
@@ -124,7 +116,7 @@ fn print_costs(manifest: &Manifest) -> Result<(), CliError> {
 }
 
 fn conditions(spec: &ModelSpec) -> String {
-    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", listed(channels));
+    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", comma_separated(channels));
     let mut text = String::new();
     if spec.state_inputs().is_some() {
         text += &list("the state", &spec.states);
@@ -144,12 +136,26 @@ fn describe_dataset(dir: &Path) -> Result<(), CliError> {
         info.frame_count, info.frame_width_px, info.frame_height_px, info.frame_period_s
     ))?;
     print_line(format!("  episodes    {}", info.episode_count))?;
-    print_line(format!("  action      [{}]", listed(&info.action_channels)))?;
-    print_line(format!("  state       [{}]", listed(&info.state_channels)))?;
+    print_line(format!("  action      [{}]", comma_separated(&info.action_channels)))?;
+    print_line(format!("  state       [{}]", comma_separated(&info.state_channels)))?;
     print_line(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
+    print_line(format!("  camera      {}", camera(info)))?;
     print_line(format!(
         "  scenario    {}",
         info.scenario.as_deref().unwrap_or("none (recorded)")
     ))?;
     print_line(format!("  content     SHA-256 {}", info.content_hash))
+}
+
+fn camera(info: &DatasetInfo) -> String {
+    info.camera.map_or_else(
+        || "not described".to_owned(),
+        |camera| {
+            format!(
+                "pinhole, {:.1}° wide, tilted down {:.1}°",
+                camera.horizontal_fov_rad.to_degrees(),
+                camera.tilt_down_rad.to_degrees()
+            )
+        },
+    )
 }

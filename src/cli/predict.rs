@@ -11,13 +11,13 @@ use super::output::{OutputDirectory, enlarged};
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
+use crate::error_text;
 use crate::evaluation::figures::montage;
 use crate::frame::fit::Fit;
 use crate::frame::{Frame, MAX_SIDE_PX, codec};
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
-use crate::wording;
 
 /// The least width of the GIF, in pixels.
 const GIF_WIDTH_PX: u32 = 256;
@@ -134,7 +134,7 @@ fn input(args: &PredictArgs, loaded: &LoadedModel, selected: &Selected) -> Resul
     } else if spec.action_inputs().is_some() {
         return Err(CliError::Usage(format!(
             "--actions is missing; model {name:?} takes {}",
-            wording::listed(&spec.actions)
+            error_text::comma_separated(&spec.actions)
         )));
     }
     Ok(input)

@@ -8,6 +8,7 @@ use super::{CliError, print_line};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App};
+use crate::store::Store;
 use crate::telemetry;
 
 /// Serve models over HTTP and WebSocket.
@@ -30,7 +31,7 @@ pub(super) struct ServeArgs {
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let config = with_checked_directories(args.settings.load()?)?;
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
-    telemetry::record();
+    telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         // Every such thread uses memory, and many decoding threads would slow down the one that predicts.
@@ -44,7 +45,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config) -> Result<(), CliError> {
-    let keys = keys(&config).await?;
+    let store = open_store(&config).await?;
+    let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
         CliError::Failed(format!(
             "could not listen on {}: {error}; choose another address or port with --bind or --port",
@@ -52,7 +54,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    let app = Box::pin(App::open(config.server))
+    let app = Box::pin(App::with_store(config.server, store))
         .await
         .map_err(CliError::failed)?
         .with_keys(keys);
@@ -68,34 +70,28 @@ fn report_models(app: &App) {
     for manifest in &models {
         info!(model.id = %manifest.name, model.version = manifest.version, "model loaded");
     }
-    if models.is_empty() {
-        let server = app.config();
-        warn!(
-            models_dir = %server.models_dir.display(),
-            data_dir = %server.data_dir.display(),
-            "no models found, so there is nothing to predict with; start the server where the models directory is or name it \
-             with --models-dir, or publish a trained model with `foreframe publish DIR`"
-        );
+    if let Some(advice) = app.no_model_advice() {
+        warn!("{advice}");
     }
 }
 
-/// The API keys that are accepted. Errors: `Usage` if other machines can reach the server and no key exists.
-async fn keys(config: &Config) -> Result<Keys, CliError> {
+/// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.
+async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
-    let keys = Keys::of(open_store(config).await?, is_required).await?;
+    let keys = Keys::open(store, is_required).await?;
     if is_required && keys.count() == 0 {
         return Err(CliError::Usage(format!(
-            "other machines can reach {}, and no API key exists; create one with foreframe keys create NAME, listen on \
-             127.0.0.1, or allow everybody with --insecure",
+            "other machines can reach {}, but no API keys exist; create one with foreframe keys create NAME, bind a \
+             loopback address, or use --insecure",
             config.bind
         )));
     }
     match keys.count() {
-        0 if keys.are_asked_for() => {
-            warn!("all API keys are revoked: every request is refused until foreframe keys create makes a new one");
+        0 if keys.are_required() => {
+            warn!("no valid API key exists: every request is refused until foreframe keys create makes one");
         }
         0 => info!("authentication is off: no API keys exist"),
-        count => info!(keys = count, "authentication is on: requests need an API key"),
+        count => info!(keys = count, "authentication is on"),
     }
     Ok(keys)
 }

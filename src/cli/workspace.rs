@@ -85,7 +85,7 @@ impl Workspace {
             Some(version) if version != found => Err(VersionError::Unknown {
                 model: name.to_owned(),
                 version,
-                known: vec![found],
+                available: vec![found],
             }
             .into()),
             _ => Ok((dir, loaded)),

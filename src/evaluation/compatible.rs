@@ -5,7 +5,7 @@ use crate::dataset::{Dataset, DatasetInfo};
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
-use crate::wording::listed;
+use crate::error_text::comma_separated;
 
 /// Periods that differ by less than this share of themselves are the same.
 const PERIOD_TOLERANCE: f64 = 0.01;
@@ -44,7 +44,7 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
         if used.is_none() {
             continue;
         }
-        let (wanted, found) = (listed(wanted), listed(found));
+        let (wanted, found) = (comma_separated(wanted), comma_separated(found));
         if wanted != found {
             return Err(EvaluationError::Channels {
                 dataset: info.name.clone(),

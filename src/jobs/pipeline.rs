@@ -1,5 +1,5 @@
-//! The work itself, below the data directory: collections into `datasets/NAME`, trainings in `runs/JOB`, whose model
-//! becomes the next version of its name, evaluations into `reports/JOB`.
+//! The work of jobs, below the data directory: a collection writes `datasets/NAME`; a training works in `runs/JOB` and
+//! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
 use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,18 +20,18 @@ use crate::store::{LossRow, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
-use crate::wording;
+use crate::error_text;
 
-/// The file of a report that is written last.
+/// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
-/// Points of a stage's training loss, besides those of its validations.
+/// How many points of the training loss are stored for each stage, besides those of its validations.
 const CURVE_POINTS: usize = 500;
-/// How long a job waits for a process that was taken for dead to let go of the directory.
-const BUSY_PATIENCE: Duration = Duration::from_mins(1);
-/// How often it looks whether that has.
+/// How long a job waits for another process, whose lease has expired, to unlock the directory.
+const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
+/// How often it tries.
 const BUSY_POLL: Duration = Duration::from_millis(200);
 
-/// What works on jobs.
+/// Runs jobs in this process.
 pub struct Pipeline {
     store: Store,
     versions: Versions,
@@ -40,7 +40,7 @@ pub struct Pipeline {
 }
 
 impl Pipeline {
-    /// One that collects on so many threads. To be called within a tokio runtime.
+    /// A pipeline that collects on `threads` threads. Needs a tokio runtime.
     #[must_use]
     pub fn new(store: Store, versions: Versions, threads: usize) -> Self {
         Self {
@@ -54,7 +54,7 @@ impl Pipeline {
 
 impl JobExecutor for Pipeline {
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
-        Box::pin(self.look_over(spec.clone()))
+        Box::pin(self.check_spec(spec.clone()))
     }
 
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
@@ -71,11 +71,11 @@ impl JobExecutor for Pipeline {
 }
 
 impl Pipeline {
-    async fn look_over(&self, spec: JobSpec) -> Result<(), JobError> {
+    async fn check_spec(&self, spec: JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
         let data_dir = objects.data_dir().to_owned();
-        // It looks at the disk, and must wait for nothing that needs a thread of the same kind: there are only so many.
+        // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
         let checked = tokio::task::spawn_blocking(move || {
             spec.check(AvailableInputs {
                 data_dir: &data_dir,
@@ -95,13 +95,13 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
-        let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
-        self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
+        let clearing = datasets::clear_stale(self.store.objects(), &spec.name, &config);
+        self.runtime.block_on(clearing).map_err(|error| failed(&error))?;
         let on_progress =
             |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
-        let info = once_free(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
+        let info = retry_while_busy(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
         self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
         Ok(JobResult {
             result: json!({
@@ -125,24 +125,24 @@ impl Pipeline {
             run_dir: &run_dir,
             command: &command(spec),
         };
-        let mut watch = TrainingReporter {
+        let mut reporter = TrainingReporter {
             report,
             steps: [config.pretrain.steps, config.fit.steps],
             train_loss: None,
         };
-        let mut keeping = CheckpointSync::default();
+        let mut sync = CheckpointSync::default();
         let mut observer = |event: TrainingEvent| {
-            watch.on_event(event);
+            reporter.on_event(event);
             if matches!(event, TrainingEvent::Checkpointed { .. }) {
                 let pushing = self.store.objects().push(&run, CHECKPOINT_FILE);
-                if let Some(line) = keeping.note(self.runtime.block_on(pushing)) {
+                if let Some(line) = sync.record(self.runtime.block_on(pushing)) {
                     report.line(line);
                 }
             }
         };
         let train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
-        match once_free(train, is_busy, cancelled).map_err(|error| failed(&error))? {
+        match retry_while_busy(train, is_busy, cancelled).map_err(|error| failed(&error))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
@@ -159,14 +159,14 @@ impl Pipeline {
         }
     }
 
-    /// Has the run's directory hold its last checkpoint, and at its first taking up nothing.
+    /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
     fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), JobFailure> {
         let objects = self.store.objects();
         let prepared = self.runtime.block_on(async {
             if report.lease().token == 1 {
                 return objects.delete(run).await;
             }
-            checkpoints::recall(objects, run).await
+            checkpoints::fetch_latest(objects, run).await
         });
         prepared.map_err(|error| failed(&error))
     }
@@ -186,7 +186,7 @@ impl Pipeline {
             bootstrap_samples: spec.resamples,
             seed: Seed(spec.seed),
             twin: twin.as_ref(),
-            command: posted(&JobSpec::Evaluate(spec.clone())),
+            command: request_line(&JobSpec::Evaluate(spec.clone())),
             cancelled: Some(cancelled),
             ..EvaluateConfig::default()
         };
@@ -200,7 +200,7 @@ impl Pipeline {
         let mut found = found.map_err(|error| failed(&error))?;
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let dir = report_key(&report.id());
-        // What an attempt that broke off left is of no use.
+        // An earlier attempt may have left an incomplete report.
         let cleared = self.runtime.block_on(self.store.objects().delete(&dir));
         cleared.map_err(|error| failed(&error))?;
         let out = self.store.objects().data_dir().join(&dir);
@@ -242,8 +242,8 @@ impl Pipeline {
     }
 }
 
-/// Tries until nobody else works in the directory, for so long at most, or until it is cancelled.
-fn once_free<T, E>(
+/// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
+fn retry_while_busy<T, E>(
     mut work: impl FnMut() -> Result<T, E>,
     is_busy: impl Fn(&E) -> bool,
     cancelled: &AtomicBool,
@@ -251,7 +251,7 @@ fn once_free<T, E>(
     let began = Instant::now();
     loop {
         let done = work();
-        let may_wait = began.elapsed() < BUSY_PATIENCE && !cancelled.load(Ordering::Acquire);
+        let may_wait = began.elapsed() < BUSY_TIMEOUT && !cancelled.load(Ordering::Acquire);
         match done {
             Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
             done => return done,
@@ -259,16 +259,16 @@ fn once_free<T, E>(
     }
 }
 
-/// The directory of a job's report among the objects.
+/// The key of the directory of a job's report.
 #[must_use]
 pub fn report_key(id: &str) -> String {
     format!("reports/{id}")
 }
 
-/// Writes a training's events down.
+/// Turns a training's events into the job's report.
 struct TrainingReporter<'a> {
     report: &'a JobReporter,
-    /// Of each stage.
+    /// The steps of each stage.
     steps: [usize; 2],
     train_loss: Option<f64>,
 }
@@ -281,7 +281,7 @@ impl TrainingReporter<'_> {
                 self.report
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
-            // What was not written before the process died must be in the curves all the same.
+            // A point that the last attempt did not write before it was killed must also be in the curves.
             TrainingEvent::Recalled {
                 stage,
                 step,
@@ -349,36 +349,36 @@ impl TrainingReporter<'_> {
     }
 }
 
-/// What the manifest tells of how the model was made.
+/// The command that the manifest records.
 fn command(spec: &TrainSpec) -> String {
-    posted(&JobSpec::Train(spec.clone()))
+    request_line(&JobSpec::Train(spec.clone()))
 }
 
-fn posted(spec: &JobSpec) -> String {
+fn request_line(spec: &JobSpec) -> String {
     format!("POST /v1/jobs {}", serde_json::to_string(spec).unwrap_or_default())
 }
 
 fn failed(error: &dyn Error) -> JobFailure {
-    JobFailure::Failed(wording::sentence(error))
+    JobFailure::Failed(error_text::with_causes(error))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Tries work that is busy that often; says what came of it and how often it was tried.
+    /// Retries work that is busy `busy` times. Returns its result and the number of tries.
     fn tried(busy: u32, cancelled: bool) -> (Result<(), bool>, u32) {
         let mut tries = 0;
         let work = || {
             tries += 1;
             if tries > busy { Ok(()) } else { Err(true) }
         };
-        let done = once_free(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
+        let done = retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
         (done, tries)
     }
 
     #[test]
-    fn work_begins_once_the_directory_is_free_or_never_if_it_is_cancelled() {
+    fn work_starts_once_the_directory_is_free_unless_cancelled() {
         assert_eq!(tried(2, false), (Ok(()), 3));
         assert_eq!(tried(2, true), (Err(true), 1));
     }
@@ -390,7 +390,10 @@ mod tests {
             tries += 1;
             Err(false)
         };
-        assert_eq!(once_free(work, |is_busy| *is_busy, &AtomicBool::new(false)), Err(false));
+        assert_eq!(
+            retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(false)),
+            Err(false)
+        );
         assert_eq!(tries, 1);
     }
 }

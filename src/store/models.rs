@@ -1,4 +1,4 @@
-//! Which versions of the models were published, and which of them serves. The files are in the objects.
+//! The published versions of the models, and which version is active. Their files are in the object store.
 
 use super::database::{DatabaseRow, Tx};
 use super::jobs::Lease;
@@ -9,7 +9,7 @@ use super::{Store, StoreError};
 pub struct VersionRow {
     /// The model's name.
     pub model: String,
-    /// Counts the publications of the name.
+    /// The version's number.
     pub version: u32,
     /// When it was published, in seconds since 1970.
     pub published_s: f64,
@@ -21,8 +21,8 @@ fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
 }
 
 impl Store {
-    /// The version that a job is to publish: the next of the name above `shipped`; asked again, the same.
-    /// `None` if the lease is lost. Errors: `Query`.
+    /// Reserves the version that a job publishes: the next number above `shipped`. A second call of the same job returns the
+    /// same number. `None` if the lease is lost. Errors: `Query`.
     pub async fn reserve_version(&self, lease: Lease, model: &str, shipped: u32) -> Result<Option<u32>, StoreError> {
         let mut tx = self.database.begin().await?;
         // Held until the commit, so that two jobs never reserve one number.
@@ -72,7 +72,7 @@ impl Store {
         self.database.execute(sql, vec![model.into()]).await.map(drop)
     }
 
-    /// Every version that was published and not deleted, by name and number. Errors: `Query`.
+    /// All published versions that are not deleted, by name and number. Errors: `Query`.
     pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
         let sql = "SELECT model, version, published_s FROM model_versions \
              WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
@@ -87,7 +87,7 @@ impl Store {
         rows.iter().map(version).collect()
     }
 
-    /// The name and version of every model of which one was chosen to serve. Errors: `Query`.
+    /// The active version of each model that has one. Errors: `Query`.
     pub async fn active_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
         let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;
         rows.iter()
@@ -95,7 +95,7 @@ impl Store {
             .collect()
     }
 
-    /// Has a version serve from now on. Errors: `Query`.
+    /// Makes a version active. Errors: `Query`.
     pub async fn set_active(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
              ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s";
@@ -103,7 +103,7 @@ impl Store {
         self.database.execute(sql, values).await.map(drop)
     }
 
-    /// Deletes a version unless it serves; says whether it did. Errors: `Query`.
+    /// Marks a version as deleted unless it is active. Returns whether it did. Errors: `Query`.
     pub async fn delete_version(&self, model: &str, version: u32, now_s: f64) -> Result<bool, StoreError> {
         let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
              AND published_s IS NOT NULL AND deleted_s IS NULL \

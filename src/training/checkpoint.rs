@@ -13,7 +13,7 @@ use super::config::{RunConfig, TrainConfig};
 use super::observer::TrainingStage;
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{is_partial_of, remove_abandoned, sha256_hex, write_atomically};
+use crate::files::{is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// The file of a run that says how far it is.
@@ -79,7 +79,7 @@ impl RunFiles {
         let lock = File::open(&config).map_err(io_failed("read", &config))?;
         match lock.try_lock() {
             Ok(()) => {
-                remove_abandoned(&self.run_dir);
+                remove_stale_partials(&self.run_dir);
                 Ok(lock)
             }
             Err(TryLockError::WouldBlock) => Err(TrainError::Busy(self.run_dir.clone())),

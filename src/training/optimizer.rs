@@ -1,6 +1,6 @@
 //! Adam (Kingma & Ba 2015) with its moments in the open, so that a resumed run goes on bit for bit, and gradients as
 //! values of their own, so that parts of a batch can be computed apart and joined.
-// A closure's vector instructions reach what is inlined into it, and only that.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 mod gradients;

@@ -54,7 +54,11 @@ impl Versions {
         for &version in &doomed {
             let (model, version) = of_model(version);
             if !known.contains(&version) {
-                return Err(VersionError::Unknown { model, version, known });
+                return Err(VersionError::Unknown {
+                    model,
+                    version,
+                    available: known,
+                });
             }
             if shipped == Some(version) {
                 return Err(VersionError::Shipped { model, version });

@@ -1,4 +1,4 @@
-//! The configuration: what goes over what, where values come from, and how wrong ones are refused.
+//! The configuration: precedence, sources of values, and refusals.
 
 use foreframe::config::{Config, LoadedConfig, environment_layers};
 use foreframe::settings::{SettingsError, SettingsLayer};
@@ -23,7 +23,7 @@ fn refused(layers: Vec<SettingsLayer>) -> String {
 }
 
 #[test]
-fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
+fn flags_override_environment_file_and_defaults() {
     let layers = [file("max_streams = 1\nmax_frames = 1\nmax_batch = 1")]
         .into_iter()
         .chain(environment(&[
@@ -47,7 +47,7 @@ fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
 }
 
 #[test]
-fn what_is_printed_can_be_read_as_a_file() {
+fn the_printed_configuration_is_a_valid_file() {
     let settings = [
         "drain_ms=5",
         "cors_origins=[\"http://a\"]",
@@ -63,7 +63,7 @@ fn what_is_printed_can_be_read_as_a_file() {
 }
 
 #[test]
-fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
+fn every_limit_is_checked_against_its_range() {
     let defaults = Config::default().server;
     for (field, value, range) in defaults.bounds() {
         let setting = SettingsLayer::assignment(&format!("{field}={value}")).unwrap();
@@ -87,7 +87,7 @@ fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
 }
 
 #[test]
-fn what_is_no_setting_is_refused_with_where_it_was_given() {
+fn invalid_settings_are_refused_with_their_source() {
     let set = |setting| vec![SettingsLayer::assignment(setting).unwrap()];
     for (layers, expected) in [
         (
@@ -145,7 +145,7 @@ fn a_port_replaces_that_of_the_address_and_names_are_resolved() {
 }
 
 #[test]
-fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
+fn empty_urls_and_test_variables_are_ignored() {
     let variables = [
         ("FOREFRAME_DATABASE_URL", ""),
         ("FOREFRAME_TEST_POSTGRES", "x"),

@@ -1,4 +1,4 @@
-//! Evaluation: a whole run on a small scene, what it leaves on disk, what it refuses.
+//! Evaluation: a whole run on a small scene, its files, and refusals.
 
 use std::collections::BTreeSet;
 
@@ -34,7 +34,7 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
     }
 }
 
-/// A model that was never trained, whose data set is said to have been this one.
+/// An untrained model whose manifest names this data set as its training data.
 fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
     let trained_on = DatasetStamp {
         name: dataset.info().name.clone(),
@@ -69,7 +69,7 @@ fn refusal(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> 
 }
 
 #[test]
-fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
+fn every_method_is_scored_and_skipped_sets_give_reasons() {
     let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     let twin = untrained("twin", spec(Conditioning::None), &dataset);
@@ -94,7 +94,7 @@ fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
+fn scores_do_not_depend_on_the_batch_size() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let first = evaluate(&model, &dataset, &config()).unwrap();
@@ -146,7 +146,7 @@ fn report_and_figures_are_written_and_read_back() {
 }
 
 #[test]
-fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
+fn a_mismatched_data_set_is_refused() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     assert_eq!(
@@ -184,7 +184,7 @@ fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
 }
 
 #[test]
-fn the_markdown_reads_as_agreed() {
+fn the_markdown_report_matches_its_snapshot() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::Action), &dataset);
     let mut report = evaluate(&model, &dataset, &config()).unwrap();
@@ -192,13 +192,13 @@ fn the_markdown_reads_as_agreed() {
     "a processor".clone_into(&mut report.stamp.cpu);
     report.stamp.threads = 2;
     report.stamp.program.git_commit = Some("0123abc".to_owned());
-    // Figures differ from one processor to the next in their last digits; their places don't.
+    // The last digits depend on the processor, so numbers are masked.
     let markdown = report.to_markdown();
     let masked: String = markdown.lines().map(|line| mask_numbers(line) + "\n").collect();
     insta::assert_snapshot!(masked);
 }
 
-/// Replaces every number of three digits or more, every fraction and every hash by a mark.
+/// Replaces numbers of three or more characters and hashes by `#`.
 fn mask_numbers(line: &str) -> String {
     let is_measured = |word: &str| {
         let digits = word.trim_matches(|c: char| !c.is_ascii_alphanumeric());

@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use tracing::info;
 
 use crate::cli::CliError;
+use crate::error_text;
 use crate::frame::fit::{Fit, fit};
 use crate::frame::{Frame, codec};
 use crate::nn::ModelSpec;
-use crate::wording;
 
 /// The endings of the files that are read.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
@@ -57,7 +57,7 @@ impl ImageFiles {
 
     fn read_one(&mut self, path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
         let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
-        let unreadable = |error| CliError::Failed(format!("{}: {}", path.display(), wording::sentence(&error)));
+        let unreadable = |error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error)));
         let frame = codec::decode(&bytes).map_err(unreadable)?;
         if !self.has_reported_color && codec::is_color(&bytes).map_err(unreadable)? {
             info!(image = %path.display(), "color images are converted to gray");

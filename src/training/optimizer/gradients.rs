@@ -1,5 +1,5 @@
 //! Gradients as values: taken, joined, measured.
-// A closure's vector instructions reach what is inlined into it, and only that.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use std::collections::BTreeMap;
