@@ -32,11 +32,11 @@ pub use layout::{INFO, METADATA};
 pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 
+use crate::error_text::comma_separated;
 use crate::files::hex;
 use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
-use crate::error_text::comma_separated;
 
 /// Description of a data set: frame size, frame period, channels, origin and the hash of its content.
 #[derive(Clone, Debug, Default, PartialEq)]

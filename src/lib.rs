@@ -9,8 +9,8 @@ pub mod files;
 
 pub mod settings;
 
-pub mod telemetry;
 pub mod error_text;
+pub mod telemetry;
 
 pub mod frame;
 

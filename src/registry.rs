@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 
 pub use self::loader::{LoadedModel, load, load_as};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
+use crate::error_text::existing;
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
-use crate::error_text::existing;
 
 /// Name of the weights file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";

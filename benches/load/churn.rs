@@ -10,12 +10,12 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, OnLate, ServerMes
 use futures_util::SinkExt as _;
 use tokio::task::JoinSet;
 
-use crate::report::Bounds;
 use crate::http::{Http, Request};
-use crate::workload::{self, Workload};
 use crate::process_usage::Usage;
+use crate::report::Bounds;
 use crate::server::{Server, Target};
 use crate::session::{self, Session};
+use crate::workload::{self, Workload};
 
 /// Number of parts of the load; memory is printed after each.
 const PARTS: u64 = 5;
@@ -27,7 +27,7 @@ const SETTLE_LIMIT: Duration = Duration::from_secs(20);
 const IDLE_TIME: Duration = Duration::from_secs(1);
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct ChurnArgs {
     #[command(flatten)]
     target: Target,
     /// Sessions to open, stream on, close and delete
@@ -58,7 +58,7 @@ enum Task {
 
 type Faults = BTreeMap<String, u64>;
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[]).await;
     let workload = Arc::new(Workload::of(&args.target.model));
     let tasks = [
@@ -76,8 +76,8 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
             *faults.entry(fault).or_default() += 1;
         }
     };
-    for (task, count, most, _) in &tasks {
-        repeat(task, (count / 10).min(*most)).await;
+    for (task, count, max, _) in &tasks {
+        repeat(task, (count / 10).min(*max)).await;
     }
     tokio::time::sleep(IDLE_TIME).await;
     let before = server.process.usage();
@@ -180,12 +180,16 @@ async fn many(
     working.join_all().await.concat()
 }
 
-async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::http::Answer, String> {
+async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::http::Response, String> {
     let answer = http.ask(request).await.map_err(|error| format!("no answer: {error}"))?;
     if answer.status == status {
         Ok(answer)
     } else {
-        Err(format!("status {} instead of {status}: {}", answer.status, answer.text()))
+        Err(format!(
+            "status {} instead of {status}: {}",
+            answer.status,
+            answer.text()
+        ))
     }
 }
 

@@ -9,12 +9,12 @@ use serde_json::{Value, json};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 
-use crate::report::{Bounds, Latencies};
-use crate::robots::{SendMode, RobotLoad};
 use crate::http::{Http, Request};
-use crate::workload::Workload;
+use crate::report::{Bounds, Latencies};
+use crate::robots::{RobotLoad, SendMode};
 use crate::schedule::{Schedule, Tick};
 use crate::server::{Server, Target};
+use crate::workload::Workload;
 
 const TRIALS: u64 = 40;
 const POLL: Duration = Duration::from_millis(100);
@@ -24,7 +24,7 @@ const JOB_LIMIT: Duration = Duration::from_mins(2);
 const WARM_UP: Duration = Duration::from_millis(500);
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct HealthArgs {
     #[command(flatten)]
     target: Target,
     /// Number of streams
@@ -58,7 +58,7 @@ struct Checks {
     faults: Vec<String>,
 }
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &HealthArgs, bounds: &mut Bounds) {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut server = Server::start(&args.target, &[("job_threads", args.job_threads.unwrap_or(cores))]).await;
     let workload = Arc::new(Workload::of(&args.target.model));
@@ -72,7 +72,10 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     println!("during a training:");
     let (livez_p99_ms, p99_ms, faults) = measure(args, &server, &workload).await;
     let job = http.expect(200, &Request::get(&training)).await.json();
-    bounds.check(job["state"] == "running", "the training ran during the whole measurement");
+    bounds.check(
+        job["state"] == "running",
+        "the training ran during the whole measurement",
+    );
     http.expect(202, &Request::json(&format!("{training}/cancel"), &Value::Null))
         .await;
     bounds.check(
@@ -120,7 +123,7 @@ async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) -> bool) {
 }
 
 /// The 99th percentiles of health checks and of streams in milliseconds, and the faults.
-async fn measure(args: &Args, server: &Server, workload: &Arc<Workload>) -> (f64, f64, Vec<String>) {
+async fn measure(args: &HealthArgs, server: &Server, workload: &Arc<Workload>) -> (f64, f64, Vec<String>) {
     let load = RobotLoad {
         sessions: args.sessions,
         mode: SendMode::Scheduled(args.rate_hz),
@@ -150,7 +153,7 @@ async fn measure(args: &Args, server: &Server, workload: &Arc<Workload>) -> (f64
 }
 
 /// Sends scheduled health checks, in turn on new connections and on a kept-alive one.
-async fn check(args: &Args, address: SocketAddr) -> Checks {
+async fn check(args: &HealthArgs, address: SocketAddr) -> Checks {
     let checks = Arc::new(Mutex::new(Checks::default()));
     let time = WARM_UP + Duration::from_secs_f64(args.seconds);
     let schedule = Schedule::lasting(Instant::now(), args.checks_hz, time);

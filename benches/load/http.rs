@@ -48,14 +48,14 @@ impl Request {
 
 /// A response.
 #[derive(Default)]
-pub(crate) struct Answer {
+pub(crate) struct Response {
     pub(crate) status: u16,
     /// Whether it has a valid `Retry-After` header.
     pub(crate) retry_after: bool,
     pub(crate) body: Vec<u8>,
 }
 
-impl Answer {
+impl Response {
     pub(crate) fn text(&self) -> String {
         String::from_utf8_lossy(&self.body).into_owned()
     }
@@ -86,20 +86,20 @@ impl Http {
     }
 
     /// Sends a request and returns the response. Errors: the connection ended, or the time limit passed.
-    pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Answer> {
+    pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Response> {
         timeout(TIMEOUT, self.exchange(request))
             .await
             .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
     }
 
     /// Sends a request and returns the response, which must have this status.
-    pub(crate) async fn expect(&mut self, status: u16, request: &Request) -> Answer {
+    pub(crate) async fn expect(&mut self, status: u16, request: &Request) -> Response {
         let answer = self.ask(request).await.expect("the server answers");
         assert_eq!(answer.status, status, "{}", answer.text());
         answer
     }
 
-    async fn exchange(&mut self, request: &Request) -> io::Result<Answer> {
+    async fn exchange(&mut self, request: &Request) -> io::Result<Response> {
         let mut stream = match self.kept.take() {
             Some((stream, asked)) if asked.elapsed() < KEEP_ALIVE => stream,
             _ => connect(self.address).await?,
@@ -118,8 +118,8 @@ async fn connect(address: SocketAddr) -> io::Result<BufReader<TcpStream>> {
 }
 
 /// Reads a response, and whether the connection ends after it.
-async fn read(stream: &mut BufReader<TcpStream>) -> io::Result<(Answer, bool)> {
-    let (mut answer, mut length, mut is_last) = (Answer::default(), None, false);
+async fn read(stream: &mut BufReader<TcpStream>) -> io::Result<(Response, bool)> {
+    let (mut answer, mut length, mut is_last) = (Response::default(), None, false);
     let mut line = String::new();
     stream.read_line(&mut line).await?;
     let status = line.split(' ').nth(1).and_then(|status| status.parse().ok());

@@ -4,19 +4,19 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
-mod report;
-mod robots;
 mod health;
 mod http;
-mod workload;
-mod schedule;
 mod process_usage;
+mod report;
 mod robot;
+mod robots;
 mod saturate;
+mod schedule;
 mod server;
 mod session;
 mod slow_reader;
 mod stream;
+mod workload;
 
 use std::process::ExitCode;
 use std::time::Instant;
@@ -39,7 +39,7 @@ struct Cli {
     #[command(subcommand)]
     scenario: Option<Scenario>,
     #[command(flatten)]
-    stream: stream::Args,
+    stream: stream::StreamArgs,
     /// Run a short form of every scenario, as CI does
     #[arg(long)]
     test: bool,
@@ -51,15 +51,15 @@ struct Cli {
 #[derive(clap::Subcommand)]
 enum Scenario {
     /// Robots at a fixed frame rate: measure latencies, or with --find the largest number of robots
-    Stream(stream::Args),
+    Stream(stream::StreamArgs),
     /// Twice the load that the server can handle: measure goodput, refusals and memory over time
-    Saturate(saturate::Args),
+    Saturate(saturate::SaturateArgs),
     /// One client that sends and never reads: measure its effect on other robots
-    SlowReader(slow_reader::Args),
+    SlowReader(slow_reader::SlowReaderArgs),
     /// Many sessions and requests: measure leaks of memory, file descriptors and threads
-    Churn(churn::Args),
+    Churn(churn::ChurnArgs),
     /// Health checks and streams while a training uses every core: measure latencies
-    Health(health::Args),
+    Health(health::HealthArgs),
 }
 
 /// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.

@@ -7,8 +7,8 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, ErrorCode, Server
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 
-use crate::workload::{self, Workload};
 use crate::session::{self, Socket};
+use crate::workload::{self, Workload};
 
 /// Answers to the frames of one robot or of many.
 #[derive(Default)]
@@ -25,12 +25,12 @@ pub(crate) struct FrameCounts {
     pub(crate) first_refusal: Option<String>,
     /// Predictions that the server dropped because this client read too slowly.
     pub(crate) dropped: u64,
-    pub(crate) answers: Vec<Answer>,
+    pub(crate) answers: Vec<PredictionTimes>,
 }
 
 /// A prediction.
 #[derive(Clone, Copy)]
-pub(crate) struct Answer {
+pub(crate) struct PredictionTimes {
     /// When its frame was scheduled.
     pub(crate) scheduled: Instant,
     /// When its frame was sent.
@@ -93,7 +93,7 @@ pub(crate) async fn run(
                 } => {
                     let (scheduled, sent) = log.lock().unwrap()[seq as usize];
                     let compute = Duration::from_micros(timing.compute_us);
-                    counts.answers.push(Answer {
+                    counts.answers.push(PredictionTimes {
                         scheduled,
                         sent,
                         received,

@@ -5,8 +5,8 @@ mod streams;
 
 use std::time::Duration;
 
-use crate::report::Bounds;
 use crate::process_usage::Process;
+use crate::report::Bounds;
 use crate::server::{Server, Target};
 
 /// Period of the memory samples.
@@ -15,7 +15,7 @@ const SAMPLE_PERIOD: Duration = Duration::from_millis(200);
 const PARTS: usize = 5;
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct SaturateArgs {
     #[command(flatten)]
     target: Target,
     /// Which interface to overload
@@ -63,7 +63,7 @@ enum Over {
     Both,
 }
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     if args.over != Over::Streams {
         rest::run(args, bounds).await;
     }
@@ -72,7 +72,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     }
 }
 
-impl Args {
+impl SaturateArgs {
     fn peak_time(&self) -> Duration {
         Duration::from_secs_f64(self.peak_s)
     }

@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::http::{Answer, Http, TIMEOUT, Request};
+use crate::http::{Http, Request, Response, TIMEOUT};
 
 /// Size of the read buffer: larger than an answer, but small, because it is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;
@@ -35,7 +35,7 @@ impl Session {
         Request::json("/v1/sessions", &settings)
     }
 
-    pub(crate) fn of(answer: &Answer) -> Self {
+    pub(crate) fn of(answer: &Response) -> Self {
         let answer = answer.json();
         let text = |field: &str| answer[field].as_str().expect("a session has this field").to_owned();
         Self {

@@ -6,15 +6,15 @@ use std::time::Duration;
 use foreframe::server::protocol::OnLate;
 
 use crate::report::Bounds;
-use crate::robots::{SendMode, RobotLoad, RobotLoadResult};
-use crate::workload::Workload;
+use crate::robots::{RobotLoad, RobotLoadResult, SendMode};
 use crate::server::{Server, Target};
+use crate::workload::Workload;
 
 /// Relative precision of the search.
 const FIND_PRECISION: f64 = 0.05;
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct StreamArgs {
     #[command(flatten)]
     target: Target,
     /// Concurrent sessions; with --find, the number to start with, which must keep the bound
@@ -40,7 +40,7 @@ pub(crate) struct Args {
     find_max: usize,
 }
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &StreamArgs, bounds: &mut Bounds) {
     let capacity = if args.find { args.find_max } else { args.sessions } + 1;
     let settings = [
         ("max_streams", capacity),
@@ -69,7 +69,7 @@ pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
     server.check(bounds);
 }
 
-impl Args {
+impl StreamArgs {
     fn load(&self, sessions: usize) -> RobotLoad {
         RobotLoad {
             sessions,
@@ -86,7 +86,7 @@ fn all_predicted(result: &RobotLoadResult) -> bool {
     counts.overloaded + counts.refused + counts.dropped + counts.unanswered() == 0 && !counts.answers.is_empty()
 }
 
-fn report(args: &Args, result: &RobotLoadResult) {
+fn report(args: &StreamArgs, result: &RobotLoadResult) {
     let (counts, from_schedule) = (&result.counts, result.since_schedule());
     println!(
         "{} sessions at {} Hz for {} s: {} frames sent, {} predicted, {} of them measured; {} refused, {} dropped, {} \
@@ -117,7 +117,7 @@ fn report(args: &Args, result: &RobotLoadResult) {
 }
 
 /// Doubles the number of sessions until the bound fails, then bisects. A failed number is tried a second time.
-async fn find(args: &Args, server: &Server, workload: &Arc<Workload>, bounds: &mut Bounds) {
+async fn find(args: &StreamArgs, server: &Server, workload: &Arc<Workload>, bounds: &mut Bounds) {
     let (mut passed, mut failed, mut sessions) = (0, None, args.sessions.clamp(1, args.find_max));
     loop {
         let holds = passes(args, sessions, server, workload).await || passes(args, sessions, server, workload).await;
@@ -140,7 +140,7 @@ async fn find(args: &Args, server: &Server, workload: &Arc<Workload>, bounds: &m
     bounds.check(passed >= args.sessions, format!("at least {} sessions", args.sessions));
 }
 
-async fn passes(args: &Args, sessions: usize, server: &Server, workload: &Arc<Workload>) -> bool {
+async fn passes(args: &StreamArgs, sessions: usize, server: &Server, workload: &Arc<Workload>) -> bool {
     let result = args.load(sessions).run(server, workload).await;
     let latencies = result.since_schedule();
     println!(

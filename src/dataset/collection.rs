@@ -145,7 +145,13 @@ fn differences(found: &str, wanted: &str) -> String {
     let differing: Vec<_> = wanted
         .iter()
         .filter(|(key, value)| found.get(*key) != Some(value))
-        .map(|(key, value)| format!("{key}: {} in the directory, {} requested", text(found.get(key)), text(Some(value))))
+        .map(|(key, value)| {
+            format!(
+                "{key}: {} in the directory, {} requested",
+                text(found.get(key)),
+                text(Some(value))
+            )
+        })
         .collect();
     differing.join("; ")
 }

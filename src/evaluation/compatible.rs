@@ -2,10 +2,10 @@
 
 use super::EvaluationError;
 use crate::dataset::{Dataset, DatasetInfo};
+use crate::error_text::comma_separated;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
-use crate::error_text::comma_separated;
 
 /// Periods that differ by less than this share of themselves are the same.
 const PERIOD_TOLERANCE: f64 = 0.01;

@@ -154,15 +154,27 @@ mod tests {
     fn fine_stripes_average_instead_of_aliasing() {
         let stripes = Frame::new(64, 64, [0u8, 200].repeat(64 * 32)).unwrap();
         let fitted = fit(&stripes, 8, 8, Fit::Stretch).unwrap();
-        assert!(fitted.pixels().iter().all(|pixel| pixel.abs_diff(100) < 12), "{fitted:?}");
+        assert!(
+            fitted.pixels().iter().all(|pixel| pixel.abs_diff(100) < 12),
+            "{fitted:?}"
+        );
     }
 
     #[test]
     fn a_size_out_of_range_is_refused() {
-        assert!(matches!(fit(&flat(2, 2, 0), 0, 4, Fit::Crop), Err(FrameError::Size { .. })));
-        assert!(matches!(fit(&flat(2, 2, 0), 4, 5000, Fit::Crop), Err(FrameError::Size { .. })));
+        assert!(matches!(
+            fit(&flat(2, 2, 0), 0, 4, Fit::Crop),
+            Err(FrameError::Size { .. })
+        ));
+        assert!(matches!(
+            fit(&flat(2, 2, 0), 4, 5000, Fit::Crop),
+            Err(FrameError::Size { .. })
+        ));
         assert_eq!("crop".parse::<Fit>().unwrap(), Fit::Crop);
         let error = "zoom".parse::<Fit>().unwrap_err();
-        assert_eq!(error.to_string(), "fit is \"zoom\"; it must be crop, letterbox or stretch");
+        assert_eq!(
+            error.to_string(),
+            "fit is \"zoom\"; it must be crop, letterbox or stretch"
+        );
     }
 }

@@ -14,13 +14,13 @@ use super::runner::{JobExecutor, JobFailure, JobReporter, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
+use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
 use crate::store::{LossRow, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
-use crate::error_text;
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";

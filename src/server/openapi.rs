@@ -106,7 +106,10 @@ struct PathExample {
 struct Examples;
 
 impl Modify for Examples {
-    #[expect(clippy::expect_used, reason = "the examples are part of the program, and a test sends each")]
+    #[expect(
+        clippy::expect_used,
+        reason = "the examples are part of the program, and a test sends each"
+    )]
     fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
         let mut examples: BTreeMap<String, PathExample> =
             serde_json::from_str(EXAMPLES).expect("examples that are not JSON are a bug");

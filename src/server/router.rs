@@ -33,7 +33,9 @@ pub fn router(app: App) -> Router {
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(config.max_body_bytes))
         .layer(from_fn_with_state(origins, origin::check))
-        .layer(from_fn(move |request, next| middleware::trace(trace.clone(), request, next)))
+        .layer(from_fn(move |request, next| {
+            middleware::trace(trace.clone(), request, next)
+        }))
         .with_state(app)
 }
 

@@ -253,7 +253,11 @@ fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32)
         let is_clear_of_pillars = arena::PILLARS
             .iter()
             .all(|pillar| arena::distance(pillar.position_m, [x, y]) > pillar.radius_m + 0.3);
-        if is_clear_of_pillars && taken.iter().all(|&other| arena::distance(other, [x, y]) >= min_distance) {
+        if is_clear_of_pillars
+            && taken
+                .iter()
+                .all(|&other| arena::distance(other, [x, y]) >= min_distance)
+        {
             return [x, y];
         }
     }

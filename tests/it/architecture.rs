@@ -18,13 +18,30 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("training", &["types", "files", "settings", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
-        &["types", "files", "error_text", "frame", "nn", "sim", "dataset", "registry"],
+        &[
+            "types",
+            "files",
+            "error_text",
+            "frame",
+            "nn",
+            "sim",
+            "dataset",
+            "registry",
+        ],
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
     (
         "versions",
-        &["types", "files", "error_text", "telemetry", "registry", "serving", "store"],
+        &[
+            "types",
+            "files",
+            "error_text",
+            "telemetry",
+            "registry",
+            "serving",
+            "store",
+        ],
     ),
     (
         "jobs",
@@ -134,7 +151,10 @@ fn dependencies_are_used_only_in_their_modules() {
     for (file, text) in sources() {
         for (name, modules) in USED_IN.iter().filter(|(_, modules)| !modules.contains(&module(&file))) {
             let uses = |line: &str| line.trim_start().starts_with(&format!("use {name}"));
-            assert!(!code(&text).any(uses), "{file} uses {name}, which is for {modules:?} only");
+            assert!(
+                !code(&text).any(uses),
+                "{file} uses {name}, which is for {modules:?} only"
+            );
         }
     }
 }
@@ -189,7 +209,9 @@ fn names_of(path: &str) -> (Vec<String>, &str) {
 /// Every path that begins here, with those in braces spread out.
 fn paths(text: &str) -> Vec<Vec<String>> {
     let (names, rest) = names_of(text);
-    let Some(inner) = rest.strip_prefix('{') else { return vec![names] };
+    let Some(inner) = rest.strip_prefix('{') else {
+        return vec![names];
+    };
     let (mut depth, mut start, mut found) = (0, 0, Vec::new());
     for (at, letter) in inner.char_indices() {
         match letter {
@@ -245,7 +267,9 @@ fn server_uses(sources: &[(String, String)]) -> Vec<(Vec<String>, Vec<String>)> 
     let files: Vec<Vec<String>> = modules.iter().map(|(module, _)| module.clone()).collect();
     let mut uses = Vec::new();
     for (module, text) in &modules {
-        let used = server_paths(module, text).into_iter().filter_map(|path| file_of(&path, &files));
+        let used = server_paths(module, text)
+            .into_iter()
+            .filter_map(|path| file_of(&path, &files));
         let apart = used.filter(|used| !used.starts_with(module) && !module.starts_with(used));
         uses.extend(apart.map(|used| (module.clone(), used)));
     }
@@ -268,12 +292,19 @@ fn server_faults(sources: &[(String, String)]) -> Vec<String> {
     loop {
         let before = left.len();
         let users: Vec<Vec<String>> = left.iter().map(|(user, _)| user.clone()).collect();
-        left.retain(|(_, used)| users.iter().any(|user| user.starts_with(used) || used.starts_with(user)));
+        left.retain(|(_, used)| {
+            users
+                .iter()
+                .any(|user| user.starts_with(used) || used.starts_with(user))
+        });
         if left.len() == before {
             break;
         }
     }
-    faults.extend(left.iter().map(|(user, used)| format!("a circle goes through {} and {}", user.join("/"), used.join("/"))));
+    faults.extend(
+        left.iter()
+            .map(|(user, used)| format!("a circle goes through {} and {}", user.join("/"), used.join("/"))),
+    );
     faults
 }
 
@@ -298,9 +329,18 @@ fn a_use_against_the_order_or_in_a_circle_is_found() {
         ["server/http/extract uses server/state"]
     );
     assert_eq!(
-        with("server/blocking.rs", "use super::{config, routes::{jobs, models::list}};"),
-        ["server/blocking uses server/routes/jobs", "server/blocking uses server/routes/models"]
+        with(
+            "server/blocking.rs",
+            "use super::{config, routes::{jobs, models::list}};"
+        ),
+        [
+            "server/blocking uses server/routes/jobs",
+            "server/blocking uses server/routes/models"
+        ]
     );
     let circle = with("server/http/problem.rs", "use super::keys::Keys;");
-    assert!(circle.iter().any(|fault| fault.contains("http/problem and http/keys")), "{circle:?}");
+    assert!(
+        circle.iter().any(|fault| fault.contains("http/problem and http/keys")),
+        "{circle:?}"
+    );
 }

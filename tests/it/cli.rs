@@ -260,7 +260,10 @@ fn damaged_files_exit_with_1_and_the_cause() {
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
     let (code, text) = run(dir.path(), "inspect static-observer");
     assert!(code == 1 && text.contains("file-000.parquet has the sha256"), "{text}");
-    assert!(text.contains("restore the file or collect the data set again"), "{text}");
+    assert!(
+        text.contains("restore the file or collect the data set again"),
+        "{text}"
+    );
 
     record_hash(
         &dir.path().join("data/datasets/static-observer"),
@@ -468,7 +471,7 @@ fn every_command_finds_what_is_in_the_data_directory() {
         .args(["inspect", "mine"])
         .env("FOREFRAME_DATA_DIR", "d")
         .current_dir(dir.path());
-    assert_eq!(ended(&mut command).0, 0);
+    assert_eq!(exit_of(&mut command).0, 0);
     fs::write(dir.path().join("foreframe.toml"), "data_dir = \"d\"\n").unwrap();
     succeed(dir.path(), "inspect mine");
 }

@@ -113,7 +113,10 @@ fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
     stamp["camera"] = serde_json::json!({"horizontal_fov_rad": 4.0, "tilt_down_rad": 0.0});
     fs::write(&path, stamp.to_string()).unwrap();
     let refused = Dataset::open(&out).unwrap_err().to_string();
-    assert!(refused.contains("the camera model has a field of view of 4 rad"), "{refused}");
+    assert!(
+        refused.contains("the camera model has a field of view of 4 rad"),
+        "{refused}"
+    );
 }
 
 #[test]

@@ -93,7 +93,11 @@ fn a_stopped_and_resumed_run_has_the_same_bits() {
             "{name}: the last checkpoints differ"
         );
         let model = |run: &Path| std::fs::read(run.join("model").join(registry::WEIGHTS_FILE)).unwrap();
-        assert_eq!(model(&resumed), model(&uninterrupted), "{name}: the published weights differ");
+        assert_eq!(
+            model(&resumed),
+            model(&uninterrupted),
+            "{name}: the published weights differ"
+        );
     }
 }
 

@@ -8,13 +8,13 @@ use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use super::{Args, watch_memory};
-use crate::report::{Bounds, Latencies};
+use super::{SaturateArgs, watch_memory};
 use crate::http::{Http, Request};
-use crate::workload::Workload;
-use crate::schedule::Schedule;
 use crate::process_usage::CpuShare;
+use crate::report::{Bounds, Latencies};
+use crate::schedule::Schedule;
 use crate::server::Server;
+use crate::workload::Workload;
 
 /// Numbers of connections tried to find the peak.
 const LEVELS: [usize; 3] = [16, 64, 128];
@@ -30,7 +30,7 @@ struct RequestCounts {
     faults: BTreeMap<String, u64>,
 }
 
-pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[("max_queued_predictions", args.queue)]).await;
     let request = Workload::of(&args.target.model).predict_json();
     let mut peak_hz: f64 = 0.0;
@@ -81,7 +81,7 @@ async fn closed(connections: usize, server: &Server, request: &Request, time: Du
 }
 
 /// Sends scheduled requests on free connections. Returns also how many found no free connection.
-async fn open(args: &Args, rate_hz: f64, server: &Server, request: &Request) -> (RequestCounts, u64) {
+async fn open(args: &SaturateArgs, rate_hz: f64, server: &Server, request: &Request) -> (RequestCounts, u64) {
     let begin = Instant::now();
     let (until, limit) = (begin + args.time(), args.connections);
     let (due, not_sent) = (Arc::new(Semaphore::new(0)), Arc::new(AtomicU64::new(0)));
@@ -97,10 +97,10 @@ async fn open(args: &Args, rate_hz: f64, server: &Server, request: &Request) -> 
             counts
         });
     }
-    let (of_pace, count) = (Arc::clone(&due), Arc::clone(&not_sent));
+    let (permits, count) = (Arc::clone(&due), Arc::clone(&not_sent));
     Schedule::lasting(begin, rate_hz, args.time()).start(move |_| {
-        if of_pace.available_permits() < limit {
-            of_pace.add_permits(1);
+        if permits.available_permits() < limit {
+            permits.add_permits(1);
         } else {
             count.fetch_add(1, Ordering::Relaxed);
         }

@@ -6,12 +6,12 @@ use std::time::Duration;
 use foreframe::server::protocol::OnLate;
 use tokio_tungstenite::tungstenite::Error;
 
-use super::{Args, watch_memory};
+use super::{SaturateArgs, watch_memory};
 use crate::report::Bounds;
-use crate::robots::{SendMode, RobotLoad};
-use crate::workload::Workload;
+use crate::robots::{RobotLoad, SendMode};
 use crate::server::Server;
 use crate::session;
+use crate::workload::Workload;
 
 const WARM_UP: Duration = Duration::from_millis(500);
 /// Frames that each robot is ahead of its answers when the peak is measured.
@@ -19,7 +19,7 @@ const AHEAD: usize = 2;
 /// Period of the attempts to open a stream over the limit.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
-pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     let settings = [("max_streams", args.sessions), ("max_queued_predictions", args.queue)];
     let mut server = Server::start(&args.target, &settings).await;
     let workload = Arc::new(Workload::of(&args.target.model));
@@ -50,7 +50,8 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
         measured: args.time(),
     };
     let memory = tokio::spawn(watch_memory(server.process.clone(), args.time()));
-    let (result, (refused_streams, unexpected)) = tokio::join!(load.run(&server, &workload), open_over_limit(args, &server));
+    let (result, (refused_streams, unexpected)) =
+        tokio::join!(load.run(&server, &workload), open_over_limit(args, &server));
     let (goodput_hz, counts) = (result.goodput_hz(), &result.counts);
     println!(
         "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s, {:.0} µs each; of {} frames {} \
@@ -85,7 +86,7 @@ pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
 
 /// Tries to open streams while the limit is reached. Returns how many were refused with `Retry-After`, and how many had
 /// another outcome.
-async fn open_over_limit(args: &Args, server: &Server) -> (u64, u64) {
+async fn open_over_limit(args: &SaturateArgs, server: &Server) -> (u64, u64) {
     let path = format!("/v1/models/{}/stream", args.target.model);
     let (mut refused, mut unexpected) = (0, 0);
     // At this time all streams are open, and none has closed yet.

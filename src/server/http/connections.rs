@@ -61,7 +61,12 @@ impl Connections {
 ///
 /// `hyper_util`'s `GracefulShutdown` does not serve here: it does not support upgrades of HTTP/1 connections, and it
 /// closes an idle connection before it reads a request that has already arrived.
-async fn answer(connection: BoundedConnection, http: http1::Builder, router: Router, mut stopping: watch::Receiver<bool>) {
+async fn answer(
+    connection: BoundedConnection,
+    http: http1::Builder,
+    router: Router,
+    mut stopping: watch::Receiver<bool>,
+) {
     let service = TowerToHyperService::new(router);
     let mut connection = pin!(http.serve_connection(TokioIo::new(connection), service).with_upgrades());
     let result = tokio::select! {

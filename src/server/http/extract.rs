@@ -5,8 +5,8 @@ use std::marker::PhantomData;
 use axum::extract::path::ErrorKind;
 use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection};
 use axum::extract::{FromRequest, FromRequestParts, Request};
-use axum::http::{StatusCode, header};
 use axum::http::request::Parts;
+use axum::http::{StatusCode, header};
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
@@ -141,9 +141,9 @@ impl From<PathRejection> for ApiError {
     fn from(rejection: PathRejection) -> Self {
         let detail = match &rejection {
             PathRejection::FailedToDeserializePathParams(error) => match error.kind() {
-                ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } => Some(format!(
-                    "\"{value}\" in the path is not a whole number, or too large"
-                )),
+                ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } => {
+                    Some(format!("\"{value}\" in the path is not a whole number, or too large"))
+                }
                 _ => None,
             },
             _ => None,

@@ -9,6 +9,7 @@ use utoipa_axum::routes;
 
 use super::picture::PictureError;
 use crate::dataset::{self, Dataset, DatasetError, DatasetInfo};
+use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::jobs::{JobError, datasets};
@@ -17,7 +18,6 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::types::Channel;
-use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -100,10 +100,7 @@ impl DatasetDescription {
     get, path = "/v1/datasets", tag = "datasets", params(Page),
     responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
 )]
-async fn list(
-    State(app): State<App>,
-    Query(page): Query<Page>,
-) -> Result<axum::Json<DatasetList>, ApiError> {
+async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
     let names = datasets::names(app.store().objects()).await?;
     let (names, next) = page.of(names, |name| name)?;
     let mut datasets = Vec::new();
@@ -120,10 +117,7 @@ async fn list(
     params(("dataset" = String, Path, description = "The data set's name")),
     responses((status = 200, body = DatasetDescription), (status = 404, description = "No such data set", body = Problem))
 )]
-async fn get(
-    State(app): State<App>,
-    Path(name): Path<String>,
-) -> Result<axum::Json<DatasetDescription>, ApiError> {
+async fn get(State(app): State<App>, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
     describe(&app, &name).await.map(axum::Json)
 }
 

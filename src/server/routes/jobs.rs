@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
 use utoipa_axum::routes;
 
+use crate::error_text::with_causes;
 use crate::jobs::pipeline::report_key;
 use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::store::{LogRow, LossRow};
-use crate::error_text::with_causes;
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
@@ -143,17 +143,13 @@ impl From<LossRow> for CurvePoint {
         (status = 503, description = "Too many jobs wait", body = Problem),
     )
 )]
-async fn create(
-    State(app): State<App>,
-    headers: HeaderMap,
-    Json(spec): Json<JobSpec>,
-) -> Result<Response, ApiError> {
+async fn create(State(app): State<App>, headers: HeaderMap, Json(spec): Json<JobSpec>) -> Result<Response, ApiError> {
     let key = headers
         .get("idempotency-key")
         .map(|key| key.to_str().map(str::to_owned));
-    let key = key
-        .transpose()
-        .map_err(|_| ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned()))?;
+    let key = key.transpose().map_err(|_| {
+        ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned())
+    })?;
     Ok(accepted(app.jobs().submit(spec, key).await?))
 }
 
@@ -165,10 +161,7 @@ async fn create(
         (status = 422, description = "No such kind or state", body = Problem),
     )
 )]
-async fn list(
-    State(app): State<App>,
-    Query(query): Query<ListQuery>,
-) -> Result<axum::Json<JobList>, ApiError> {
+async fn list(State(app): State<App>, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
     let limit = page(query.limit, DEFAULT_LIMIT)?;
     let filter = JobFilter {
         kind: query.kind,
@@ -246,10 +239,7 @@ async fn logs(
     params(("id" = String, Path, description = "The job's id")),
     responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
 )]
-async fn metrics(
-    State(app): State<App>,
-    Path(id): Path<String>,
-) -> Result<axum::Json<LossCurves>, ApiError> {
+async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
     let points = app.jobs().losses(&id).await?;
     Ok(axum::Json(LossCurves {
         points: points.into_iter().map(CurvePoint::from).collect(),
@@ -268,10 +258,7 @@ async fn metrics(
         (status = 404, description = "No such job or file", body = Problem),
     )
 )]
-async fn file(
-    State(app): State<App>,
-    Path((id, file)): Path<(String, String)>,
-) -> Result<impl IntoResponse, ApiError> {
+async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) -> Result<impl IntoResponse, ApiError> {
     let job = app.jobs().get(&id).await?;
     let files = job.result.as_ref().and_then(|result| result["files"].as_array());
     // Only a name from the job's own list becomes part of a path.

@@ -6,6 +6,7 @@ use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use crate::error_text::with_causes;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::blocking::run_to_completion;
@@ -14,7 +15,6 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::versions::VersionError;
-use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -137,10 +137,7 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
         (status = 404, description = "No such model; the answer lists the models", body = Problem),
     )
 )]
-async fn get(
-    State(app): State<App>,
-    Path(model): Path<String>,
-) -> Result<axum::Json<ModelDescription>, ApiError> {
+async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let versions = app.versions().of(&model).await?;
     Ok(axum::Json(ModelDescription::new(&manifest, versions)))
@@ -164,7 +161,8 @@ async fn activate(
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
     let (switched, name) = (app.clone(), model.clone());
-    run_to_completion(async move { switched.versions().activate(switched.predictor(), &name, version).await }).await??;
+    run_to_completion(async move { switched.versions().activate(switched.predictor(), &name, version).await })
+        .await??;
     get(State(app), Path(model)).await
 }
 
@@ -181,10 +179,7 @@ async fn activate(
         (status = 409, description = "It is active, or was not published by a job", body = Problem),
     )
 )]
-async fn delete(
-    State(app): State<App>,
-    Path((model, version)): Path<(String, u32)>,
-) -> Result<StatusCode, ApiError> {
+async fn delete(State(app): State<App>, Path((model, version)): Path<(String, u32)>) -> Result<StatusCode, ApiError> {
     run_to_completion(async move { app.versions().delete(app.predictor(), &model, version).await }).await??;
     Ok(StatusCode::NO_CONTENT)
 }

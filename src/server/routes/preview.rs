@@ -41,8 +41,7 @@ const TRIAL: u64 = 1;
 async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Response, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let simulated = app.blocking().run(move || simulate(&manifest)).await?;
-    let (input, truth) = simulated
-        .map_err(|error| ApiError::Unprocessable(error.to_string()))?;
+    let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
     let predicted = app.predictor().predict(&model, input).await?.frames;
     let draw = move || picture::png(prediction_sheet(&seen, &predicted, &truth));

@@ -156,7 +156,12 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let task = state.futures(conditioning(request.candidates, robot_state, &model.manifest, app.config())?);
+    let task = state.rollout_task(conditioning(
+        request.candidates,
+        robot_state,
+        &model.manifest,
+        app.config(),
+    )?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &model, &[], &computed);
     app.blocking().run(encode).await?
@@ -168,7 +173,7 @@ impl RolloutRequest {
         let seen = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, seen.len())?;
         let conditioning = conditioning(self.candidates, state, manifest, config)?;
-        let task = Task::futures(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
+        let task = Task::rollout(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
     }
 }

@@ -39,10 +39,7 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         (status = 503, description = "Too many sessions", body = Problem),
     )
 )]
-async fn create(
-    State(app): State<App>,
-    Json(request): Json<CreateSession>,
-) -> Result<impl IntoResponse, ApiError> {
+async fn create(State(app): State<App>, Json(request): Json<CreateSession>) -> Result<impl IntoResponse, ApiError> {
     let (model, state, settings) = request.resolve(&app)?;
     let now = Instant::now();
     let created = Session::new(model, state, settings, now);
@@ -62,10 +59,7 @@ async fn create(
     get, path = "/v1/sessions", tag = "sessions", params(Page),
     responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range", body = Problem))
 )]
-async fn list(
-    State(app): State<App>,
-    Query(page): Query<Page>,
-) -> Result<axum::Json<SessionList>, ApiError> {
+async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
     let now = Instant::now();
     let found = app.sessions().page(&page.after, page.limit()? + 1, now);
     let (found, next) = page.of(found, |session| session.id())?;
@@ -87,10 +81,7 @@ async fn list(
         (status = 410, description = "It has expired", body = Problem),
     )
 )]
-async fn get(
-    State(app): State<App>,
-    Path(id): Path<String>,
-) -> Result<axum::Json<SessionDescription>, ApiError> {
+async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<SessionDescription>, ApiError> {
     let now = Instant::now();
     let session = app.sessions().get(&id, now)?;
     Ok(axum::Json(SessionDescription::of(

@@ -77,7 +77,12 @@ async fn model_stream(
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
-    let session = Session::new(model, SessionState::default(), SessionSettings::default(), Instant::now());
+    let session = Session::new(
+        model,
+        SessionState::default(),
+        SessionSettings::default(),
+        Instant::now(),
+    );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
     open(&app, Arc::new(session), false, upgrade)
 }

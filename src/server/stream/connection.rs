@@ -79,7 +79,12 @@ pub(in crate::server) struct StreamConnection {
 
 impl StreamConnection {
     /// Takes over the session from the connection before. `is_persistent`: the session outlives the stream.
-    pub(in crate::server) fn new(services: StreamServices, session: &Arc<Session>, is_persistent: bool, codec: Codec) -> Self {
+    pub(in crate::server) fn new(
+        services: StreamServices,
+        session: &Arc<Session>,
+        is_persistent: bool,
+        codec: Codec,
+    ) -> Self {
         let outbox = Outbox::new(services.config.max_stream_buffer_bytes);
         let ownership = session.connect();
         let model = &session.model().manifest.name;

@@ -94,7 +94,12 @@ impl SessionTable {
     }
 
     /// The session, if the token is right; counts as use. Errors: `Unknown`, `Expired`, `Token`.
-    pub(in crate::server) fn open(&self, id: &str, token: &str, now: Instant) -> Result<Arc<Session>, SessionTableError> {
+    pub(in crate::server) fn open(
+        &self,
+        id: &str,
+        token: &str,
+        now: Instant,
+    ) -> Result<Arc<Session>, SessionTableError> {
         let session = self.get(id, now)?;
         if session.token_hash != TokenHash::of(token) {
             return Err(SessionTableError::Token);

@@ -69,7 +69,10 @@ impl Codec {
 
     /// The message on the wire.
     #[must_use]
-    #[expect(clippy::expect_used, reason = "every message type is valid in both formats; the tests encode each")]
+    #[expect(
+        clippy::expect_used,
+        reason = "every message type is valid in both formats; the tests encode each"
+    )]
     pub fn encode<T: Serialize>(self, message: &T) -> Message {
         match self {
             Self::Json => {

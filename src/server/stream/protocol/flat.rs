@@ -115,7 +115,10 @@ impl AnyMessage {
             ("on_late", self.on_late.is_some()),
             ("fit", self.fit.is_some()),
         ];
-        fields.into_iter().find(|(_, is_unused)| *is_unused).map(|(name, _)| name)
+        fields
+            .into_iter()
+            .find(|(_, is_unused)| *is_unused)
+            .map(|(name, _)| name)
     }
 }
 
