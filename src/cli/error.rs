@@ -116,7 +116,7 @@ impl UsageError for TrainError {
             | Self::Config(_)
             | Self::NotARun(_)
             | Self::OtherRun { .. }
-            | Self::NoValidation { .. } => true,
+            | Self::NoWindows { .. } => true,
             Self::Dataset(error) => error.is_usage(),
             Self::Registry(error) => error.is_usage(),
             // The network's sizes come from the settings.

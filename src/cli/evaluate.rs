@@ -6,14 +6,15 @@ use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, print_line, progress::ProgressLine};
-use crate::evaluation::{self, EvaluateConfig, EvaluationStage};
+use crate::evaluation::{self, EvaluateConfig, Purpose};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
-/// Measure a model on trials that it was not trained on, and write a report with figures and a GIF.
+/// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///
-/// There are two test sets: trials that training never saw, and start/goal pairs and controller gains that it never saw. The
-/// skill is 1 − MSE / MSE of the best simple baseline: 1 is perfect, 0 is no better than the baseline.
+/// There are three test sets: trials, start/goal pairs and controller gains that training never saw. The skill is 1 − MSE / MSE
+/// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. To choose between models or settings, use `--split
+/// validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe evaluate --model paper --dataset static-observer
@@ -29,10 +30,14 @@ pub(super) struct EvaluateArgs {
     /// A new directory for report.md, report.json and the figures [default: reports/MODEL]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// The same model trained without actions or state, to measure what those inputs are worth
+    /// A model of the same training budget that lacks the action, the state or both, for the table that shows what each
+    /// input is worth; may be given several times
     #[arg(long, value_name = "MODEL")]
-    twin: Option<String>,
-    /// At most so many windows of each test set, spread evenly over its trials
+    twin: Vec<String>,
+    /// What to score: the validation split, or the test sets
+    #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
+    split: SplitChoice,
+    /// Windows of each set at most, spread evenly over its trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
     /// Bootstrap resamples of the trials, for the intervals
@@ -41,21 +46,30 @@ pub(super) struct EvaluateArgs {
     /// The seed of the resamples and of the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write the scores into the model's manifest too
+    /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
     record: bool,
     #[command(flatten)]
     settings: CommonArgs,
 }
 
+/// What to score.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum SplitChoice {
+    /// The validation split, to choose between models or settings
+    Validation,
+    /// The test sets, for the final numbers
+    Test,
+}
+
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (model_dir, loaded) = workspace.load_model(&args.model)?;
-    let twin = args
+    let twins = args
         .twin
-        .as_deref()
-        .map(|twin| workspace.load_model(twin))
-        .transpose()?;
+        .iter()
+        .map(|twin| Ok(workspace.load_model(twin)?.1))
+        .collect::<Result<Vec<LoadedModel>, CliError>>()?;
     let out = args
         .out
         .clone()
@@ -64,28 +78,34 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let (_, dataset) = workspace.open_dataset(&dataset)?;
     let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
+        purpose: match args.split {
+            SplitChoice::Validation => Purpose::Validation,
+            SplitChoice::Test => Purpose::Test,
+        },
         max_windows: args.windows,
         bootstrap_samples: args.resamples,
         seed: Seed(args.seed),
-        twin: twin.as_ref().map(|(_, twin)| twin),
+        twins: twins.iter().collect(),
         command: command_line(),
         ..EvaluateConfig::default()
     };
     let progress = ProgressLine::new("windows");
     progress.label("evaluating");
     let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
-        let what = match now.stage {
-            EvaluationStage::Scores => "scores",
-            EvaluationStage::Actions => "actions",
-        };
-        progress.update(now.done as u64, now.total as u64, || format!("{} {what}", now.split));
+        let stage = now.stage.name();
+        progress.update(now.done as u64, now.total as u64, || format!("{} {stage}", now.split));
     })?;
     progress.finish();
     let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
     evaluation::write(output.path(), &mut report, &inputs)?;
     output.finish()?;
     if args.record {
-        registry::record_metrics(&model_dir, report.headline())?;
+        let mut scores = report.headline();
+        if config.purpose == Purpose::Test {
+            // Earlier versions scored unseen pairs and gains as one set.
+            scores["test-unseen"] = serde_json::Value::Null;
+        }
+        registry::record_metrics(&model_dir, scores)?;
     }
     for (split, score) in report.headline().as_object().into_iter().flatten() {
         print_line(format!("{split}: {score}"))?;

@@ -6,15 +6,13 @@ use std::path::PathBuf;
 use clap::value_parser;
 use serde_json::json;
 
-use super::output::{OutputDirectory, enlarged};
+use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
 use crate::dataset::{Dataset, Episode};
+use crate::evaluation::figures::montage;
 use crate::frame::{Frame, codec};
-
-/// The least width of the GIF, in pixels.
-const GIF_WIDTH_PX: u32 = 256;
 
 /// Write an episode's frames as PNG, its actions and states as JSON, and a GIF to look at.
 ///
@@ -90,7 +88,7 @@ fn write(output: &OutputDirectory, dataset: &Dataset, range: Range<usize>) -> Re
         let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels).map_err(CliError::failed)?;
         let png = codec::encode_png(&frame).map_err(CliError::failed)?;
         output.write(&format!("frame-{index:03}.png"), &png)?;
-        large.push(enlarged(&frame, GIF_WIDTH_PX)?);
+        large.push(montage::enlarged(&frame).map_err(CliError::failed)?);
     }
     let delay_ms = (info.frame_period_s * 1000.0).round() as u32;
     let gif = codec::encode_gif(&large, delay_ms).map_err(CliError::failed)?;

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 
 use super::CliError;
 use crate::files::write_atomically;
-use crate::frame::Frame;
 
 /// The beginning of the name of the directory in which the files are written first.
 const PARTIAL: &str = ".partial-";
@@ -85,21 +84,6 @@ fn is_empty(path: &Path) -> std::io::Result<bool> {
     Ok(true)
 }
 
-/// The frame with every pixel as a square, so that it is at least `width_px` wide.
-pub(super) fn enlarged(frame: &Frame, width_px: u32) -> Result<Frame, CliError> {
-    let scale = width_px.div_ceil(frame.width()).max(1) as usize;
-    let mut pixels = Vec::with_capacity(frame.pixels().len() * scale * scale);
-    for row in frame.pixels().chunks(frame.width() as usize) {
-        let wide: Vec<u8> = row
-            .iter()
-            .flat_map(|&pixel| std::iter::repeat_n(pixel, scale))
-            .collect();
-        pixels.extend(std::iter::repeat_n(wide, scale).flatten());
-    }
-    let scale = scale as u32;
-    Frame::new(frame.width() * scale, frame.height() * scale, pixels).map_err(CliError::failed)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -120,13 +104,5 @@ mod tests {
         assert!(output.finish().is_ok());
         assert_eq!(fs::read(target.join("a")).unwrap(), b"1");
         assert!(OutputDirectory::create(&target).is_err());
-    }
-
-    #[test]
-    fn an_enlarged_frame_repeats_every_pixel() {
-        let frame = Frame::new(2, 1, vec![1, 2]).unwrap();
-        let large = enlarged(&frame, 3).unwrap_or_else(|error| panic!("{}", error.report().0));
-        assert_eq!((large.width(), large.height()), (4, 2));
-        assert_eq!(large.pixels(), [1, 1, 2, 2, 1, 1, 2, 2]);
     }
 }

@@ -7,22 +7,17 @@ use std::path::PathBuf;
 
 use self::actions::ActionsFile;
 use self::images::ImageFiles;
-use super::output::{OutputDirectory, enlarged};
+use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
 use crate::error_text;
 use crate::evaluation::figures::montage;
 use crate::frame::fit::Fit;
-use crate::frame::{Frame, MAX_SIDE_PX, codec};
+use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
-
-/// The least width of the GIF, in pixels.
-const GIF_WIDTH_PX: u32 = 256;
-/// The room that a column of the contact sheet takes at most, beside a frame that is wider than this.
-const COLUMN_PX: u32 = 208;
 
 /// Predict the frames that follow the images in a directory.
 ///
@@ -146,10 +141,8 @@ fn write(output: &OutputDirectory, spec: &ModelSpec, selected: &Selected, predic
         output.write(&format!("predicted-{}.png", index + 1), &png(frame)?)?;
     }
     output.write("contact-sheet.png", &png(&contact_sheet(selected, predicted)?)?)?;
-    let film = selected.seen.iter().chain(predicted);
-    let film: Vec<Frame> = film
-        .map(|frame| enlarged(frame, GIF_WIDTH_PX))
-        .collect::<Result<_, _>>()?;
+    let film = selected.seen.iter().chain(predicted).map(montage::enlarged);
+    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
     let delay_ms = (spec.frame_period_s * 1000.0).round() as u32;
     output.write(
         "prediction.gif",
@@ -159,11 +152,15 @@ fn write(output: &OutputDirectory, spec: &ModelSpec, selected: &Selected, predic
 
 /// The frames next to the last one seen, as many on each side as fit into an image.
 fn contact_sheet(selected: &Selected, predicted: &[Frame]) -> Result<Frame, CliError> {
-    let width_px = predicted.first().map_or(1, Frame::width);
-    let columns = (MAX_SIDE_PX / width_px.saturating_add(16).max(COLUMN_PX)).max(1) as usize;
-    let seen = &selected.seen[selected.seen.len().saturating_sub(columns)..];
-    let (predicted, truth) = (first(predicted, columns), first(&selected.truth, columns));
-    montage::prediction_sheet(seen, predicted, truth).map_err(CliError::failed)
+    let mut count = selected.seen.len().max(predicted.len());
+    loop {
+        let seen = &selected.seen[selected.seen.len().saturating_sub(count)..];
+        let sheet = montage::prediction_sheet(seen, first(predicted, count), first(&selected.truth, count));
+        match sheet {
+            Err(FrameError::Size { .. }) if count > 1 => count /= 2,
+            other => return other.map_err(CliError::failed),
+        }
+    }
 }
 
 fn first(frames: &[Frame], count: usize) -> &[Frame] {

@@ -155,7 +155,7 @@ impl<'a> TrainingDisplay<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{remark}"));
             }
-            TrainingEvent::Recalled {
+            TrainingEvent::Restored {
                 stage, validation_loss, ..
             } => self.validated(stage, validation_loss),
             TrainingEvent::Checkpointed { .. } => {}

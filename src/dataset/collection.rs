@@ -14,7 +14,6 @@ use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo, unfinished};
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
-use crate::frame::warp::CameraModel;
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -79,7 +78,7 @@ impl CollectionStatus {
             });
         }
         if out.join(INFO).exists() {
-            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info())));
+            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
         }
         let shards = config.shard_count();
         let complete = (0..shards)
@@ -285,9 +284,7 @@ fn description(config: &CollectConfig) -> DatasetInfo {
         frame_count: 0,
         episode_count: 0,
         has_masks: true,
-        camera: Some(CameraModel {
-            horizontal_fov_rad: config.world.camera.horizontal_fov_rad as f32,
-            tilt_down_rad: config.world.camera.tilt_down_rad as f32,
-        }),
+        camera: Some(config.world.camera.model()),
+        world: Some(config.world.clone()),
     }
 }
