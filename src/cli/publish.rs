@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on};
 use super::{CliError, print_line};
-use crate::registry::{self, MANIFEST_FILE};
+use crate::registry::{self, MANIFEST_FILE, RegistryError};
 
 /// The directory of the model in a run's directory.
 const RUN_MODEL: &str = "model";
@@ -42,6 +42,9 @@ pub(super) fn run(args: &PublishArgs) -> Result<(), CliError> {
         Some(name) => name.clone(),
         None => registry::manifest::read(&model_dir)?.name,
     };
+    if !registry::is_valid_name(&name) {
+        return Err(RegistryError::Name(name).into());
+    }
     let version = block_on(async {
         let versions = workspace.versions().await?;
         Ok(versions.publish(&name, &model_dir, !args.no_activate).await?)

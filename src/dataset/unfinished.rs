@@ -1,5 +1,5 @@
-//! The finished trials of shards that a stopped collection could not finish. They are kept beside the data, one file for
-//! each shard, until the same command continues and writes the whole shard.
+//! The finished trials of shards that a stopped collection could not complete. They are saved beside the data, one file for
+//! each shard, until the same command resumes the collection and writes the complete shard.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ fn path(out: &Path, shard: usize) -> PathBuf {
     out.join(DIRECTORY).join(format!("shard-{shard:06}.parquet"))
 }
 
-/// Keeps the first trials of a shard; `first` is the number of its first trial. Errors: `Io`.
+/// Saves the first trials of a shard; `first` is the number of its first trial. Errors: `Io`.
 pub(super) fn save(
     info: &DatasetInfo,
     out: &Path,
@@ -30,12 +30,12 @@ pub(super) fn save(
     files::write_atomically(&path(out, shard), &build(info, start, episodes)?.bytes)
 }
 
-/// The first trials of a shard that were kept; none if the file is missing or damaged, and then they are simulated again.
+/// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
 pub(super) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedEpisode> {
     read(info, &path(out, shard)).unwrap_or_default()
 }
 
-/// How many trials of a shard were kept.
+/// How many trials of a shard are saved.
 pub(super) fn count(out: &Path, shard: usize) -> usize {
     let path = path(out, shard);
     if path.is_file() {
@@ -45,7 +45,7 @@ pub(super) fn count(out: &Path, shard: usize) -> usize {
     }
 }
 
-/// Deletes the kept trials of every shard; called when all shards are whole. Errors: `Io`.
+/// Deletes the saved trials of all shards, after every shard is complete. Errors: `Io`.
 pub(super) fn remove_all(out: &Path) -> Result<(), DatasetError> {
     let dir = out.join(DIRECTORY);
     match fs::remove_dir_all(&dir) {
