@@ -7,6 +7,7 @@ mod error;
 mod evaluate;
 mod export;
 mod healthcheck;
+mod import;
 mod inspect;
 mod interrupt;
 mod keys;
@@ -15,6 +16,7 @@ mod output;
 mod predict;
 mod progress;
 mod publish;
+mod run_job;
 mod serve;
 mod settings;
 mod train;
@@ -48,6 +50,8 @@ struct Cli {
 enum Command {
     /// Simulate trials and store their frames, actions and states as a data set
     Collect(collect::CollectArgs),
+    /// Turn a recording of a real robot into a data set
+    Import(import::ImportArgs),
     /// Train a model on a data set
     Train(train::TrainArgs),
     /// Measure a model on trials that it was not trained on
@@ -68,6 +72,9 @@ enum Command {
     Healthcheck(healthcheck::HealthcheckArgs),
     /// Run jobs without serving
     Worker(worker::WorkerArgs),
+    /// Run one job for a server or worker, which starts this command
+    #[command(hide = true)]
+    RunJob,
     /// Describe a model or a data set
     Inspect(inspect::InspectArgs),
     /// Write an episode's frames as PNG, its actions as JSON, and a GIF
@@ -89,6 +96,7 @@ pub fn main() -> ExitCode {
 fn run(command: Option<Command>) -> Result<(), CliError> {
     match command.unwrap_or_else(|| Command::Serve(serve::ServeArgs::default())) {
         Command::Collect(args) => collect::run(&args),
+        Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),
@@ -99,6 +107,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::RunJob => run_job::run(),
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }
@@ -145,6 +154,10 @@ mod tests {
         command.build();
         for (name, text) in help_texts(&mut command) {
             // A setting of the environment may stand before the command, and a comment or a redirection behind it.
+            if name == "run-job" {
+                // Only servers and workers start it.
+                continue;
+            }
             let start = |line: &str| {
                 line.trim_start()
                     .trim_start_matches("FOREFRAME_MAX_STREAMS=8 ")

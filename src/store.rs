@@ -10,10 +10,12 @@ pub mod reports;
 
 use std::path::{Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
+
 use self::database::Database;
 pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
-pub use self::models::VersionRow;
+pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
 
@@ -82,7 +84,7 @@ impl StoreError {
 }
 
 /// Where state is kept.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StoreConfig {
     /// The data directory. It holds the database file and the objects, unless they are configured elsewhere.
     pub data_dir: PathBuf,
@@ -121,6 +123,11 @@ impl Store {
             database,
             objects: Objects::open(data_dir, config.objects.as_deref())?,
         })
+    }
+
+    /// Opens a store that another process of this version has opened before. Errors: as [`Store::open`].
+    pub async fn open_existing(config: &StoreConfig) -> Result<Self, StoreError> {
+        Self::open(config).await
     }
 
     /// The files.

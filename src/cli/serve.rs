@@ -29,7 +29,8 @@ pub(super) struct ServeArgs {
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let config = with_checked_directories(args.settings.load()?)?;
+    let mut config = with_checked_directories(args.settings.load()?)?;
+    config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -1,6 +1,5 @@
 //! `foreframe worker`
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tracing::info;
@@ -8,8 +7,8 @@ use tracing::info;
 use super::settings::{CommonArgs, open_store, with_checked_directories};
 use super::{CliError, print_line};
 use crate::config::Config;
-use crate::jobs::Jobs;
 use crate::jobs::pipeline::Pipeline;
+use crate::jobs::{Jobs, child};
 use crate::server;
 use crate::telemetry;
 use crate::versions::Versions;
@@ -27,7 +26,8 @@ pub(super) struct WorkerArgs {
 }
 
 pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
-    let config = with_checked_directories(args.settings.load()?)?;
+    let mut config = with_checked_directories(args.settings.load()?)?;
+    config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
@@ -40,8 +40,9 @@ async fn work(config: &Config) -> Result<(), CliError> {
     let server = &config.server;
     let store = open_store(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
-    let pipeline = Pipeline::new(store.clone(), versions, server.job_threads);
-    let jobs = Jobs::start(store, server.jobs(), Arc::new(pipeline), true).map_err(CliError::failed)?;
+    let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory_limit(server.job_memory_mb);
+    let executor = child::executor(pipeline, server.job_process());
+    let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
     print_line("Foreframe runs jobs — Ctrl-C stops it")?;
     server::shutdown::requested().await;
     info!("stopping");

@@ -20,7 +20,14 @@ const MAX_CONNECTIONS: u32 = 8;
 /// How long a statement waits for a connection or, on SQLite, for another writer.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 
-const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "initial", include_str!("migrations/0001_initial.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "initial", include_str!("migrations/0001_initial.sql")),
+    (
+        2,
+        "attempts and metrics",
+        include_str!("migrations/0002_attempts_and_metrics.sql"),
+    ),
+];
 
 /// A parameter of a statement: `$1`, `$2`, …
 #[derive(Clone, Debug)]

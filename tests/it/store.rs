@@ -75,6 +75,8 @@ fn outcome(state: &'static str) -> JobOutcome {
         outcome: Some("{}".to_owned()),
         ended_s: Some(9.0),
         published: None,
+        measured: None,
+        crashed: false,
     }
 }
 
@@ -89,6 +91,7 @@ fn report(line: &str) -> JobReport {
             validation: None,
         }],
         max_lines: 3,
+        checkpoint: 0,
     }
 }
 
