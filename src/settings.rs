@@ -85,12 +85,10 @@ impl SettingsLayer {
 
     /// One value, for example of the flag `--bind`. Dots in the key separate tables, as in `fit.steps`.
     #[must_use]
-    #[expect(clippy::expect_used, reason = "a key has at least one part, so the value is in a table")]
     pub fn value(origin: impl Into<String>, key: &str, value: impl Into<Value>) -> Self {
-        let nested = nest(key, value.into()).into_dict();
         Self {
             origin: origin.into(),
-            values: nested.expect("a key that gives no table is a bug"),
+            values: table(nest(key, value.into()).into_dict()),
         }
     }
 
@@ -136,14 +134,12 @@ impl SettingsLayer {
         Self::toml(path.display().to_string(), &text)
     }
 
-    /// The fields of a structure or table. Panics if they are neither.
+    /// The fields of a structure or table.
     #[must_use]
-    #[expect(clippy::expect_used, reason = "structures and TOML tables always serialize to a table")]
     pub fn serialized(origin: impl Into<String>, fields: &impl Serialize) -> Self {
-        let values = Value::serialize(fields).ok().and_then(Value::into_dict);
         Self {
             origin: origin.into(),
-            values: values.expect("settings that are not a table are a bug"),
+            values: table(Value::serialize(fields).ok().and_then(Value::into_dict)),
         }
     }
 
@@ -158,6 +154,11 @@ impl SettingsLayer {
     pub fn keys(&self) -> impl Iterator<Item = &String> {
         self.values.keys()
     }
+}
+
+#[expect(clippy::expect_used, reason = "keys, structures and TOML tables always give a table")]
+fn table(values: Option<Dict>) -> Dict {
+    values.expect("settings that are not a table are a bug")
 }
 
 /// A single TOML value.
