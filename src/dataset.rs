@@ -18,6 +18,7 @@ mod shard_reader;
 mod stats;
 mod store;
 mod tables;
+mod unfinished;
 
 use std::ops::Range;
 

@@ -7,6 +7,8 @@ pub mod types;
 
 pub mod files;
 
+pub mod settings;
+
 pub mod error_text;
 pub mod telemetry;
 

@@ -1,13 +1,13 @@
 //! Trained models on disk. Each model has a directory with `model.safetensors` (weights, f16) and `manifest.json`
-//! (description and origin). [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds
-//! and publishes models.
+//! (description and origin). In a directory of models, the name of a model's directory is its name, whatever the manifest
+//! says. [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds and publishes models.
 
 pub mod loader;
 pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
-pub use self::loader::{LoadedModel, load};
+pub use self::loader::{LoadedModel, load, load_as};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::error_text::existing;
 use crate::files::{sha256_hex, write_atomically};
@@ -95,24 +95,40 @@ pub fn is_valid_name(name: &str) -> bool {
 /// Names and directories of the models in a directory, sorted by name. A missing directory contains none. Errors: `Io` if
 /// the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
+    let named = directories(models_dir)?.into_iter().map(|path| (directory_name(&path), path));
+    let mut models: Vec<_> = named
+        .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
+        .collect();
+    models.sort();
+    Ok(models)
+}
+
+/// The directories that hold a model but have no valid name, sorted: [`list`] leaves them out. Errors: `Io`.
+pub fn misnamed(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    let mut paths = directories(models_dir)?;
+    paths.retain(|path| !is_valid_name(&directory_name(path)) && path.join(MANIFEST_FILE).is_file());
+    paths.sort();
+    Ok(paths)
+}
+
+/// Everything in a directory; an absent one holds nothing. Errors: `Io`.
+fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
     if !models_dir.exists() {
         return Ok(Vec::new());
     }
-    let list_failed = |source| RegistryError::Io {
+    let entries = std::fs::read_dir(models_dir).and_then(|entries| {
+        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+        paths.collect::<Result<Vec<_>, _>>()
+    });
+    entries.map_err(|source| RegistryError::Io {
         action: "list",
         path: models_dir.to_owned(),
         source,
-    };
-    let mut models = Vec::new();
-    for entry in std::fs::read_dir(models_dir).map_err(list_failed)? {
-        let entry = entry.map_err(list_failed)?;
-        let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
-        if is_valid_name(&name) && path.join(MANIFEST_FILE).is_file() {
-            models.push((name, path));
-        }
-    }
-    models.sort();
-    Ok(models)
+    })
+}
+
+fn directory_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// The directory of the model with this name. Errors: `Name`, `Unknown` with the existing names.
@@ -132,17 +148,17 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     })
 }
 
-/// The directory of a model that the user gave as a path or as a name below `models_dir`. A path is tried first.
-/// Errors: those of [`find`], `NotAModel`.
-pub fn locate(models_dir: &Path, what: &str) -> Result<PathBuf, RegistryError> {
-    let given = Path::new(what);
-    if given.join(MANIFEST_FILE).is_file() {
-        return Ok(given.to_owned());
+/// The directory of a model that the user gave as a path; none if the text can only be a name. Errors: `NotAModel` for a
+/// path without a model.
+pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
+    let path = Path::new(model);
+    if path.join(MANIFEST_FILE).is_file() {
+        return Ok(Some(path.to_owned()));
     }
-    if !is_valid_name(what) && (what.contains('/') || given.exists()) {
-        return Err(RegistryError::NotAModel(given.to_owned()));
+    if !is_valid_name(model) && (model.contains('/') || path.exists()) {
+        return Err(RegistryError::NotAModel(path.to_owned()));
     }
-    find(models_dir, what)
+    Ok(None)
 }
 
 /// Writes the weights (as f16) and then the manifest into `model_dir`. Fills in the weights' hash and returns the manifest.
@@ -233,6 +249,18 @@ mod tests {
             assert!(!is_valid_name(name), "{name:?} was accepted");
         }
         assert!(is_valid_name("moving-2"));
+    }
+
+    #[test]
+    fn a_directory_with_an_invalid_name_is_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["my_model", "paper"] {
+            std::fs::create_dir(dir.path().join(name)).unwrap();
+            std::fs::write(dir.path().join(name).join(MANIFEST_FILE), "{}").unwrap();
+        }
+        std::fs::create_dir(dir.path().join("Pictures")).unwrap();
+        assert_eq!(misnamed(dir.path()).unwrap(), [dir.path().join("my_model")]);
+        assert_eq!(list(dir.path()).unwrap().len(), 1);
     }
 
     #[test]

@@ -122,6 +122,14 @@ pub struct StoreConfig {
     pub objects: Option<String>,
 }
 
+impl StoreConfig {
+    /// Whether there is a store to open: one in the data directory, or one that is named.
+    #[must_use]
+    pub fn exists(&self) -> bool {
+        self.database.is_some() || self.data_dir.join(DATABASE_FILE).is_file()
+    }
+}
+
 /// The open store. Clones share its connections.
 #[derive(Clone)]
 pub struct Store {

@@ -1,6 +1,8 @@
 //! The versions of the models: shipped ones in the models' directory, and those that trainings published, in
 //! `models/NAME/VERSION` below the data directory. The store knows which versions are published and which are active.
 
+mod publish;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -42,7 +44,7 @@ pub enum VersionError {
     },
     /// It is a shipped version.
     #[error(
-        "version {version} of model \"{model}\" was shipped, not published by a job; the server does not delete it"
+        "version {version} of model \"{model}\" was not published: it lies in the models directory; delete its directory there"
     )]
     Shipped {
         /// The model's name.
@@ -150,6 +152,10 @@ impl Versions {
     /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
     pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
         let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
+        for path in registry::misnamed(&self.shipped_dir)? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            warn!(directory = %path.display(), error = %RegistryError::Name(name), "a model is not loaded");
+        }
         let mut serving = Vec::new();
         for (model, mut versions) in self.all().await? {
             if versions.is_empty() {
@@ -174,15 +180,7 @@ impl Versions {
 
     /// Loads the active version, else the shipped one, else the newest. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn load_active(&self, model: &str) -> Result<LoadedModel, VersionError> {
-        let active = self.store.active_versions().await?;
-        let chosen = active
-            .into_iter()
-            .find(|(name, _)| name == model)
-            .map(|(_, version)| version);
-        let version = match chosen.or_else(|| self.shipped(model)) {
-            Some(version) => version,
-            None => self.of(model).await?.last().copied().unwrap_or_default(),
-        };
+        let version = self.active(model).await?.unwrap_or_default();
         self.load(model, version).await
     }
 
@@ -195,7 +193,11 @@ impl Versions {
             version,
             reason,
         };
-        let loaded = tokio::task::spawn_blocking(move || registry::load(&dir)).await;
+        let name = model.to_owned();
+        let is_shipped = self.shipped(model) == Some(version);
+        // The name of a shipped model is that of its directory.
+        let load = move || if is_shipped { registry::load_as(&dir, &name) } else { registry::load(&dir) };
+        let loaded = tokio::task::spawn_blocking(load).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
             .map_err(|error| refused(error_text::with_causes(&error)))?;
@@ -208,7 +210,8 @@ impl Versions {
         Ok(loaded)
     }
 
-    async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
+    /// The directory of a version, fetched into the data directory if it is not there. Errors: `Unknown`, `Store`.
+    pub async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
         let available = self.of(model).await?;
         if !available.contains(&version) {
             return Err(VersionError::Unknown {
@@ -239,6 +242,23 @@ impl Versions {
         let shipped = self.shipped(model);
         let reserved = self.store.reserve_version(lease, model, shipped.unwrap_or(0)).await?;
         let Some(version) = reserved else { return Ok(None) };
+        self.write_files(model, version, trained_dir).await?;
+        Ok(Some((version, shipped.is_none())))
+    }
+
+    /// The version that serves, or else the one that would: the chosen one, the shipped one, the newest.
+    /// Errors: `Registry`, `Store`.
+    pub async fn active(&self, model: &str) -> Result<Option<u32>, VersionError> {
+        let active = self.store.active_versions().await?;
+        let chosen = active.into_iter().find(|(name, _)| name == model);
+        match chosen.map(|(_, version)| version).or_else(|| self.shipped(model)) {
+            Some(version) => Ok(Some(version)),
+            None => Ok(self.of(model).await?.last().copied()),
+        }
+    }
+
+    /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Io`, `Store`.
+    async fn write_files(&self, model: &str, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
         let objects = self.store.objects();
         let dir = objects.data_dir().join(key(model, version));
         let failed = |action, path: &Path| {
@@ -259,8 +279,7 @@ impl Versions {
         };
         registry::write_manifest(&dir, &manifest)?;
         registry::load(&dir)?;
-        objects.push(&key(model, version), registry::MANIFEST_FILE).await?;
-        Ok(Some((version, shipped.is_none())))
+        Ok(objects.push(&key(model, version), registry::MANIFEST_FILE).await?)
     }
 
     /// Makes a version active: here at once, on other servers of the store soon, and after a restart. Open streams keep

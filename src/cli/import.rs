@@ -1,8 +1,10 @@
 //! `foreframe import`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use super::{CliError, DATASETS_DIR, interrupt, progress::ProgressLine, say};
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
 use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
@@ -30,7 +32,7 @@ pub(super) struct ImportArgs {
     /// The data set's name [default: the source's name]
     #[arg(long)]
     name: Option<String>,
-    /// The data set's directory [default: data/datasets/NAME]
+    /// The data set's directory [default: DATA_DIR/datasets/NAME]
     #[arg(long, value_name = "DIR", conflicts_with = "name")]
     out: Option<PathBuf>,
     /// Width and height of the frames in pixels, as in 64x64
@@ -66,6 +68,8 @@ pub(super) struct ImportArgs {
     /// Leave out what is damaged and list it, instead of stopping there
     #[arg(long)]
     skip_bad: bool,
+    #[command(flatten)]
+    settings: CommonArgs,
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {
@@ -74,7 +78,8 @@ fn size(text: &str) -> Result<(u32, u32), String> {
 }
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
-    let out = args.out.clone().unwrap_or_else(|| Path::new(DATASETS_DIR).join(name(&args)));
+    let workspace = Workspace::new(args.settings.start()?);
+    let out = args.out.clone().unwrap_or_else(|| workspace.datasets_dir().join(name(&args)));
     let config = ImportConfig {
         source: args.source,
         out: out.clone(),
@@ -94,7 +99,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         },
     };
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));
-    progress.start("importing", 0, 0);
+    progress.label("importing");
     let imported = import(
         &config,
         &|now| progress.update(now.done, now.total, String::new),
@@ -103,7 +108,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     progress.finish();
     let imported = imported?;
     let info = &imported.info;
-    say(format!(
+    print_line(format!(
         "{}: {} episodes, {} frames of {}×{} px, {:.4} s apart, content {}",
         out.display(),
         info.episode_count,
@@ -114,15 +119,15 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         info.content_hash
     ))?;
     if !imported.skipped.is_empty() {
-        say(format!("left out {} damaged items:", imported.skipped.len()))?;
+        print_line(format!("left out {} damaged items:", imported.skipped.len()))?;
         for item in imported.skipped.iter().take(LISTED_ITEMS) {
-            say(format!("  {}: {}", item.place, item.reason))?;
+            print_line(format!("  {}: {}", item.place, item.reason))?;
         }
         if imported.skipped.len() > LISTED_ITEMS {
-            say(format!("  … all of them are in {}", out.join("meta/skipped.json").display()))?;
+            print_line(format!("  … all of them are in {}", out.join("meta/skipped.json").display()))?;
         }
     }
-    say(format!("next: foreframe train --dataset {}", out.display()))
+    print_line(format!("next: foreframe train --dataset {}", out.display()))
 }
 
 /// The data set's name: the one given, or the source's.

@@ -2,7 +2,9 @@
 
 use super::CliError;
 use crate::jobs::child;
+use crate::telemetry::{self, LogFormat};
 
 pub(super) fn run() -> Result<(), CliError> {
+    let _telemetry = telemetry::init(LogFormat::Text, None)?;
     child::run().map_err(CliError::Failed)
 }

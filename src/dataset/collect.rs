@@ -1,7 +1,8 @@
 //! Simulates trials on several threads and writes them as a data set. Finished shards stay on disk if it is stopped.
 //!
 //! Each thread simulates a complete shard of consecutive trials; the calling thread writes the shards in order, each
-//! atomically. The result depends only on seed and trial number, not on threads or interruptions.
+//! atomically. If the collection is stopped, the finished trials of the other shards are saved beside them. The finished
+//! data set depends only on seed and trial numbers, not on threads or interruptions.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -128,8 +129,11 @@ pub fn collect(
         workers.failed.store(written.is_err(), Ordering::Relaxed);
         written
     });
-    written?;
+    let unwritten = written?;
     if collection.shard_count() < config.shard_count() {
+        for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
+            collection.save_unfinished(*shard, episodes)?;
+        }
         return Err(DatasetError::Cancelled {
             done: collection.trial_count(),
             total: config.trials,
@@ -138,19 +142,26 @@ pub fn collect(
     collection.complete()
 }
 
-/// A shard's number, and its episodes or the error.
+/// A shard's number and its finished episodes (all of them, unless the collection was stopped), or the error.
 type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
 
-/// Writes the shards in order. A shard that arrives early waits for the shards before it.
-fn write_in_order(collection: &mut Collection<'_>, results: Receiver<ShardResult>) -> Result<(), DatasetError> {
-    let mut early = BTreeMap::new();
+/// Writes complete shards in order. A shard that arrives early waits for the shards before it. Returns the episodes that
+/// could not be written: those of incomplete shards, and of shards after an incomplete one.
+fn write_in_order(
+    collection: &mut Collection<'_>,
+    results: Receiver<ShardResult>,
+) -> Result<BTreeMap<usize, Vec<EncodedEpisode>>, DatasetError> {
+    let mut waiting = BTreeMap::new();
     for (shard, episodes) in results {
-        early.insert(shard, episodes?);
-        while let Some(episodes) = early.remove(&collection.shard_count()) {
-            collection.write(&episodes)?;
+        waiting.insert(shard, episodes?);
+        while let Some(entry) = waiting.first_entry()
+            && *entry.key() == collection.shard_count()
+            && collection.is_complete(*entry.key(), entry.get())
+        {
+            collection.write(&entry.remove())?;
         }
     }
-    Ok(())
+    Ok(waiting)
 }
 
 /// State shared by the simulation threads.
@@ -183,29 +194,24 @@ impl CollectWorkers<'_> {
             if shard >= self.config.shard_count() {
                 return;
             }
-            let result = match self.simulate_shard(shard) {
-                Ok(Some(episodes)) => Ok(episodes),
-                Ok(None) => return,
-                Err(error) => Err(error),
-            };
-            if sender.send((shard, result)).is_err() {
+            if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
                 return;
             }
         }
     }
 
-    /// Simulates the trials of a shard; none if the collection was stopped.
-    fn simulate_shard(&self, shard: usize) -> Result<Option<Vec<EncodedEpisode>>, DatasetError> {
-        let mut episodes = Vec::new();
-        for trial in self.config.shard_trials(shard) {
+    /// Simulates the trials of a shard that are not saved yet; stops early if the collection was stopped.
+    fn simulate_shard(&self, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
+        let mut episodes = Collection::saved_episodes(self.config, &self.info, shard);
+        for trial in self.config.shard_trials(shard).skip(episodes.len()) {
             let simulated = self.simulate(trial);
             let Some(data) = simulated.map_err(|source| DatasetError::Simulation { trial, source })? else {
-                return Ok(None);
+                break;
             };
             episodes.push(EncodedEpisode::new(&self.info, trial as usize, data)?);
             self.report(1);
         }
-        Ok(Some(episodes))
+        Ok(episodes)
     }
 
     /// Simulates a trial; none if the collection was stopped.

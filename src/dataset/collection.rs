@@ -12,9 +12,8 @@ use super::layout::{ARGUMENTS, DatasetMetadata, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
-use super::{DatasetError, DatasetInfo};
+use super::{DatasetError, DatasetInfo, unfinished};
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
-use crate::frame::warp::CameraModel;
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -50,9 +49,9 @@ impl Arguments<'_> {
 pub enum CollectionStatus {
     /// Nothing has been written yet.
     New,
-    /// Some shards may be written, but not all.
+    /// Some trials may be saved, but not all.
     Unfinished {
-        /// Trials in finished shards.
+        /// Saved trials.
         trials: u64,
     },
     /// The data set is complete.
@@ -81,9 +80,13 @@ impl CollectionStatus {
         if out.join(INFO).exists() {
             return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
         }
-        let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
-        let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
-        Ok(Self::Unfinished { trials })
+        let shards = config.shard_count();
+        let complete = (0..shards)
+            .take_while(|&shard| out.join(shard_path(shard)).exists())
+            .count();
+        let in_shards: u64 = (0..complete).map(|shard| config.shard_trials(shard).count() as u64).sum();
+        let beside: u64 = (complete..shards).map(|shard| unfinished::count(out, shard) as u64).sum();
+        Ok(Self::Unfinished { trials: in_shards + beside })
     }
 }
 
@@ -200,9 +203,30 @@ impl<'a> Collection<'a> {
         self.shards.len()
     }
 
-    /// Number of trials in finished shards.
+    /// Number of saved trials, including those of unfinished shards.
     pub(super) fn trial_count(&self) -> u64 {
-        self.start.episode as u64
+        let unfinished = (self.shards.len()..self.config.shard_count())
+            .map(|shard| unfinished::count(&self.config.out, shard))
+            .sum::<usize>();
+        (self.start.episode + unfinished) as u64
+    }
+
+    /// The saved trials of an unfinished shard.
+    pub(super) fn saved_episodes(config: &CollectConfig, info: &DatasetInfo, shard: usize) -> Vec<EncodedEpisode> {
+        let mut episodes = unfinished::load(info, &config.out, shard);
+        episodes.truncate(config.shard_trials(shard).count());
+        episodes
+    }
+
+    /// Whether these are all trials of a shard.
+    pub(super) fn is_complete(&self, shard: usize, episodes: &[EncodedEpisode]) -> bool {
+        episodes.len() == self.config.shard_trials(shard).count()
+    }
+
+    /// Saves the finished trials of a shard until a later call completes it. Errors: `Io`.
+    pub(super) fn save_unfinished(&self, shard: usize, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
+        let first = self.config.shard_trials(shard).start;
+        unfinished::save(&self.info, &self.config.out, (shard, first), episodes)
     }
 
     /// The next shard, if it is on disk and complete. A damaged shard is simulated again.
@@ -241,6 +265,7 @@ impl<'a> Collection<'a> {
 
     /// Writes the tables and metadata after all shards are written.
     pub(super) fn complete(self) -> Result<DatasetInfo, DatasetError> {
+        unfinished::remove_all(&self.config.out)?;
         complete(&self.config.out, self.info, &self.shards)
     }
 }

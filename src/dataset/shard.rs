@@ -38,10 +38,10 @@ pub(super) struct EpisodeRecord {
 /// An episode with encoded frames, ready to be written.
 pub(super) struct EncodedEpisode {
     pub(super) images: Vec<Vec<u8>>,
-    masks: Option<Vec<Vec<u8>>>,
+    pub(super) masks: Option<Vec<Vec<u8>>>,
     pub(super) actions: Vec<f32>,
-    states: Vec<f32>,
-    timestamps_s: Vec<f32>,
+    pub(super) states: Vec<f32>,
+    pub(super) timestamps_s: Vec<f32>,
     pub(super) record: EpisodeRecord,
 }
 

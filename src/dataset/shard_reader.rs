@@ -156,7 +156,7 @@ impl ImageTarget<'_> {
     }
 }
 
-fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
+pub(super) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
     let images: &StructArray = batch.column_by_name(key)?.as_struct_opt()?;
     let bytes = images.column_by_name("bytes")?.as_binary_opt::<i32>()?;
     (bytes.null_count() == 0).then_some(bytes)
@@ -180,7 +180,7 @@ impl<'a> Column<'a> {
     }
 
     /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
-    fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
+    pub(super) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
         match size {
             0 => return Ok(&[]),
             1 => return self.numbers::<Float32Type>(key),

@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage};
+use image::{DynamicImage, ExtendedColorType, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage};
 
 use super::{Frame, FrameError, MAX_SIDE_PX};
 
@@ -33,6 +33,14 @@ pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
     let mut limits = Limits::default();
     limits.max_alloc = Some(MAX_METADATA_BYTES);
     reader(bytes, limits)?.into_dimensions().map_err(FrameError::Decode)
+}
+
+/// Whether a PNG or JPEG image has color channels, without decoding its pixels. Errors: `Decode` if the bytes are neither.
+pub fn is_color(bytes: &[u8]) -> Result<bool, FrameError> {
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(MAX_METADATA_BYTES);
+    let decoder = reader(bytes, limits)?.into_decoder().map_err(FrameError::Decode)?;
+    Ok(decoder.color_type().has_color())
 }
 
 fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {

@@ -65,6 +65,19 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     })
 }
 
+/// As [`load`], under another name than the manifest's. Errors: as [`load`].
+pub fn load_as(model_dir: &Path, name: &str) -> Result<LoadedModel, RegistryError> {
+    let loaded = load(model_dir)?;
+    let manifest = Manifest {
+        name: name.to_owned(),
+        ..(*loaded.manifest).clone()
+    };
+    Ok(LoadedModel {
+        manifest: Arc::new(manifest),
+        model: loaded.model,
+    })
+}
+
 /// The parameters as the bytes of a safetensors file, in half precision, sorted by name.
 pub(super) fn serialize_f16(parameters: &Parameters) -> Result<Vec<u8>, NnError> {
     let halves = parameters

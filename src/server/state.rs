@@ -244,8 +244,8 @@ impl App {
         let is_empty = self.predictor().models().is_empty();
         is_empty.then(|| {
             format!(
-                "no model found in {}; train one with POST /v1/jobs or foreframe train, publish it there, or name another \
-                 directory with --models",
+                "no model found in {}; name the right directory with --models-dir, publish a trained model with `foreframe publish \
+                 DIR`, or train one with POST /v1/jobs",
                 self.config().models_dir.display()
             )
         })

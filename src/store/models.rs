@@ -59,6 +59,34 @@ impl Store {
         rows.first().map(version_of).transpose()
     }
 
+    /// The next version of a name, above `shipped`, for a model that no job trained. Errors: `Query`.
+    pub async fn reserve_next_version(&self, model: &str, shipped: u32) -> Result<u32, StoreError> {
+        let mut tx = self.database.begin().await?;
+        // The row is locked until the commit, so that a number is never given twice.
+        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
+            .await?;
+        let sql = "INSERT INTO model_versions (model, version) \
+             SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1 \
+             FROM model_versions WHERE model = $1 RETURNING version";
+        let rows = tx.fetch(sql, vec![model.into(), shipped.into()]).await?;
+        tx.commit().await?;
+        rows.first()
+            .map_or(Err(StoreError::Query(sqlx::Error::RowNotFound)), version_of)
+    }
+
+    /// Records that the files of a reserved version are there. Errors: `Query`.
+    pub async fn publish_version(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
+        let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
+        let values = vec![model.into(), version.into(), now_s.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
+    /// Forgets which version of a model was chosen to serve. Errors: `Query`.
+    pub async fn clear_active(&self, model: &str) -> Result<(), StoreError> {
+        let sql = "DELETE FROM active_versions WHERE model = $1";
+        self.database.execute(sql, vec![model.into()]).await.map(drop)
+    }
+
     /// All published versions that are not deleted, by name and number. Errors: `Query`.
     pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
         let sql = "SELECT model, version, published_s FROM model_versions \

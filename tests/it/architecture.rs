@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
     ("files", &[]),
+    ("settings", &[]),
     ("error_text", &[]),
     ("telemetry", &[]),
     ("frame", &["types"]),
@@ -14,7 +15,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "error_text", "frame", "sim"]),
     ("registry", &["types", "files", "error_text", "nn"]),
-    ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
+    ("training", &["types", "files", "settings", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
         &[
@@ -80,7 +81,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
             "jobs",
         ],
     ),
-    ("config", &["telemetry", "server"]),
+    ("config", &["settings", "telemetry", "server"]),
 ];
 
 /// The modules in which a dependency may be used.
@@ -88,7 +89,7 @@ const USED_IN: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
     ("axum", &["server"]),
     ("hyper", &["server"]),
-    ("figment", &["config"]),
+    ("figment", &["settings"]),
     ("metrics_exporter_prometheus", &["telemetry"]),
     ("image::", &["frame"]),
     ("tokio", &["server", "jobs", "versions", "store", "serving", "cli"]),

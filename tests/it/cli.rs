@@ -1,4 +1,4 @@
-//! The command line: exit codes and error messages.
+//! The command line: what its commands write, exit codes and error messages.
 
 use std::fs;
 use std::path::Path;
@@ -81,6 +81,32 @@ fn usage_errors_exit_with_2_and_advice() {
         ("train --set fit.steps=0", "fit.steps is 0; it must be 1 to"),
         ("train --set model.context=0", "the context is 0; it must be at least 1"),
         ("train --config none.toml", "could not read none.toml: No such file"),
+        (
+            "train --set fit.stepz=1",
+            "unknown field `stepz` in `fit` (--set); `foreframe train --print-config` lists all settings",
+        ),
+        ("train --set fit", "--set fit is not KEY=VALUE"),
+        (
+            "collect --set max_streamz=1",
+            "unknown field `max_streamz` (--set); `foreframe config` lists all settings",
+        ),
+        ("publish thesis", "thesis holds no model (manifest.json is missing)"),
+        (
+            "publish models/plain --name My_Model",
+            "\"My_Model\" is not a valid model name; use 1 to 64 of",
+        ),
+        (
+            "predict --model plain@2 --frames thesis --out p",
+            "there is no version 2 of model \"plain\"; there are: 1",
+        ),
+        (
+            "predict --model plain@new --frames thesis --out p",
+            "\"plain@new\" is not NAME or NAME@VERSION",
+        ),
+        (
+            "predict --model plain --frames thesis --out p --fit squeeze",
+            "it must be crop, letterbox or stretch",
+        ),
         (
             "train --dataset thesis",
             "thesis holds no data set (meta/info.json is missing)",
@@ -181,20 +207,20 @@ fn predict_reports_invalid_frames_and_actions() {
     for (actions, expected) in [
         (
             json!({"states": state, "actions": [["NaN", 0.0]]}),
-            "is no actions file: expected value at line 1",
+            "is not an actions file: expected value at line 1",
         ),
         (
             json!({"actions": [[1e39, 0.0]]}),
-            "is no actions file: number out of range",
+            "is not an actions file: number out of range",
         ),
         (json!([]), "it is JSON of finite numbers"),
         (
             json!({"states": state, "actions": vec![[0.0, 0.0]; enough - 1]}),
-            "holds 3 actions; model \"moving\" sees 3 frames and predicts 2, which takes 4",
+            "holds 3 actions; predicting 2 frames after frame 2 takes 4; add the planned actions",
         ),
         (
             json!({"states": [[0.0]], "actions": vec![[0.0, 0.0]; enough]}),
-            "holds 1 states; model \"moving\" sees 3 frames",
+            "holds 1 states; the state at frame 2 takes 3",
         ),
         (
             json!({"states": state, "actions": vec![[0.0]; enough]}),
@@ -285,6 +311,210 @@ fn a_failed_write_leaves_no_data_set() {
     let (code, text) = run(dir.path(), "inspect static-observer");
     assert!(
         code == 2 && text.contains("is unfinished; run `foreframe collect` with the same arguments"),
+        "{text}"
+    );
+}
+
+/// A file of one frame.
+fn write_png(path: &Path, value: u8) {
+    fs::write(
+        path,
+        foreframe::frame::codec::encode_png(&service::frame(value)).unwrap(),
+    )
+    .unwrap();
+}
+
+#[test]
+fn a_prediction_follows_the_last_frames_in_natural_order() {
+    let dir = working_dir();
+    let mut names: Vec<String> = (1..=12).map(|index| format!("{index}.png")).collect();
+    for part in ["all", "last", "middle"] {
+        fs::create_dir(dir.path().join(part)).unwrap();
+    }
+    for (index, name) in names.iter().enumerate() {
+        write_png(&dir.path().join("all").join(name), index as u8 * 20);
+    }
+    let copy = |names: &[String], part: &str| {
+        for name in names {
+            let from = dir.path().join("all").join(name);
+            fs::copy(from, dir.path().join(part).join(name)).unwrap();
+        }
+    };
+    copy(&names.split_off(9), "last");
+    copy(&names[6..9], "middle");
+    let predicted = |arguments: &str, out: &str| {
+        succeed(dir.path(), &format!("predict --model plain {arguments} --out {out}"));
+        fs::read(dir.path().join(out).join("predicted-1.png")).unwrap()
+    };
+    let last = predicted("--frames all", "a");
+    assert_eq!(last, predicted("--frames last", "b"));
+    let middle = predicted("--frames all --at 8", "c");
+    assert_eq!(middle, predicted("--frames middle", "d"));
+    assert_ne!(last, middle);
+    let (code, text) = run(dir.path(), "predict --model plain --frames all --at 12 --out e");
+    assert!(
+        code == 2 && text.contains("--at is 12; it must be 2 to 11: model \"plain\" takes 3 frames, and all holds 12"),
+        "{text}"
+    );
+    assert!(!dir.path().join("e").exists());
+}
+
+#[test]
+fn images_of_another_size_are_fitted_and_color_is_reported_once() {
+    let dir = working_dir();
+    let images = dir.path().join("photos");
+    fs::create_dir(&images).unwrap();
+    for index in 0..service::CONTEXT {
+        let color = image::RgbImage::from_pixel(40, 20, image::Rgb([200, index as u8, 50]));
+        color.save(images.join(format!("{index}.png"))).unwrap();
+    }
+    let (code, text) = run(dir.path(), "predict --model plain --frames photos --out seen");
+    assert!(
+        code == 2 && text.contains("photos/0.png is 40×20 px; model \"plain\" takes 16×12; add --fit crop"),
+        "{text}"
+    );
+    for way in ["crop", "letterbox", "stretch"] {
+        let line = format!("predict --model plain --frames photos --fit {way} --out {way}");
+        let (code, text) = run(dir.path(), &line);
+        assert_eq!((code, text.matches("converted to gray").count()), (0, 1), "{text}");
+    }
+}
+
+/// The shipped models.
+const MODELS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models");
+
+#[test]
+fn the_example_of_predict_works_on_every_exported_episode() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(dir.path(), "collect --scenario moving-observer --trials 4");
+    for episode in 0..4 {
+        succeed(
+            dir.path(),
+            &format!("export --dataset moving-observer --episode {episode} --out look{episode}"),
+        );
+        let look = format!("--frames look{episode} --models-dir {MODELS} --out");
+        let moving = format!("--model moving --actions look{episode}/actions.json --at 9");
+        succeed(dir.path(), &format!("predict {moving} {look} moving{episode}"));
+        succeed(dir.path(), &format!("predict --model paper {look} paper{episode}"));
+        for (out, gif) in [
+            (format!("look{episode}"), "episode.gif"),
+            (format!("moving{episode}"), "prediction.gif"),
+        ] {
+            let gif = fs::read(dir.path().join(out).join(gif)).unwrap();
+            assert!(u16::from_le_bytes([gif[6], gif[7]]) >= 256);
+        }
+        assert!(dir.path().join(format!("paper{episode}/contact-sheet.png")).is_file());
+    }
+    let (code, text) = run(
+        dir.path(),
+        &format!("predict --model moving --actions look0/actions.json --frames look0 --models-dir {MODELS} --out none"),
+    );
+    assert!(
+        code == 2 && text.contains("add the planned actions, or predict after an earlier frame with --at"),
+        "{text}"
+    );
+    assert!(!dir.path().join("none").exists());
+}
+
+#[test]
+fn the_next_step_of_a_small_collection_works() {
+    let dir = tempfile::tempdir().unwrap();
+    for (scenario, preset) in [("static-observer", "static"), ("moving-observer", "moving")] {
+        let printed = succeed(
+            dir.path(),
+            &format!("collect --scenario {scenario} --trials 60 --frame-size 8"),
+        );
+        let next = printed
+            .lines()
+            .find_map(|line| line.strip_prefix("next: foreframe "))
+            .unwrap();
+        assert!(next.contains(&format!("--preset {preset} ")), "{next}");
+        succeed(
+            dir.path(),
+            &format!("{next} --set fit.steps=1 --set model.features=4 --set model.hidden=4"),
+        );
+    }
+    let printed = succeed(dir.path(), "collect --trials 2 --frame-size 8 --out tiny");
+    assert!(
+        printed.contains("next: collect more trials into another directory"),
+        "{printed}"
+    );
+}
+
+#[test]
+fn every_command_finds_what_is_in_the_data_directory() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(
+        dir.path(),
+        "collect --data-dir d --trials 40 --frame-size 8 --threads 1",
+    );
+    assert!(dir.path().join("d/datasets/static-observer/meta/info.json").is_file());
+    let small = "--set data.windows=40 --set fit.steps=2 --set model.features=4 --set model.hidden=4";
+    succeed(dir.path(), &format!("train --data-dir d {small}"));
+    let published = succeed(dir.path(), "publish runs/paper --name mine --data-dir d");
+    assert_eq!(published, "published mine@1; it is the active version\n");
+    succeed(
+        dir.path(),
+        "evaluate --model mine --data-dir d --resamples 100 --windows 5 --record --out r",
+    );
+    let described = succeed(dir.path(), "inspect mine@1 --data-dir d");
+    assert!(
+        described.starts_with("d/models/mine/1 (mine version 1)") && described.contains("skill"),
+        "{described}"
+    );
+    assert!(succeed(dir.path(), "inspect static-observer --data-dir d").contains("episodes    40"));
+    succeed(dir.path(), "export --dataset static-observer --data-dir d --out look");
+    succeed(dir.path(), "predict --model mine --data-dir d --frames look --out seen");
+    // The same through the environment and the file.
+    let mut command = Command::new(PROGRAM);
+    command
+        .args(["inspect", "mine"])
+        .env("FOREFRAME_DATA_DIR", "d")
+        .current_dir(dir.path());
+    assert_eq!(exit_of(&mut command).0, 0);
+    fs::write(dir.path().join("foreframe.toml"), "data_dir = \"d\"\n").unwrap();
+    succeed(dir.path(), "inspect mine");
+}
+
+#[test]
+fn a_model_has_the_name_of_its_directory() {
+    let dir = working_dir();
+    let models = dir.path().join("models");
+    fs::rename(models.join("plain"), models.join("my-robot")).unwrap();
+    fs::rename(models.join("moving"), models.join("my_robot")).unwrap();
+    assert!(succeed(dir.path(), "inspect my-robot").starts_with("models/my-robot (my-robot version 1)"));
+    let (code, text) = run(dir.path(), "inspect my_robot");
+    assert!(
+        code == 2 && text.contains("\"my_robot\" is not a valid model name; use 1 to 64 of a–z, 0–9 and '-'"),
+        "{text}"
+    );
+    assert!(succeed(dir.path(), "models list").contains("not used: models/my_robot: "));
+}
+
+#[test]
+fn the_stream_example_says_that_no_server_answers() {
+    let dir = tempfile::tempdir().unwrap();
+    fs::create_dir(dir.path().join("look")).unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/stream.py");
+    let mut command = Command::new("python3");
+    // Port 1 is reserved, so nothing listens there.
+    command.args([
+        script,
+        "--server",
+        "http://127.0.0.1:1",
+        "--frames",
+        "look",
+        "--out",
+        "seen",
+    ]);
+    let Ok(output) = command.current_dir(dir.path()).output() else {
+        // Without Python there is nothing to try.
+        return;
+    };
+    let text = String::from_utf8(output.stderr).unwrap();
+    let says_why = text.contains("no server answers at http://127.0.0.1:1") || text.contains("pip install websockets");
+    assert!(
+        !output.status.success() && says_why && !text.contains("Traceback"),
         "{text}"
     );
 }

@@ -153,7 +153,8 @@ proptest! {
         for trials in stops {
             if let Err(error) = run_until(&config(&out), trials) {
                 let DatasetError::Cancelled { done, total } = error else { panic!("{error}") };
-                prop_assert!(total == TRIALS && done >= kept_before, "finished shards were lost");
+                prop_assert!(total == TRIALS && done >= kept_before, "finished trials were lost");
+                prop_assert!(done >= trials, "{done} of {trials} finished trials were kept");
                 kept_before = done;
                 prop_assert!(Dataset::open(&out).is_err());
             }
@@ -174,18 +175,18 @@ fn resuming_simulates_only_missing_trials() {
     let error = run_until(&one_thread, 7).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "stopped after 6 of 11 trials were saved; run the same command again to resume"
+        "stopped after 7 of 11 trials were saved; run the same command again to resume"
     );
     assert_eq!(
         CollectionStatus::of(&one_thread).unwrap(),
-        CollectionStatus::Unfinished { trials: 6 }
+        CollectionStatus::Unfinished { trials: 7 }
     );
     let first = AtomicU64::new(u64::MAX);
     let on_progress = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
     };
     collect(&one_thread, &on_progress, &AtomicBool::new(false)).unwrap();
-    assert_eq!(first.into_inner(), 6);
+    assert_eq!(first.into_inner(), 7);
 }
 
 #[test]

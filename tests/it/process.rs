@@ -53,6 +53,11 @@ impl Program {
         Self { child, line, log }
     }
 
+    /// The first line that it printed.
+    pub(crate) fn first_line(&self) -> &str {
+        &self.line
+    }
+
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
-use crate::process::{RunningServer, foreframe, output, text};
+use crate::process::{Program, RunningServer, foreframe, output, text};
 use crate::service::{TIMEOUT, context, model, slow_spec, spec};
 
 /// Sends requests until connections are refused. A request counts as accepted once the server asks for its body.
@@ -207,11 +207,11 @@ fn a_public_server_requires_an_api_key() {
 fn invalid_directories_are_refused_at_startup() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("file"), "").unwrap();
-    let none = "; name a directory that holds models, or none to serve those in ./models";
+    let none = "; name a directory that holds models, or leave the setting out to serve those in ./models";
     for (arguments, complaint) in [
         (
-            ["serve", "--models", "modles"],
-            format!("models_dir is \"modles\" (--models), which is not there{none}"),
+            ["serve", "--models-dir", "modles"],
+            format!("models_dir is \"modles\" (--models-dir), which does not exist{none}"),
         ),
         (
             ["worker", "--set", "models_dir=file"],
@@ -219,7 +219,7 @@ fn invalid_directories_are_refused_at_startup() {
         ),
         (
             ["serve", "--data-dir", "file"],
-            "data_dir is \"file\" (--data-dir), which is a file; name a directory, which is made if it is not there"
+            "data_dir is \"file\" (--data-dir), which is a file; name a directory; it is created if it does not exist"
                 .to_owned(),
         ),
     ] {
@@ -231,9 +231,9 @@ fn invalid_directories_are_refused_at_startup() {
     }
     // Without models the server starts, and the log says what to do.
     let server = RunningServer::start(dir.path(), &[]);
-    assert!(server.get("/v1/models").ends_with("{\"models\":[]}"));
+    assert!(server.get("/v1/models").contains("{\"models\":[]"));
     server.terminate();
-    assert!(server.wait_for_exit().contains("no models there; train one by"));
+    assert!(server.wait_for_exit().contains("publish a trained model with `foreframe publish DIR`"));
 }
 
 #[test]
@@ -260,7 +260,85 @@ fn the_configuration_is_printed_with_its_sources() {
     std::fs::write(dir.path().join("foreframe.toml"), "max_stream = 7\n").unwrap();
     let refused = output(dir.path(), &["serve"]);
     assert_eq!(refused.status.code(), Some(2));
-    assert!(text(&refused.stderr).contains("max_stream (foreframe.toml) is no field"));
+    assert!(text(&refused.stderr).contains("unknown field `max_stream` (foreframe.toml); `foreframe config` lists"));
+}
+
+#[test]
+fn a_server_listens_on_the_port_and_name_that_it_is_given() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = RunningServer::start(dir.path(), &["--port", "0"]);
+    assert!(server.get("/livez").starts_with("HTTP/1.1 200"));
+    server.terminate();
+    server.wait_for_exit();
+    let named = Program::start(dir.path(), &["serve", "--bind", "localhost:0"]);
+    assert!(
+        named.first_line().contains("http://127.0.0.1:"),
+        "{}",
+        named.first_line()
+    );
+    named.terminate();
+    named.wait_for_exit();
+}
+
+#[test]
+fn the_directory_of_a_model_gives_it_its_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let models = dir.path().join("models");
+    model(&models, "plain", spec(Conditioning::None));
+    std::fs::rename(models.join("plain"), models.join("other")).unwrap();
+    model(&models, "my_model", spec(Conditioning::None));
+    let server = RunningServer::start(dir.path(), &[]);
+    assert!(server.get("/v1/models/other").contains("\"name\":\"other\""));
+    server.terminate();
+    let log = server.wait_for_exit();
+    assert!(log.contains("my_model") && log.contains("is not a valid model name"), "{log}");
+}
+
+#[test]
+fn a_running_server_serves_what_is_published() {
+    let dir = tempfile::tempdir().unwrap();
+    model(&dir.path().join("models"), "plain", spec(Conditioning::None));
+    let server = RunningServer::start(dir.path(), &[]);
+    let run = |arguments: &[&str]| {
+        let done = output(dir.path(), arguments);
+        assert!(done.status.success(), "{arguments:?}: {}", text(&done.stderr));
+        text(&done.stdout)
+    };
+    let wait_for = |model: &str, version: &str| {
+        let deadline = Instant::now() + TIMEOUT;
+        while !server.get(&format!("/v1/models/{model}")).contains(version) {
+            assert!(Instant::now() < deadline, "{model} is not server as {version}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    assert_eq!(
+        run(&["publish", "models/plain", "--name", "mine"]),
+        "published mine@1; it is the active version\n"
+    );
+    wait_for("mine", "\"active_version\":1");
+    assert_eq!(
+        run(&["publish", "models/plain"]),
+        "published plain@2; it is the active version\n"
+    );
+    wait_for("plain", "\"active_version\":2");
+    let listed = run(&["models", "list"]);
+    assert!(
+        listed.contains("mine@1                   active data/models/mine/1\n")
+            && listed.contains("plain@1                         models/plain\n")
+            && listed.contains("plain@2                  active data/models/plain/2\n"),
+        "{listed}"
+    );
+    let refused = output(dir.path(), &["models", "remove", "plain@2"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("is active"));
+    run(&["models", "activate", "plain@1"]);
+    wait_for("plain", "\"active_version\":1");
+    assert_eq!(run(&["models", "remove", "plain@2"]), "removed plain@2\n");
+    assert!(!dir.path().join("data/models/plain/2").exists());
+    assert!(run(&["models", "remove", "mine"]).contains("no version of mine is left"));
+    let refused = output(dir.path(), &["models", "remove", "plain"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("delete its directory there"));
+    server.terminate();
+    server.wait_for_exit();
 }
 
 #[test]

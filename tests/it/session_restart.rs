@@ -20,7 +20,7 @@ struct KillableServer {
 impl KillableServer {
     fn start(data_dir: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
-            .args(["serve", "--bind", "127.0.0.1:0", "--models", "models", "--data-dir"])
+            .args(["serve", "--bind", "127.0.0.1:0", "--models-dir", "models", "--data-dir"])
             .arg(data_dir)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
             .stdout(Stdio::piped())

@@ -134,7 +134,7 @@ async fn a_lost_database_does_not_forget_that_keys_exist() {
     let store = open(dir.path()).await.unwrap();
     assert!(store.list_keys().await.unwrap().is_empty() && store.keys_were_created());
     let keys = foreframe::server::keys::Keys::open(store, false).await.unwrap();
-    assert!(keys.are_asked_for() && keys.count() == 0);
+    assert!(keys.are_required() && keys.count() == 0);
 }
 
 #[cfg(unix)]
