@@ -22,6 +22,7 @@ pub const DEFAULT_FILE: &str = "foreframe.toml";
 
 /// Why there is no configuration.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("could not read the configuration {}: {source}", path.display())]

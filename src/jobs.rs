@@ -28,6 +28,7 @@ pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum JobError {
     /// No job has that id.
     #[error("there is no job \"{id}\"; of those that ended only the latest are remembered")]

@@ -20,6 +20,7 @@ pub const MANIFEST_FILE: &str = "manifest.json";
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum RegistryError {
     /// There is no model of that name.
     #[error("there is no model {name:?} in {}; there {}", dir.display(), those(known))]

@@ -5,6 +5,7 @@
 mod catalog;
 mod compute;
 mod input;
+mod local;
 mod meter;
 mod queue;
 mod task;
@@ -37,6 +38,7 @@ const PARTS_IN_A_BATCH: usize = 4;
 
 /// Why no prediction came.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ServingError {
     /// No model of that name is loaded.
     #[error("no model is named \"{name}\"; there are: {}", .known.join(", "))]
@@ -94,6 +96,7 @@ pub enum ServingError {
 
 /// The predictor's bounds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PredictorConfig {
     /// Requests that may wait, at least 1.
     pub queue_capacity: usize,
@@ -115,6 +118,7 @@ impl Default for PredictorConfig {
 
 /// Predicted frames and how long they took.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Prediction {
     /// The model's name.
     pub model: String,
@@ -130,6 +134,7 @@ pub struct Prediction {
 
 /// What came of a [`Task`] and how long it took.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct TaskOutput {
     /// Of the task's frames, in order.
     pub features: Vec<Features>,

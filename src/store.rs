@@ -22,6 +22,7 @@ const DATABASE_FILE: &str = "foreframe.db";
 
 /// Why state could not be read or written.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum StoreError {
     /// A URL of a kind that is not known. It is told without what may be secret in it.
     #[error("{flag} starts with \"{scheme}\"; use {known}")]

@@ -5,15 +5,11 @@ pub mod names;
 
 #[cfg(feature = "otlp")]
 mod otlp;
+#[cfg(feature = "server")]
 mod prometheus;
 
-use std::io::IsTerminal as _;
-
 use serde::{Deserialize, Serialize};
-use tracing_subscriber::layer::SubscriberExt as _;
-use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{EnvFilter, Layer as _, fmt};
-
+#[cfg(feature = "server")]
 pub use prometheus::{fold, record, render};
 
 /// How log lines look.
@@ -29,6 +25,7 @@ pub enum LogFormat {
 
 /// Why traces cannot be sent.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TelemetryError {
     /// The program cannot send traces.
     #[error("otlp_endpoint is set, and this program was built without the feature otlp; build it with --features otlp")]
@@ -47,7 +44,14 @@ pub struct Telemetry {
 
 /// Installs the subscriber for the process; a second call changes nothing. Spans go to `otlp_endpoint`, for example
 /// `http://127.0.0.1:4318`, if one is given. Errors: `NoOtlp`, `Otlp`.
+#[cfg(feature = "server")]
 pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry, TelemetryError> {
+    use std::io::IsTerminal as _;
+
+    use tracing_subscriber::layer::SubscriberExt as _;
+    use tracing_subscriber::util::SubscriberInitExt as _;
+    use tracing_subscriber::{EnvFilter, Layer as _, fmt};
+
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     // Colours are for people, not for files.
     let lines = fmt::layer()

@@ -35,6 +35,7 @@ const MAX_PRINCIPAL_FRAMES: usize = 8192;
 
 /// Why a training did not start or stopped.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TrainError {
     /// There is no preset of that name.
     #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]

@@ -18,6 +18,7 @@ use crate::wording;
 
 /// Why a version could not be loaded, published, chosen or deleted.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum VersionError {
     /// There is no such model or version.
     #[error("there is no version {version} of model \"{model}\"; there are: {}", numbers(known))]

@@ -7,6 +7,7 @@ use crate::sim::SimError;
 
 /// Why a data set could not be made, read or sampled: what was wrong and what would be right.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum DatasetError {
     /// The parts of an episode don't hold the same number of frames.
     #[error("episode {episode}: {part} has {found} values; {frames} frames take {expected}")]

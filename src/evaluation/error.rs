@@ -8,6 +8,7 @@ use crate::nn::NnError;
 
 /// What was wrong, and what would be right.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum EvaluationError {
     /// The frames have another size.
     #[error(

@@ -7,6 +7,7 @@ use crate::types::{Action, RobotState};
 
 /// What does not fit, by the name of the field.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum InputError {
     /// Not as many frames as the model's context.
     #[error("frames holds {found} images; model \"{model}\" takes {expected}")]

@@ -14,6 +14,7 @@ use crate::types::{Action, RobotState};
 
 /// Why a memory is not one of the model's.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MemoryError {
     /// More frames than the context.
     #[error("memory.features holds {found} frames; the model keeps at most {most}")]
@@ -57,7 +58,8 @@ pub enum MemoryError {
 }
 
 /// A session's memory as it travels between servers.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SessionMemory {
     /// The number that the next frame shall have.
@@ -65,10 +67,10 @@ pub struct SessionMemory {
     /// Of the last frames, oldest first, at most the model's context: the features of each, -1 to 1.
     pub features: Vec<Vec<f32>>,
     /// The actions that the last future was predicted under; empty if the model takes none.
-    #[schema(value_type = Vec<Vec<f32>>)]
+    #[cfg_attr(feature = "server", schema(value_type = Vec<Vec<f32>>))]
     pub actions: Vec<Action>,
     /// What the robot said of itself at the last frame; absent if the model takes none.
-    #[schema(value_type = Option<Vec<f32>>)]
+    #[cfg_attr(feature = "server", schema(value_type = Option<Vec<f32>>))]
     pub state: Option<RobotState>,
 }
 

@@ -6,7 +6,8 @@ use super::{SimError, arena};
 use crate::frame::MAX_SIDE_PX;
 
 /// Tb1's camera.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Height of the pinhole above the floor, in metres.
@@ -31,7 +32,8 @@ impl Default for CameraConfig {
 }
 
 /// How a world is run and seen.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldConfig {
     /// Width of a frame in pixels.

@@ -6,6 +6,7 @@ use crate::types::ValueError;
 
 /// Why a world was not made or a step not taken.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum SimError {
     /// No scenario has that name.
     #[error("there is no scenario \"{name}\"; there are {}", scenario::names())]

@@ -25,7 +25,8 @@ const CROWD: usize = 3;
 const MAX_CROWD: usize = 16;
 
 /// Who moves, and when a trial ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Scenario {
     /// The paper's: Tb1 stands still; the trial ends when Tb2 reaches its goal.
@@ -78,7 +79,8 @@ impl FromStr for Scenario {
 }
 
 /// How a mover is driven: a controller for its heading, one for its distance, and its own top speed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PidGains {
     /// From heading error (rad) to angular velocity (rad/s).
@@ -108,7 +110,8 @@ impl PidGains {
 }
 
 /// Where a mover begins, where it goes first, and how.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Route {
     /// At the beginning.
@@ -120,7 +123,8 @@ pub struct Route {
 }
 
 /// All that was drawn for a trial.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TrialParameters {
     /// Who moves.
@@ -128,7 +132,7 @@ pub struct TrialParameters {
     /// Position in the seed's sequence.
     pub trial: u64,
     /// Of the sequence.
-    #[schema(value_type = u64)]
+    #[cfg_attr(feature = "server", schema(value_type = u64))]
     pub seed: Seed,
     /// Tb2's start, an index of [`arena::STARTS_M`].
     pub start: usize,

@@ -144,3 +144,14 @@ fn no_file_is_longer_than_400_lines() {
         assert!(text.lines().count() <= 400, "{file} has {} lines", text.lines().count());
     }
 }
+
+#[test]
+fn every_expect_says_that_its_failure_is_a_bug() {
+    for (file, text) in sources() {
+        let code: String = code(&text).collect();
+        for call in code.split(".expect(").skip(1) {
+            let message = call.split('"').nth(1).unwrap_or_default();
+            assert!(message.ends_with("is a bug"), "{file} expects {message:?}");
+        }
+    }
+}
