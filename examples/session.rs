@@ -36,7 +36,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         // The robot plans to go on as it does now.
         let plan = vec![recording.actions[i].clone(); horizon];
         let conditioning = ConditioningInput::for_model(&model, Some(&plan), Some(&recording.states[i]))?;
-        let prediction = session.predict_next(&model, frame, conditioning)?;
+        let prediction = session.predict_next(&model, frame, &conditioning)?;
         predicted = prediction.and_then(|frames| frames.into_iter().next());
     }
     println!(

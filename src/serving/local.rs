@@ -33,14 +33,13 @@ impl SessionState {
         &mut self,
         loaded: &LoadedModel,
         frame: Frame,
-        conditioning: ConditioningInput,
+        conditioning: &ConditioningInput,
     ) -> Result<Option<Vec<Frame>>, ServingError> {
         let spec = loaded.model.spec();
         check_size("frame", &loaded.manifest.name, spec, (frame.width(), frame.height()))?;
         let task = self.step(frame, Some(conditioning.clone()), spec);
-        let Some(output) = compute::run(loaded, &[&task])?.pop() else {
-            return Ok(None);
-        };
+        let mut outputs = compute::run(loaded, &[&task])?;
+        let output = outputs.pop().expect("a task without an output is a bug");
         let seq = self.next_seq();
         for features in output.features {
             self.advance(seq, features, conditioning.clone(), spec);
@@ -67,7 +66,7 @@ mod tests {
         let mut predicted = None;
         for frame in frames.clone() {
             assert_eq!(predicted, None);
-            predicted = session.predict_next(&model, frame, conditioning.clone()).unwrap();
+            predicted = session.predict_next(&model, frame, &conditioning).unwrap();
         }
         let input = PredictionInput {
             frames,
@@ -83,7 +82,7 @@ mod tests {
         let (model, mut session) = (test_model(), SessionState::default());
         let frame = Frame::new(5, 4, vec![0; 20]).unwrap();
         let error = session
-            .predict_next(&model, frame, ConditioningInput::default())
+            .predict_next(&model, frame, &ConditioningInput::default())
             .unwrap_err();
         assert_eq!(error.to_string(), "frame is 5×4 px; model \"test\" takes 6×4");
         assert_eq!(session, SessionState::default());
