@@ -41,8 +41,8 @@ pub mod types;
 
 pub mod files;
 
+pub mod error_text;
 pub mod telemetry;
-pub mod wording;
 
 pub mod frame;
 

@@ -1,54 +1,56 @@
-//! Where state lives that outlasts the process: rows in a database ([`jobs`] with their [`accounts`], [`models`], [`keys`]),
-//! whole files in [`objects`]. `database` alone knows that there are two kinds of database; SQL is written nowhere but here.
+//! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`]) and files in [`objects`].
+//! Only `database` knows that there are two kinds of database. SQL is only in this module.
 
-pub mod accounts;
 mod database;
 pub mod jobs;
 pub mod keys;
 pub mod models;
 pub mod objects;
+pub mod reports;
 
 use std::path::{Path, PathBuf};
 
-pub use self::accounts::{JobUpdate, LogRow, LossRow};
+use serde::{Deserialize, Serialize};
+
 use self::database::Database;
 pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
-pub use self::models::VersionRow;
+pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
+pub use self::reports::{JobReport, LogRow, LossRow};
 
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
 
-/// Why state could not be read or written.
+/// Why the store could not be read or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StoreError {
-    /// A URL of a kind that is not known. It is told without what may be secret in it.
-    #[error("{flag} starts with \"{scheme}\"; use {known}")]
+    /// A URL with an unknown scheme. The error shows only the scheme, because the rest can hold a password.
+    #[error("{flag} starts with \"{scheme}\"; use {expected}")]
     Url {
         /// `database` or `objects`.
         flag: &'static str,
-        /// What it starts with, up to the colon.
+        /// The scheme, up to the colon.
         scheme: String,
-        /// What it may be.
-        known: &'static str,
+        /// The supported forms.
+        expected: &'static str,
     },
     /// The database could not be reached or opened.
     #[error("could not open the {database} database: {source}")]
     Open {
         /// `SQLite` or `PostgreSQL`.
         database: &'static str,
-        /// Its reason.
+        /// The database's error.
         source: sqlx::Error,
     },
-    /// TLS is asked for and cannot be had.
+    /// The URL asks for TLS, but the program was built without it.
     #[error(
-        "database_url asks for TLS by its sslmode, which this program was built without; build it with --features cloud"
+        "the sslmode in database_url needs TLS, but this program was built without it; build it with --features cloud"
     )]
     NoTls,
-    /// The tables could not be brought to this program's form.
-    #[error("could not bring the database's tables to this version: {0}")]
+    /// The tables could not be migrated to this version of the program.
+    #[error("could not migrate the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
     /// A statement failed.
     #[error("the database failed: {0}")]
@@ -83,17 +85,17 @@ impl StoreError {
 }
 
 /// Where state is kept.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StoreConfig {
-    /// The directory that holds the database's file and the objects, unless they are elsewhere.
+    /// The data directory. It holds the database file and the objects, unless they are configured elsewhere.
     pub data_dir: PathBuf,
-    /// `sqlite:FILE` or `postgres://…`; a file in the data directory where it is not given.
+    /// `sqlite:FILE` or `postgres://…`; a file in the data directory by default.
     pub database: Option<String>,
-    /// A directory or `s3://BUCKET/PREFIX`; the data directory where it is not given.
+    /// A directory or `s3://BUCKET/PREFIX`; the data directory by default.
     pub objects: Option<String>,
 }
 
-/// The open store; clones share its connections.
+/// The open store. Clones share its connections.
 #[derive(Clone)]
 pub struct Store {
     database: Database,
@@ -101,8 +103,8 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens it, makes what is not there yet, and brings the tables to this program's form. Must be called, and the store
-    /// used, within a tokio runtime. Errors: `Url`, `NoTls`, `Open`, `Migrate`, `Io`, `Object`.
+    /// Opens the store, creates what is missing, and migrates the tables. Needs a tokio runtime, now and later.
+    /// Errors: `Url`, `NoTls`, `Open`, `Migrate`, `Io`, `Object`.
     pub async fn open(config: &StoreConfig) -> Result<Self, StoreError> {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;
@@ -116,19 +118,24 @@ impl Store {
         })
     }
 
+    /// Opens a store that another process of this version has opened before. Errors: as [`Store::open`].
+    pub async fn open_existing(config: &StoreConfig) -> Result<Self, StoreError> {
+        Self::open(config).await
+    }
+
     /// The files.
     #[must_use]
     pub fn objects(&self) -> &Objects {
         &self.objects
     }
 
-    /// Answers when the database does. Errors: `Query`.
+    /// Checks that the database answers. Errors: `Query`.
     pub async fn ping(&self) -> Result<(), StoreError> {
         self.database.fetch("SELECT 1", vec![]).await.map(drop)
     }
 }
 
-/// The time as the store keeps it: seconds since 1970.
+/// The time in the store's unit: seconds since 1970.
 #[must_use]
 pub fn unix_s() -> f64 {
     let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);

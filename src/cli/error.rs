@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use crate::dataset::DatasetError;
+use crate::error_text;
 use crate::evaluation::EvaluationError;
 use crate::nn::NnError;
 use crate::registry::RegistryError;
@@ -13,7 +14,6 @@ use crate::serving::ServingError;
 use crate::sim::SimError;
 use crate::telemetry::TelemetryError;
 use crate::training::TrainError;
-use crate::wording;
 
 /// What a subcommand fails with: a sentence for the user.
 pub(super) enum CliError {
@@ -28,7 +28,7 @@ pub(super) enum CliError {
 impl CliError {
     /// It went wrong, and why.
     pub(super) fn failed(error: impl Error) -> Self {
-        Self::Failed(wording::sentence(&error))
+        Self::Failed(error_text::with_causes(&error))
     }
 
     /// A file that can't be used: asked wrongly where the path leads to nothing of the kind.
@@ -60,7 +60,7 @@ pub(super) trait Blame: Error {
 
 impl<E: Blame> From<E> for CliError {
     fn from(error: E) -> Self {
-        let sentence = wording::sentence(&error);
+        let sentence = error_text::with_causes(&error);
         if error.is_usage() {
             Self::Usage(sentence)
         } else {
@@ -116,7 +116,7 @@ impl Blame for TrainError {
             | Self::Config(_)
             | Self::NotARun(_)
             | Self::OtherRun { .. }
-            | Self::NoValidation { .. } => true,
+            | Self::NoWindows { .. } => true,
             Self::Dataset(error) => error.is_usage(),
             Self::Registry(error) => error.is_usage(),
             // The network's sizes come from the settings.

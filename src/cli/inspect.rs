@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use super::{CliError, DATASETS_DIR, say};
-use crate::dataset::{self, Dataset};
+use crate::dataset::{self, Dataset, DatasetInfo};
+use crate::error_text::{comma_separated, existing};
 use crate::nn::{ChannelScale, ModelSpec, costs};
 use crate::registry::{self, Manifest};
-use crate::wording::{listed, those};
 
 /// Describe a model or a data set.
 #[derive(clap::Args)]
@@ -34,8 +34,8 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
         "there is no model or data set {:?}; in {} there {}; in {DATASETS_DIR} there {}",
         args.what,
         models.display(),
-        those(&names),
-        those(&dataset::list(datasets)?)
+        existing(&names),
+        existing(&dataset::list(datasets)?)
     )))
 }
 
@@ -103,7 +103,7 @@ fn say_costs(manifest: &Manifest) -> Result<(), CliError> {
 }
 
 fn conditions(spec: &ModelSpec) -> String {
-    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", listed(channels));
+    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", comma_separated(channels));
     let mut text = String::new();
     if spec.state_inputs().is_some() {
         text += &list("the state", &spec.states);
@@ -123,12 +123,26 @@ fn describe_dataset(dir: &Path) -> Result<(), CliError> {
         info.frame_count, info.frame_width_px, info.frame_height_px, info.frame_period_s
     ))?;
     say(format!("  episodes    {}", info.episode_count))?;
-    say(format!("  action      [{}]", listed(&info.action_channels)))?;
-    say(format!("  state       [{}]", listed(&info.state_channels)))?;
+    say(format!("  action      [{}]", comma_separated(&info.action_channels)))?;
+    say(format!("  state       [{}]", comma_separated(&info.state_channels)))?;
     say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
+    say(format!("  camera      {}", camera(info)))?;
     say(format!(
         "  scenario    {}",
         info.scenario.as_deref().unwrap_or("none: recorded")
     ))?;
     say(format!("  content     SHA-256 {}", info.content_hash))
+}
+
+fn camera(info: &DatasetInfo) -> String {
+    info.camera.map_or_else(
+        || "not described".to_owned(),
+        |camera| {
+            format!(
+                "pinhole, {:.1}° wide, tilted down {:.1}°",
+                camera.horizontal_fov_rad.to_degrees(),
+                camera.tilt_down_rad.to_degrees()
+            )
+        },
+    )
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::{CliError, load_model, say};
+use crate::error_text;
 use crate::evaluation::{self, figures::montage};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
@@ -12,7 +13,6 @@ use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
 use crate::types::{Action, RobotState};
-use crate::wording;
 
 /// Predict the frames that follow those in a directory.
 ///
@@ -77,7 +77,7 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     } else if spec.action_inputs().is_some() {
         return Err(CliError::Usage(format!(
             "--actions is missing; model {name:?} takes {}",
-            wording::listed(&spec.actions)
+            error_text::comma_separated(&spec.actions)
         )));
     }
     let predicted = serving::predict(&loaded, &[&input])?.remove(0);
@@ -149,7 +149,7 @@ fn read_frames(dir: &Path, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, 
 fn read_frame(path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
     let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
     let frame = codec::decode(&bytes)
-        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), wording::sentence(&error))))?;
+        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error))))?;
     if (frame.width(), frame.height()) != (spec.frame_width_px, spec.frame_height_px) {
         return Err(CliError::Usage(format!(
             "{} is {}×{} px; model {model:?} takes {}×{}",
@@ -186,7 +186,8 @@ fn write(
         &codec::encode_png(&sheet).map_err(CliError::failed)?,
     )?;
     let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
-    let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
+    let film = seen.iter().chain(predicted).map(montage::enlarged);
+    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
     save(
         "prediction.gif".to_owned(),
         &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,

@@ -8,6 +8,7 @@ use super::{CliError, say};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App};
+use crate::store::Store;
 use crate::telemetry;
 
 /// Serve models over HTTP and WebSocket.
@@ -23,9 +24,10 @@ pub(super) struct ServeArgs {
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let config = checked(args.settings.load()?)?;
+    let mut config = checked(args.settings.load()?)?;
+    config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
-    telemetry::record();
+    telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         // Each such thread keeps memory, and many that decode would leave the one that predicts few turns.
@@ -39,7 +41,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config) -> Result<(), CliError> {
-    let keys = keys(&config).await?;
+    let store = open_store(&config).await?;
+    let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
         CliError::Failed(format!(
             "could not listen on {}: {error}; try another --bind",
@@ -47,7 +50,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    let app = Box::pin(App::open(config.server))
+    let app = Box::pin(App::with_store(config.server, store))
         .await
         .map_err(CliError::failed)?
         .with_keys(keys);
@@ -55,31 +58,31 @@ async fn listen(config: Config) -> Result<(), CliError> {
     for manifest in &models {
         info!(model.id = %manifest.name, model.version = manifest.version, "model loaded");
     }
-    if models.is_empty() {
-        info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs, or copy there what foreframe train made");
+    if let Some(advice) = app.no_model_advice() {
+        warn!("{advice}");
     }
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
     server::serve(listener, app, server::shutdown::requested()).await;
     Ok(())
 }
 
-/// Who may call. Errors: `Usage` if other machines can, and there is no key to ask them for.
-async fn keys(config: &Config) -> Result<Keys, CliError> {
+/// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.
+async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
-    let keys = Keys::of(open_store(config).await?, is_required).await?;
+    let keys = Keys::open(store, is_required).await?;
     if is_required && keys.count() == 0 {
         return Err(CliError::Usage(format!(
-            "{} can be reached from other machines and there is no key to ask for; make one by foreframe keys create \
-             NAME, bind a loopback address, or say --insecure",
+            "other machines can reach {}, but no API keys exist; create one with foreframe keys create NAME, bind a \
+             loopback address, or use --insecure",
             config.bind
         )));
     }
     match keys.count() {
-        0 if keys.are_asked_for() => {
-            warn!("all keys are revoked: nobody may call until foreframe keys create makes one");
+        0 if keys.are_required() => {
+            warn!("no valid API key exists: every request is refused until foreframe keys create makes one");
         }
-        0 => info!("no key was ever made: everybody may call"),
-        count => info!(keys = count, "whoever has a key may call"),
+        0 => info!("authentication is off: no API keys exist"),
+        count => info!(keys = count, "authentication is on"),
     }
     Ok(keys)
 }

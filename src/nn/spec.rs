@@ -1,4 +1,4 @@
-//! All that determines a model's shape and its meaning, validated; the sizes that follow from it.
+//! The specification of a model: its dimensions and what its numbers mean, with validation, and the sizes that follow.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,26 +10,26 @@ use super::NnError;
 use crate::frame::preprocess::Preprocess;
 use crate::types::Channel;
 
-/// Greatest side of a frame that a model takes, in pixels.
+/// Largest width and height of a model's frames, in pixels.
 pub const MAX_MODEL_SIDE_PX: u32 = 512;
-/// Greatest period between two frames, in seconds; the least is [`MIN_FRAME_PERIOD_S`].
+/// Largest frame period, in seconds; the smallest is [`MIN_FRAME_PERIOD_S`].
 pub const MAX_FRAME_PERIOD_S: f64 = 3600.0;
-/// Least period between two frames, in seconds.
+/// Smallest frame period, in seconds.
 pub const MIN_FRAME_PERIOD_S: f64 = 1e-4;
-/// Greatest number of context frames, and of predicted frames.
+/// Largest number of context frames, and of predicted frames.
 pub const MAX_STEPS: usize = 256;
-/// Greatest number of features of a frame.
+/// Largest number of features of a frame.
 pub const MAX_FEATURES: usize = 4096;
-/// Greatest number of hidden units of an LSTM.
+/// Largest number of hidden units of an LSTM.
 pub const MAX_HIDDEN: usize = 4096;
-/// Greatest number of components of an action, and of a state.
+/// Largest number of components of an action, and of a state.
 pub const MAX_CHANNELS: usize = 64;
-/// Greatest standard deviation of the smoothing, in pixels.
+/// Largest standard deviation of the smoothing, in pixels.
 pub const MAX_BLUR_SIGMA_PX: f32 = 16.0;
-/// Greatest number of trained values of a model (1 GiB in f32).
+/// Largest number of parameters of a model (1 GiB in f32).
 pub const MAX_PARAMETERS: u64 = 1 << 28;
-/// A channel that varies less than this (in its own unit) is scaled as if it varied this much, so that a constant
-/// channel doesn't divide by zero.
+/// Smallest standard deviation used to scale a channel, in the channel's unit. It avoids division by zero for a constant
+/// channel.
 pub const MIN_CHANNEL_STD: f32 = 1e-3;
 
 macro_rules! named_enum {
@@ -63,7 +63,7 @@ macro_rules! named_enum {
 pub(super) use named_enum;
 
 named_enum!(
-    /// The paper's two approaches to reconstruct the frames seen.
+    /// The paper's two approaches to reconstruct the context frames.
     Reconstruction, "reconstruction", "\"sequence\" and \"stepwise\"", {
         /// Encodes the whole sequence, then decodes it (approach 1).
         Sequence = "sequence",
@@ -73,29 +73,31 @@ named_enum!(
 );
 
 named_enum!(
-    /// What the prediction is conditioned on, besides the frames seen.
-    Conditioning, "conditioning", "\"none\", \"action\" and \"state-action\"", {
-        /// Nothing.
+    /// The inputs of a prediction besides the context frames.
+    Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
+        /// No further inputs.
         None = "none",
         /// The action that leads to each predicted frame.
         Action = "action",
-        /// The action that leads to each predicted frame, and the state at the last frame seen.
+        /// The state at the last context frame.
+        State = "state",
+        /// The action that leads to each predicted frame, and the state at the last context frame.
         StateAction = "state-action",
     }
 );
 
-/// One component of an action or a state, and the scale by which it enters the network: (value − mean) / std.
+/// One component of an action or a state, and how it is scaled for the network: (value − mean) / std.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ChannelScale {
-    /// What the component is, for example `linear`.
+    /// The component's name, for example `linear`.
     pub name: String,
-    /// Its unit, for example `m/s`; empty where it has none.
+    /// Its unit, for example `m/s`; empty if it has none.
     pub unit: String,
     /// Mean over the training data, in that unit.
     pub mean: f32,
-    /// Standard deviation over the training data, in that unit; taken as [`MIN_CHANNEL_STD`] where less.
+    /// Standard deviation over the training data, in that unit; at least [`MIN_CHANNEL_STD`] is used.
     pub std: f32,
 }
 
@@ -105,7 +107,7 @@ impl fmt::Display for ChannelScale {
     }
 }
 
-/// All dimensions of a model, and what its numbers mean.
+/// All dimensions of a model, and the meaning of its inputs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
@@ -114,25 +116,25 @@ pub struct ModelSpec {
     pub frame_width_px: u32,
     /// Height of a frame in pixels.
     pub frame_height_px: u32,
-    /// Time from one frame to the next in seconds.
+    /// Seconds from one frame to the next.
     pub frame_period_s: f64,
-    /// How frames enter the model's space.
+    /// How frames are converted to the model's value range.
     pub preprocess: Preprocess,
-    /// Frames seen before the prediction starts.
+    /// Number of context frames.
     pub context: usize,
-    /// Frames predicted.
+    /// Number of predicted frames.
     pub horizon: usize,
     /// Features of a frame, F.
     pub features: usize,
     /// Hidden units of each LSTM, H.
     pub hidden: usize,
-    /// How the frames seen are reconstructed.
+    /// How the context frames are reconstructed.
     pub reconstruction: Reconstruction,
-    /// What the prediction is conditioned on.
+    /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
-    /// Components of an action of the data it was trained on; taken only where `conditioning` names actions.
+    /// Components of an action in the training data; used only if `conditioning` includes actions.
     pub actions: Vec<ChannelScale>,
-    /// Components of a state of that data; taken only where `conditioning` names states.
+    /// Components of a state in the training data; used only if `conditioning` includes the state.
     pub states: Vec<ChannelScale>,
 }
 
@@ -156,7 +158,7 @@ impl Default for ModelSpec {
 }
 
 impl ModelSpec {
-    /// Checks every field against its bound. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`.
+    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`.
     pub fn validate(&self) -> Result<(), NnError> {
         let side = f64::from(MAX_MODEL_SIDE_PX);
         in_range("frame_width_px", f64::from(self.frame_width_px), 1.0, side)?;
@@ -217,16 +219,16 @@ impl ModelSpec {
         self.frame_width_px as usize * self.frame_height_px as usize
     }
 
-    /// Components of an action that enter the predictor; `None` if the conditioning ignores actions.
+    /// Number of action components that the predictor gets; `None` if the conditioning does not include actions.
     #[must_use]
     pub fn action_inputs(&self) -> Option<usize> {
-        (self.conditioning != Conditioning::None).then_some(self.actions.len())
+        matches!(self.conditioning, Conditioning::Action | Conditioning::StateAction).then_some(self.actions.len())
     }
 
-    /// Components of a state that enter the predictor; `None` if the conditioning ignores states.
+    /// Number of state components that the predictor gets; `None` if the conditioning does not include the state.
     #[must_use]
     pub fn state_inputs(&self) -> Option<usize> {
-        (self.conditioning == Conditioning::StateAction).then_some(self.states.len())
+        matches!(self.conditioning, Conditioning::State | Conditioning::StateAction).then_some(self.states.len())
     }
 
     /// Inputs of the predictor's LSTM: features, then the action, then the state.
@@ -235,7 +237,7 @@ impl ModelSpec {
         self.features + self.action_inputs().unwrap_or(0) + self.state_inputs().unwrap_or(0)
     }
 
-    /// Inputs of the reconstructor's LSTM: its own output fed back (approach 1), or the encoder's output (approach 2).
+    /// Inputs of the reconstructor's LSTM: its own previous output (approach 1), or the encoder's output (approach 2).
     #[must_use]
     pub fn reconstructor_inputs(&self) -> usize {
         match self.reconstruction {
@@ -273,33 +275,33 @@ impl ModelSpec {
         shapes
     }
 
-    /// Number of trained values, the reconstructor's among them.
+    /// Number of parameters, including the reconstructor's.
     #[must_use]
     pub fn parameter_count(&self) -> u64 {
         self.tensor_shapes()
             .values()
-            .map(|shape| shape.iter().map(|&side| side as u64).product::<u64>())
+            .map(|shape| shape.iter().map(|&size| size as u64).product::<u64>())
             .sum()
     }
 
-    /// Multiply–adds of weights (biases and the gates' own products apart) per predicted frame, with the context's
-    /// encoding spread over the frames predicted, rounded up:
+    /// Multiply–add operations with weights per predicted frame, rounded up. Biases and the products inside the gates are
+    /// not counted. The cost of encoding the context is divided by the horizon:
     ///
     /// `(context · (P·F + L(F)) + horizon · (L(F+A+S) + H·F + F·P)) / horizon`, `L(D) = 4H·(D + H) + 3H`.
     ///
-    /// A session that keeps the encoder's state does less; the reconstructor has no part in a prediction.
+    /// A session keeps the features of earlier frames, so it computes less. The reconstructor is not used in a prediction.
     #[must_use]
     pub fn multiply_adds_per_frame(&self) -> u64 {
         let (context, horizon) = (self.context as u64, self.horizon.max(1) as u64);
         let (pixels, features, hidden) = (self.pixels() as u64, self.features as u64, self.hidden as u64);
         let lstm = |inputs: u64| 4 * hidden * (inputs + hidden) + 3 * hidden;
-        let seen = context * (pixels * features + lstm(features));
-        let predicted = lstm(self.predictor_inputs() as u64) + hidden * features + features * pixels;
-        seen.div_ceil(horizon) + predicted
+        let encoding = context * (pixels * features + lstm(features));
+        let prediction = lstm(self.predictor_inputs() as u64) + hidden * features + features * pixels;
+        encoding.div_ceil(horizon) + prediction
     }
 }
 
-/// Refuses a value outside its bounds, NaN with it.
+/// Errors: `OutOfRange` if the value is NaN or not in the range.
 fn in_range(field: &'static str, value: f64, min: f64, max: f64) -> Result<(), NnError> {
     if (min..=max).contains(&value) {
         return Ok(());

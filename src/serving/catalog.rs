@@ -1,4 +1,4 @@
-//! The models that answer, by name. A handle to one keeps that version alive after another has taken its name.
+//! The active version of each model, by name. A handle keeps its version loaded after another version becomes active.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +13,7 @@ pub(super) struct Catalog {
 }
 
 impl Catalog {
-    pub(super) fn of(models: Vec<LoadedModel>) -> Self {
+    pub(super) fn new(models: Vec<LoadedModel>) -> Self {
         let named = models
             .into_iter()
             .map(|model| (model.manifest.name.clone(), Arc::new(model)));
@@ -37,7 +37,7 @@ impl Catalog {
         let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
         models.get(name).cloned().ok_or_else(|| ServingError::UnknownModel {
             name: name.to_owned(),
-            known: models.keys().cloned().collect(),
+            available: models.keys().cloned().collect(),
         })
     }
 

@@ -1,7 +1,7 @@
 //! Predictions on the caller's own thread, for a program that has one camera and one model and needs no [`super::Predictor`].
 
 use super::input::check_size;
-use super::task::{REQUEST, RawConditioning};
+use super::task::{REQUEST_FIELDS, RawConditioning};
 use super::{ConditioningInput, InputError, ServingError, SessionState, compute};
 use crate::frame::Frame;
 use crate::registry::LoadedModel;
@@ -21,7 +21,7 @@ impl ConditioningInput {
             future: future_actions,
             state,
         };
-        Self::new(raw, &REQUEST, &loaded.manifest.name, loaded.model.spec())
+        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.model.spec())
     }
 }
 
@@ -44,7 +44,7 @@ impl SessionState {
         for features in output.features {
             self.advance(seq, features, conditioning.clone(), spec);
         }
-        Ok(output.futures.into_iter().next())
+        Ok(output.predictions.into_iter().next())
     }
 }
 

@@ -1,4 +1,4 @@
-//! The one thread that computes with the models.
+//! The inference thread: the only thread that computes with the models.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -18,7 +18,7 @@ pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHand
     std::thread::Builder::new()
         .name("inference".to_owned())
         .spawn(move || {
-            // A pool of this thread alone, so that no prediction waits for the threads that train.
+            // A pool with this thread only, so that predictions do not wait for training threads.
             let pool = rayon::ThreadPoolBuilder::new()
                 .num_threads(1)
                 .use_current_thread()
@@ -40,7 +40,7 @@ fn run(queue: &Queue, catalog: &Catalog) {
     }
     catalog.set_ready();
     loop {
-        match queue.take() {
+        match queue.next_work() {
             WorkItem::ModelLoad(load) => load_model(*load, catalog),
             WorkItem::Batch(batch) => answer(batch),
             WorkItem::Stop => return,
@@ -53,11 +53,11 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
     if result.is_ok() {
         catalog.insert(model);
     }
-    // Whoever asked may have gone; the model serves all the same.
+    // The caller may be gone; the model is active all the same.
     let _ = reply.send(result);
 }
 
-/// Predicts once from black frames, so that memory and kernels are warm.
+/// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
     let started = Instant::now();
     compute::predict(model, &[&blank_input(model.model.spec())?])?;
@@ -94,20 +94,20 @@ fn answer(batch: Vec<QueuedTask>) {
             for (waiting, computation) in batch.into_iter().zip(computations) {
                 let computed = TaskOutput {
                     features: computation.features,
-                    futures: computation.futures,
+                    predictions: computation.predictions,
                     queue_us: micros(started.saturating_duration_since(waiting.accepted)),
                     compute_us,
                 };
-                // Nobody listens if the client has gone.
+                // The receiver is gone if the client has disconnected.
                 let _ = waiting.reply.send(Ok(computed));
             }
-            // Whoever waits for the answer does not wait for this.
-            meter::computed(&model.manifest.name, &accepted, started, compute_us);
+            // After the answers, so that no client waits for the metrics.
+            meter::record_batch(&model.manifest.name, &accepted, started, compute_us);
         }
-        // One bad task must not fail its neighbours.
+        // One bad task must not fail the others of its batch.
         Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(vec![waiting])),
         Err(error) => {
-            meter::refused("error");
+            meter::record_refusal("error");
             if let Some(waiting) = batch.into_iter().next() {
                 let _ = waiting.reply.send(Err(error));
             }

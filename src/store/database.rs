@@ -1,4 +1,4 @@
-//! The two databases behind one face: the same statements and values go to either. Whatever differs is here.
+//! SQLite and PostgreSQL behind one interface: both get the same statements and values. All differences are here.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -15,14 +15,21 @@ use sqlx::{
 
 use super::StoreError;
 
-/// Connections to the database at most.
+/// The maximum number of connections to the database.
 const MAX_CONNECTIONS: u32 = 8;
 /// How long a statement waits for a connection or, on SQLite, for another writer.
-const PATIENCE: Duration = Duration::from_secs(10);
+const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 
-const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "initial", include_str!("migrations/0001_initial.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "initial", include_str!("migrations/0001_initial.sql")),
+    (
+        2,
+        "attempts and metrics",
+        include_str!("migrations/0002_attempts_and_metrics.sql"),
+    ),
+];
 
-/// What a statement is given for `$1`, `$2`, …
+/// A parameter of a statement: `$1`, `$2`, …
 #[derive(Clone, Debug)]
 pub(super) enum DatabaseValue {
     Text(Option<String>),
@@ -44,14 +51,14 @@ value_from!(Text: &str => |text: &str| Some(text.to_owned()), String => Some, Op
 value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::from(int)));
 value_from!(Real: f64 => Some, Option<f64> => |real| real);
 
-/// A row that came back.
+/// A row of a result.
 pub(super) enum DatabaseRow {
     Sqlite(SqliteRow),
     Postgres(PgRow),
 }
 
 impl DatabaseRow {
-    /// The value in a column. Errors: `Query` if there is none of that name and type.
+    /// The value in a column. Errors: `Query` if there is no column of that name and type.
     pub(super) fn get<T>(&self, column: &str) -> Result<T, StoreError>
     where
         T: for<'r> Decode<'r, Sqlite> + Type<Sqlite> + for<'r> Decode<'r, Postgres> + Type<Postgres>,
@@ -70,7 +77,7 @@ pub(super) enum Database {
     Postgres(PgPool),
 }
 
-/// A transaction that is rolled back unless committed. On SQLite nobody else writes meanwhile.
+/// A transaction. It is rolled back unless committed. On SQLite, only one transaction writes at a time.
 pub(super) enum Tx {
     Sqlite(Transaction<'static, Sqlite>),
     Postgres(Transaction<'static, Postgres>),
@@ -104,7 +111,7 @@ impl Database {
             _ => Err(StoreError::Url {
                 flag: "database",
                 scheme: scheme.chars().take(16).collect(),
-                known: "sqlite:FILE or postgres://USER@HOST/NAME",
+                expected: "sqlite:FILE or postgres://USER@HOST/NAME",
             }),
         }
     }
@@ -114,7 +121,7 @@ impl Database {
     }
 
     async fn open_sqlite(options: SqliteConnectOptions) -> Result<Self, StoreError> {
-        // SQLite's migrations lock nothing, and two processes may start at once.
+        // SQLite's migrations take no lock, and two processes can start at the same time.
         let lock_path = options.get_filename().with_extension("lock");
         let failed = StoreError::io("lock", &lock_path);
         let locked = tokio::task::spawn_blocking(move || {
@@ -125,10 +132,10 @@ impl Database {
         let options = options
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
-            .busy_timeout(PATIENCE);
+            .busy_timeout(BUSY_TIMEOUT);
         let pool = SqlitePoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
-            .acquire_timeout(PATIENCE)
+            .acquire_timeout(BUSY_TIMEOUT)
             .connect_with(options)
             .await
             .map_err(|source| StoreError::Open {
@@ -142,22 +149,22 @@ impl Database {
     async fn open_postgres(url: &str) -> Result<Self, StoreError> {
         let pool = PgPoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
-            .acquire_timeout(PATIENCE)
+            .acquire_timeout(BUSY_TIMEOUT)
             .connect(url);
         let pool = match pool.await {
             Ok(pool) => pool,
-            // A pool that got no connection in time does not say why; a connection of its own does.
+            // The pool's timeout hides the reason; a single connection reports it.
             Err(sqlx::Error::PoolTimedOut) => {
                 let reason = PgConnection::connect(url).await.err();
-                return Err(unopened(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
+                return Err(open_failed(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
             }
-            Err(error) => return Err(unopened(error)),
+            Err(error) => return Err(open_failed(error)),
         };
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Postgres(pool))
     }
 
-    /// The rows that a statement gives.
+    /// The rows of a query.
     pub(super) async fn fetch(
         &self,
         sql: &'static str,
@@ -179,7 +186,7 @@ impl Database {
         })
     }
 
-    /// Begins a transaction that will write.
+    /// Begins a write transaction.
     pub(super) async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(match self {
             Self::Sqlite(pool) => Tx::Sqlite(pool.begin_with("BEGIN IMMEDIATE").await?),
@@ -197,7 +204,7 @@ impl Tx {
         self.fetch_any(sql.into_sql_str(), values).await
     }
 
-    /// As `fetch`, but holds the rows and passes over those that another transaction holds.
+    /// As `fetch`, but locks the rows and skips those that another transaction has locked.
     pub(super) async fn fetch_free(
         &mut self,
         sql: &'static str,
@@ -242,7 +249,7 @@ fn postgres_rows(rows: Vec<PgRow>) -> Vec<DatabaseRow> {
     rows.into_iter().map(DatabaseRow::Postgres).collect()
 }
 
-fn unopened(source: sqlx::Error) -> StoreError {
+fn open_failed(source: sqlx::Error) -> StoreError {
     match source {
         sqlx::Error::Tls(_) if !cfg!(feature = "cloud") => StoreError::NoTls,
         source => StoreError::Open {

@@ -1,4 +1,4 @@
-//! The program itself: exit codes and what it says where it can't do what was asked.
+//! The command line: exit codes and error messages.
 
 use std::fs;
 use std::path::Path;
@@ -12,19 +12,19 @@ use crate::service;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_foreframe");
 
-/// Exit code and standard error of a command line, run in a directory.
+/// Runs a command line in a directory; returns the exit code and standard error.
 fn run(dir: &Path, line: &str) -> (i32, String) {
-    ended(Command::new(PROGRAM).args(line.split_whitespace()).current_dir(dir))
+    exit_of(Command::new(PROGRAM).args(line.split_whitespace()).current_dir(dir))
 }
 
-fn ended(command: &mut Command) -> (i32, String) {
+fn exit_of(command: &mut Command) -> (i32, String) {
     let output = command.output().unwrap();
     let text = String::from_utf8(output.stderr).unwrap();
     assert!(!text.contains("panicked"), "{text}");
     (output.status.code().unwrap(), text)
 }
 
-fn done(dir: &Path, line: &str) -> String {
+fn succeed(dir: &Path, line: &str) -> String {
     let output = Command::new(PROGRAM)
         .args(line.split_whitespace())
         .current_dir(dir)
@@ -38,10 +38,10 @@ fn done(dir: &Path, line: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A small data set under its default name, and models `plain` and `moving` of another frame size.
-fn workplace() -> tempfile::TempDir {
+/// A directory with a small data set under its default name, and models `plain` and `moving` of another frame size.
+fn working_dir() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
-    done(dir.path(), "collect --trials 3 --frame-size 8");
+    succeed(dir.path(), "collect --trials 3 --frame-size 8");
     for (name, conditioning) in [("plain", Conditioning::None), ("moving", Conditioning::StateAction)] {
         service::model(&dir.path().join("models"), name, service::spec(conditioning));
     }
@@ -49,8 +49,8 @@ fn workplace() -> tempfile::TempDir {
 }
 
 #[test]
-fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
-    let dir = workplace();
+fn usage_errors_exit_with_2_and_advice() {
+    let dir = working_dir();
     fs::create_dir(dir.path().join("thesis")).unwrap();
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();
     for (line, expected) in [
@@ -70,7 +70,7 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
         ("collect --trials 4 --frame-size 8", "trials: 3 there, 4 asked"),
         (
             "collect --out thesis",
-            "thesis exists and is not a collection; name a directory that doesn't exist",
+            "thesis exists and is not a collection; use a directory that does not exist",
         ),
         ("collect --out thesis/one.tex", "one.tex exists and is not a collection"),
         (
@@ -94,9 +94,9 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
         ("train", "but the train split has only"),
         (
             "train --set model.context=90",
-            "a window of 95 frames (90 seen, 5 to come) is longer than every episode",
+            "a window of 95 frames (context 90, horizon 5) is longer than every episode",
         ),
-        ("train --set name=A", "\"A\" is no model name"),
+        ("train --set name=A", "\"A\" is not a valid model name"),
         (
             "evaluate --model plane",
             "there is no model \"plane\" in models; there are: moving, plain",
@@ -152,13 +152,13 @@ fn what_is_asked_wrongly_ends_in_2_and_is_told_what_would_be_right() {
         assert!(code == 2 && text.contains(expected), "{line} ended in {code}: {text}");
     }
     assert_eq!(fs::read_dir(dir.path().join("thesis")).unwrap().count(), 1);
-    // What was refused left nothing that the next try would stumble over.
+    // Refused commands leave no files behind.
     assert!(!dir.path().join("runs").exists() && !dir.path().join("a").exists());
 }
 
 #[test]
-fn a_prediction_from_files_says_what_its_frames_and_actions_lack() {
-    let dir = workplace();
+fn predict_reports_invalid_frames_and_actions() {
+    let dir = working_dir();
     let frames = dir.path().join("look");
     fs::create_dir(&frames).unwrap();
     let png = foreframe::frame::codec::encode_png(&service::frame(9)).unwrap();
@@ -225,18 +225,21 @@ fn a_prediction_from_files_says_what_its_frames_and_actions_lack() {
 }
 
 #[test]
-fn a_damaged_data_set_or_model_ends_in_1_and_is_told_with_its_cause() {
-    let dir = workplace();
+fn damaged_files_exit_with_1_and_the_cause() {
+    let dir = working_dir();
     let shard = dir
         .path()
         .join("data/datasets/static-observer/data/chunk-000/file-000.parquet");
     let bytes = fs::read(&shard).unwrap();
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
     let (code, text) = run(dir.path(), "inspect static-observer");
-    assert!(code == 1 && text.contains("file-000.parquet has the sha256"), "{text}");
-    assert!(text.contains("restore the file or collect the data set anew"), "{text}");
+    assert!(code == 1 && text.contains("file-000.parquet has the SHA-256"), "{text}");
+    assert!(
+        text.contains("restore the file or collect the data set again"),
+        "{text}"
+    );
 
-    record_anew(
+    record_hash(
         &dir.path().join("data/datasets/static-observer"),
         &fs::read(&shard).unwrap(),
     );
@@ -247,19 +250,19 @@ fn a_damaged_data_set_or_model_ends_in_1_and_is_told_with_its_cause() {
     fs::write(dir.path().join("models/plain/model.safetensors"), b"short").unwrap();
     let (code, text) = run(dir.path(), "inspect plain");
     assert!(
-        code == 1 && text.contains("fetch the model again or train it anew"),
+        code == 1 && text.contains("download the model or train it again"),
         "{text}"
     );
     fs::write(dir.path().join("models/plain/manifest.json"), b"{").unwrap();
     let (code, text) = run(dir.path(), "evaluate --model plain");
     assert!(
-        code == 1 && text.contains("manifest.json is no model manifest: EOF"),
+        code == 1 && text.contains("manifest.json is not a valid model manifest: EOF"),
         "{text}"
     );
 }
 
-/// Records the shard's bytes as those that were collected.
-fn record_anew(dataset: &Path, shard: &[u8]) {
+/// Changes the recorded hash so that the shard's bytes count as valid.
+fn record_hash(dataset: &Path, shard: &[u8]) {
     let path = dataset.join("meta/foreframe.json");
     let mut stamp: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     let hash = sha256_hex(shard);
@@ -268,13 +271,13 @@ fn record_anew(dataset: &Path, shard: &[u8]) {
     fs::write(&path, stamp.to_string()).unwrap();
 }
 
-/// The system's limit on a file's size stands for a disk without room.
+/// A limit on the file size simulates a full disk.
 #[cfg(unix)]
 #[test]
-fn a_file_that_can_not_be_written_is_told_with_its_cause_and_leaves_no_data_set() {
+fn a_failed_write_leaves_no_data_set() {
     let dir = tempfile::tempdir().unwrap();
     let script = format!("trap '' XFSZ; ulimit -f 4; exec '{PROGRAM}' collect --trials 3");
-    let (code, text) = ended(Command::new("sh").args(["-c", &script]).current_dir(dir.path()));
+    let (code, text) = exit_of(Command::new("sh").args(["-c", &script]).current_dir(dir.path()));
     assert_eq!(code, 1, "{text}");
     let written = "could not write data/datasets/static-observer/data/chunk-000/file-000.parquet: File too large";
     assert!(text.contains(written), "{text}");
@@ -287,25 +290,25 @@ fn a_file_that_can_not_be_written_is_told_with_its_cause_and_leaves_no_data_set(
 }
 
 #[test]
-fn collect_train_and_evaluate_meet_in_one_place_without_being_told() {
+fn collect_train_and_evaluate_share_default_directories() {
     let dir = tempfile::tempdir().unwrap();
-    done(dir.path(), "collect --trials 40 --frame-size 8");
+    succeed(dir.path(), "collect --trials 40 --frame-size 8");
     let small = "--set data.windows=40 --set pretrain.steps=1 --set fit.steps=2 --set model.features=4 \
                  --set model.hidden=4";
     fs::create_dir(dir.path().join("thesis")).unwrap();
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();
     let (code, text) = run(dir.path(), &format!("train {small} --out thesis"));
     assert!(
-        code == 2 && text.contains("thesis exists and holds no training run; name a new directory"),
+        code == 2 && text.contains("thesis exists and holds no training run; use a new directory"),
         "{text}"
     );
-    done(dir.path(), &format!("train {small}"));
-    let scores = done(
+    succeed(dir.path(), &format!("train {small}"));
+    let scores = succeed(
         dir.path(),
         "evaluate --model runs/paper/model --resamples 100 --windows 5",
     );
     assert!(scores.ends_with("reports/paper/report.md\n"), "{scores}");
-    let described = done(dir.path(), "inspect runs/paper/model");
+    let described = succeed(dir.path(), "inspect runs/paper/model");
     for network in ["ConvLSTM (Shi et al. 2015)", "CDNA (Finn et al. 2016)"] {
         assert!(described.contains(network), "{described}");
     }

@@ -1,4 +1,4 @@
-//! The configuration: what goes over what, where values come from, and how wrong ones are refused.
+//! The configuration: precedence, sources of values, and refusals.
 
 use foreframe::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
 use foreframe::telemetry::LogFormat;
@@ -22,7 +22,7 @@ fn refused(layers: Vec<ConfigLayer>) -> String {
 }
 
 #[test]
-fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
+fn flags_override_environment_file_and_defaults() {
     let layers = [file("max_streams = 1\nmax_frames = 1\nmax_batch = 1")]
         .into_iter()
         .chain(environment(&[
@@ -46,7 +46,7 @@ fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
 }
 
 #[test]
-fn what_is_printed_can_be_read_as_a_file() {
+fn the_printed_configuration_is_a_valid_file() {
     let settings = [
         "drain_ms=5",
         "cors_origins=[\"http://a\"]",
@@ -62,7 +62,7 @@ fn what_is_printed_can_be_read_as_a_file() {
 }
 
 #[test]
-fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
+fn every_limit_is_checked_against_its_range() {
     let defaults = Config::default().server;
     for (field, value, range) in defaults.bounds() {
         let setting = ConfigLayer::setting(&format!("{field}={value}")).unwrap();
@@ -86,7 +86,7 @@ fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
 }
 
 #[test]
-fn what_is_no_setting_is_refused_with_where_it_was_given() {
+fn invalid_settings_are_refused_with_their_source() {
     let set = |setting| vec![ConfigLayer::setting(setting).unwrap()];
     for (layers, expected) in [
         (
@@ -131,7 +131,7 @@ fn what_is_no_setting_is_refused_with_where_it_was_given() {
 }
 
 #[test]
-fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
+fn empty_urls_and_test_variables_are_ignored() {
     let variables = [
         ("FOREFRAME_DATABASE_URL", ""),
         ("FOREFRAME_TEST_POSTGRES", "x"),
