@@ -28,6 +28,7 @@ const TEST_PREFIX: &str = "FOREFRAME_TEST_";
 
 /// Why there is no configuration.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ConfigError {
     /// A file, a key or a value cannot be used.
     #[error(transparent)]

@@ -12,6 +12,7 @@ pub const MAX_SIDE_PX: u32 = 4096;
 
 /// Why a frame was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum FrameError {
     /// A side is zero or over [`MAX_SIDE_PX`].
     #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]

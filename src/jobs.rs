@@ -32,6 +32,7 @@ pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum JobError {
     /// No job has that id.
     #[error("there is no job \"{id}\"; only the latest ended jobs are kept")]

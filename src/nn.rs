@@ -32,6 +32,7 @@ pub use spec::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum NnError {
     /// A number of the specification is out of range.
     #[error("model specification: {field} is {value}; it must be {min} to {max}")]

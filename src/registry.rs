@@ -20,6 +20,7 @@ pub const MANIFEST_FILE: &str = "manifest.json";
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum RegistryError {
     /// No model has this name.
     #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]

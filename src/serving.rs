@@ -5,6 +5,7 @@
 mod catalog;
 mod compute;
 mod input;
+mod local;
 mod meter;
 mod queue;
 mod task;
@@ -37,6 +38,7 @@ const PARTS_IN_A_BATCH: usize = 4;
 
 /// Why a prediction failed.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ServingError {
     /// No model of that name is loaded.
     #[error("there is no model \"{name}\"; there are: {}", .available.join(", "))]
@@ -97,6 +99,7 @@ pub enum ServingError {
 
 /// The predictor's limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PredictorConfig {
     /// How many requests can wait, at least 1.
     pub queue_capacity: usize,
@@ -118,6 +121,7 @@ impl Default for PredictorConfig {
 
 /// Predicted frames and how long they took.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Prediction {
     /// The model's name.
     pub model: String,
@@ -133,6 +137,7 @@ pub struct Prediction {
 
 /// The output of a [`Task`] and how long it took.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct TaskOutput {
     /// The features of the task's frames, in order.
     pub features: Vec<Features>,

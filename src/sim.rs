@@ -43,7 +43,8 @@ const PHYSICS_STEP_S: f32 = 0.02;
 const BLOCKED_LIMIT_S: f32 = 1.0;
 
 /// Position and heading of a robot on the floor.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PlanarPose {
     /// Metres ahead of the arena's back wall.

@@ -33,6 +33,7 @@ const KEYS_MARKER: &str = "api-keys-created";
 
 /// Why the store could not be read or written.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum StoreError {
     /// A URL with an unknown scheme. The error shows only the scheme, because the rest can hold a password.
     #[error("{flag} starts with \"{scheme}\"; use {expected}")]

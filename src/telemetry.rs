@@ -6,15 +6,12 @@ pub mod names;
 
 #[cfg(feature = "otlp")]
 mod otlp;
+#[cfg(feature = "server")]
 mod prometheus;
 
-use std::io::IsTerminal as _;
-
 use serde::{Deserialize, Serialize};
-use tracing_subscriber::layer::SubscriberExt as _;
-use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{EnvFilter, Layer as _, fmt};
 
+#[cfg(feature = "server")]
 pub use prometheus::{install_recorder, render, run_upkeep};
 
 /// Format of log lines.
@@ -30,6 +27,7 @@ pub enum LogFormat {
 
 /// Why traces cannot be sent.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TelemetryError {
     /// The program was built without the feature `otlp`.
     #[error("otlp_endpoint is set, but this program was built without the feature otlp; build it with --features otlp")]
@@ -48,7 +46,14 @@ pub struct Telemetry {
 
 /// Installs the log subscriber of the process; a second call changes nothing. If `otlp_endpoint` is given, for example
 /// `http://127.0.0.1:4318`, spans are sent there. Errors: `NoOtlp`, `Otlp`.
+#[cfg(feature = "server")]
 pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry, TelemetryError> {
+    use std::io::IsTerminal as _;
+
+    use tracing_subscriber::layer::SubscriberExt as _;
+    use tracing_subscriber::util::SubscriberInitExt as _;
+    use tracing_subscriber::{EnvFilter, Layer as _, fmt};
+
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     // Use colours only in a terminal, not in files.
     let lines = fmt::layer()

@@ -37,6 +37,7 @@ const MAX_PRINCIPAL_FRAMES: usize = 8192;
 
 /// Why a training could not start or stopped.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TrainError {
     /// No preset has this name.
     #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]

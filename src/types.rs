@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 /// Why a value was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[non_exhaustive]
 pub enum ValueError {
     /// An action or state held NaN, an infinity, or a number beyond [`MAX_MAGNITUDE`].
     #[error("{kind} component {index} is {value}; every component must be a number from -1e30 to 1e30")]
@@ -106,7 +107,8 @@ finite_vector!(
 );
 
 /// Name and unit of one component of an action or a state.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Channel {
     /// What the component is, for example `linear`.

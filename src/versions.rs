@@ -20,6 +20,7 @@ use crate::telemetry::names;
 
 /// Why a version could not be loaded, published, activated or deleted.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum VersionError {
     /// There is no such model or version.
     #[error(

@@ -7,6 +7,7 @@ use crate::sim::SimError;
 
 /// Why a data set could not be written, read or sampled.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum DatasetError {
     /// The parts of an episode have different numbers of frames.
     #[error("episode {episode}: {part} has {found} values; {frames} frames need {expected}")]

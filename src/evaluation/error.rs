@@ -10,6 +10,7 @@ use crate::types::ValueError;
 
 /// What was wrong, and what would be right.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum EvaluationError {
     /// The frames have another size.
     #[error(

@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use super::{Frame, FrameError, MAX_SIDE_PX};
 
 /// How a frame of another shape becomes one of the wanted shape.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Fit {
     /// Keeps the proportions and cuts off what does not fit, equally on both sides.

@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use super::{Frame, FrameError};
 
 /// How frames are converted to the model's value range.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Preprocess {
     /// Standard deviation of the Gaussian smoothing, in pixels; 0 means no smoothing.

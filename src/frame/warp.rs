@@ -12,7 +12,8 @@ use super::FrameError;
 const MIN_DEPTH: f32 = 1e-3;
 
 /// How a pinhole camera with square pixels projects. It looks ahead of the robot, tilted down.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(try_from = "UncheckedCameraModel")]
 pub struct CameraModel {
     /// Angle between the left and the right edge of the image, in radians: above 0, below π.

@@ -7,6 +7,7 @@ use crate::types::{Action, RobotState};
 
 /// Why an input does not fit a model. Names the field.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum InputError {
     /// The number of frames is not the model's context.
     #[error("frames holds {found} images; model \"{model}\" takes {expected}")]

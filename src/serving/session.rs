@@ -14,6 +14,7 @@ use crate::types::{Action, RobotState};
 
 /// Why an imported session state does not fit the model.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MemoryError {
     /// More frames than the context.
     #[error("memory.features holds {found} frames; the model keeps at most {most}")]
@@ -57,7 +58,8 @@ pub enum MemoryError {
 }
 
 /// The exported state of a session: what another server needs to continue it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SessionMemory {
     /// The expected sequence number of the next frame.
@@ -65,10 +67,10 @@ pub struct SessionMemory {
     /// The features of the last frames, oldest first, -1 to 1; at most as many frames as the model's context.
     pub features: Vec<Vec<f32>>,
     /// The actions of the last conditioning input; empty if the model takes none.
-    #[schema(value_type = Vec<Vec<f32>>)]
+    #[cfg_attr(feature = "server", schema(value_type = Vec<Vec<f32>>))]
     pub actions: Vec<Action>,
     /// The robot's state at the last frame; absent if the model takes none.
-    #[schema(value_type = Option<Vec<f32>>)]
+    #[cfg_attr(feature = "server", schema(value_type = Option<Vec<f32>>))]
     pub state: Option<RobotState>,
 }
 

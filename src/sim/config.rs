@@ -7,7 +7,8 @@ use crate::frame::MAX_SIDE_PX;
 use crate::frame::warp::CameraModel;
 
 /// Tb1's camera.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Height of the pinhole above the floor, in metres.
@@ -43,7 +44,8 @@ impl Default for CameraConfig {
 }
 
 /// Settings of a world.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldConfig {
     /// Width of a frame in pixels.

@@ -6,6 +6,7 @@ use crate::types::ValueError;
 
 /// Why a world could not be created or a step could not be simulated.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum SimError {
     /// No scenario has this name.
     #[error("there is no scenario \"{name}\"; there are {}", scenario::names())]

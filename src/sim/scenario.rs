@@ -26,7 +26,8 @@ const CROWD: usize = 3;
 const MAX_CROWD: usize = 16;
 
 /// Which robots move, and when a trial ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Scenario {
     /// The paper's scenario: Tb1 stands still; the trial ends when Tb2 reaches its goal.
@@ -79,7 +80,8 @@ impl FromStr for Scenario {
 }
 
 /// Gains of a robot's two PID controllers, for heading and distance, and its highest speed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PidGains {
     /// From heading error (rad) to angular velocity (rad/s).
@@ -109,7 +111,8 @@ impl PidGains {
 }
 
 /// Start pose, first goal and controller gains of a robot.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Route {
     /// Pose at the start.
@@ -121,7 +124,8 @@ pub struct Route {
 }
 
 /// All random parameters of a trial.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TrialParameters {
     /// The scenario.
@@ -129,7 +133,7 @@ pub struct TrialParameters {
     /// Number of the trial, counted from 0 for each seed.
     pub trial: u64,
     /// The seed of all trials.
-    #[schema(value_type = u64)]
+    #[cfg_attr(feature = "server", schema(value_type = u64))]
     pub seed: Seed,
     /// Tb2's start, an index of [`arena::STARTS_M`].
     pub start: usize,

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 /// The two stages of a training.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum TrainingStage {
     /// Stage 1, pre-training: the dense codec alone.
@@ -23,6 +24,7 @@ impl std::fmt::Display for TrainingStage {
 
 /// An event of a training.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum TrainingEvent {
     /// The training starts or resumes.
     Started {

@@ -23,6 +23,7 @@ const STEP: &str = "adam.step";
 
 /// Why an update failed. Parameters and moments are unchanged.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum OptimizerError {
     /// The loss is NaN or infinite.
     #[error("the loss is {value}; it must be a finite number")]

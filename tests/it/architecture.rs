@@ -166,6 +166,17 @@ fn no_file_is_longer_than_400_lines() {
     }
 }
 
+#[test]
+fn every_expect_says_that_its_failure_is_a_bug() {
+    for (file, text) in sources() {
+        let code: String = code(&text).collect();
+        for call in code.split(".expect(").skip(1) {
+            let message = call.split('"').nth(1).unwrap_or_default();
+            assert!(message.ends_with("is a bug"), "{file} expects {message:?}");
+        }
+    }
+}
+
 /// The rooms of the server in their order. A file uses only files of its own room and of rooms before it.
 const SERVER_ROOMS: &[&str] = &[
     "token",
