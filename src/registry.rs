@@ -96,7 +96,9 @@ pub fn is_valid_name(name: &str) -> bool {
 /// Names and directories of the models in a directory, sorted by name. A missing directory contains none. Errors: `Io` if
 /// the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
-    let named = directories(models_dir)?.into_iter().map(|path| (directory_name(&path), path));
+    let named = directories(models_dir)?
+        .into_iter()
+        .map(|path| (directory_name(&path), path));
     let mut models: Vec<_> = named
         .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
         .collect();

@@ -18,9 +18,9 @@ use std::sync::atomic::AtomicBool;
 
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
+use self::checkpoint::{Checkpoint, RunFiles};
 #[cfg(test)]
 pub(crate) use self::checkpoint::{hash_entry, seal};
-use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};

@@ -197,7 +197,13 @@ impl Versions {
         let name = model.to_owned();
         let is_shipped = self.shipped(model) == Some(version);
         // The name of a shipped model is that of its directory.
-        let load = move || if is_shipped { registry::load_as(&dir, &name) } else { registry::load(&dir) };
+        let load = move || {
+            if is_shipped {
+                registry::load_as(&dir, &name)
+            } else {
+                registry::load(&dir)
+            }
+        };
         let loaded = tokio::task::spawn_blocking(load).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?

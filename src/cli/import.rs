@@ -73,13 +73,18 @@ pub(super) struct ImportArgs {
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {
-    let sides = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    let sides = text
+        .split_once('x')
+        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
     sides.ok_or_else(|| "write WIDTHxHEIGHT, as in 64x64".to_owned())
 }
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
-    let out = args.out.clone().unwrap_or_else(|| workspace.datasets_dir().join(name(&args)));
+    let out = args
+        .out
+        .clone()
+        .unwrap_or_else(|| workspace.datasets_dir().join(name(&args)));
     let config = ImportConfig {
         source: args.source,
         out: out.clone(),
@@ -124,7 +129,10 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             print_line(format!("  {}: {}", item.place, item.reason))?;
         }
         if imported.skipped.len() > LISTED_ITEMS {
-            print_line(format!("  … all of them are in {}", out.join("meta/skipped.json").display()))?;
+            print_line(format!(
+                "  … all of them are in {}",
+                out.join("meta/skipped.json").display()
+            ))?;
         }
     }
     print_line(format!("next: foreframe train --dataset {}", out.display()))
@@ -134,7 +142,9 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
 fn name(args: &ImportArgs) -> String {
     args.name.clone().unwrap_or_else(|| {
         let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
-        source.file_stem().map_or_else(|| "recording".to_owned(), |name| name.to_string_lossy().into_owned())
+        source
+            .file_stem()
+            .map_or_else(|| "recording".to_owned(), |name| name.to_string_lossy().into_owned())
     })
 }
 

@@ -84,9 +84,15 @@ impl CollectionStatus {
         let complete = (0..shards)
             .take_while(|&shard| out.join(shard_path(shard)).exists())
             .count();
-        let in_shards: u64 = (0..complete).map(|shard| config.shard_trials(shard).count() as u64).sum();
-        let beside: u64 = (complete..shards).map(|shard| unfinished::count(out, shard) as u64).sum();
-        Ok(Self::Unfinished { trials: in_shards + beside })
+        let in_shards: u64 = (0..complete)
+            .map(|shard| config.shard_trials(shard).count() as u64)
+            .sum();
+        let beside: u64 = (complete..shards)
+            .map(|shard| unfinished::count(out, shard) as u64)
+            .sum();
+        Ok(Self::Unfinished {
+            trials: in_shards + beside,
+        })
     }
 }
 

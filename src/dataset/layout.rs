@@ -87,15 +87,17 @@ impl DatasetMetadata {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
             let found = std::fs::read_to_string(arguments);
-            return Err(match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
-                Ok(text) => DatasetError::Unfinished {
-                    path: directory.to_owned(),
-                    arguments: one_line(&text),
+            return Err(
+                match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
+                    Ok(text) => DatasetError::Unfinished {
+                        path: directory.to_owned(),
+                        arguments: one_line(&text),
+                    },
+                    Err(_) => DatasetError::NotADataset {
+                        path: directory.to_owned(),
+                    },
                 },
-                Err(_) => DatasetError::NotADataset {
-                    path: directory.to_owned(),
-                },
-            });
+            );
         }
         let path = directory.join(METADATA);
         let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;

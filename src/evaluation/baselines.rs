@@ -409,7 +409,10 @@ mod tests {
             (0..32 * 32).map(at).collect()
         };
         let dataset = recordings(32, frame, pan);
-        let (warped, copied) = (error_of(Method::EgoMotion, &dataset), error_of(Method::CopyLast, &dataset));
+        let (warped, copied) = (
+            error_of(Method::EgoMotion, &dataset),
+            error_of(Method::CopyLast, &dataset),
+        );
         assert!(warped < 0.3 * copied, "{warped} {copied}");
     }
 
@@ -423,7 +426,10 @@ mod tests {
                 .collect()
         };
         let dataset = recordings(SIDE, frame, |_, _| 0.0);
-        let (moved, copied) = (error_of(Method::MovingCutOut, &dataset), error_of(Method::CopyLast, &dataset));
+        let (moved, copied) = (
+            error_of(Method::MovingCutOut, &dataset),
+            error_of(Method::CopyLast, &dataset),
+        );
         assert!(moved < 0.1 * copied, "{moved} {copied}");
     }
 

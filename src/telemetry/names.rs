@@ -19,7 +19,13 @@ macro_rules! names {
 
 /// Sets counters of rare events to 0, so that Prometheus sees the first event as an increase.
 pub(super) fn initialize_counters() {
-    for name in [INFERENCE_PANICS, HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
+    for name in [
+        INFERENCE_PANICS,
+        HTTP_CONNECTIONS_REFUSED,
+        AUTH_REFUSED,
+        SESSIONS_EVICTED,
+        STREAM_DROPPED,
+    ] {
         counter!(name).increment(0);
     }
 }

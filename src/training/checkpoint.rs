@@ -13,7 +13,7 @@ use super::config::{RunConfig, TrainConfig};
 use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{none_if_missing, is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
+use crate::files::{is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// Name of the checkpoint file of a run.

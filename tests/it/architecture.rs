@@ -15,7 +15,10 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "error_text", "frame", "sim"]),
     ("registry", &["types", "files", "error_text", "nn"]),
-    ("training", &["types", "files", "settings", "frame", "nn", "dataset", "registry"]),
+    (
+        "training",
+        &["types", "files", "settings", "frame", "nn", "dataset", "registry"],
+    ),
     (
         "evaluation",
         &[

@@ -55,11 +55,19 @@ fn tub(dir: &Path) -> PathBuf {
         json!({"created_at": 1.0}),
         json!({"paths": ["catalog_0.catalog"], "current_index": 10, "max_len": 1000, "deleted_indexes": [9]}),
     ];
-    fs::write(source.join("manifest.json"), manifest.map(|line| line.to_string()).join("\n")).unwrap();
+    fs::write(
+        source.join("manifest.json"),
+        manifest.map(|line| line.to_string()).join("\n"),
+    )
+    .unwrap();
     let mut catalog = String::new();
     for index in 0..10u32 {
         let name = format!("{index}_cam_image_array_.jpg");
-        fs::write(source.join("images").join(&name), codec::encode_png(&image(index as u8)).unwrap()).unwrap();
+        fs::write(
+            source.join("images").join(&name),
+            codec::encode_png(&image(index as u8)).unwrap(),
+        )
+        .unwrap();
         let line = json!({"_index": index, "_session_id": "1", "_timestamp_ms": 1000 + 50 * index, "cam/image_array": name,
             "user/angle": f64::from(index) / 10.0, "user/throttle": 0.5, "user/mode": "user"});
         catalog += &format!("{line}\n");
@@ -175,9 +183,13 @@ fn damaged(change: impl Fn(&Path)) -> (String, usize) {
 #[test]
 fn damage_in_a_tub_is_named_or_skipped() {
     let (text, skipped) = damaged(|tub| fs::remove_file(tub.join("images/4_cam_image_array_.jpg")).unwrap());
-    assert!(text.contains("catalog_0.catalog line 5") && text.contains("is missing"), "{text}");
+    assert!(
+        text.contains("catalog_0.catalog line 5") && text.contains("is missing"),
+        "{text}"
+    );
     assert_eq!(skipped, 1);
-    let (text, skipped) = damaged(|tub| fs::write(tub.join("images/2_cam_image_array_.jpg"), b"\xff\xd8nothing").unwrap());
+    let (text, skipped) =
+        damaged(|tub| fs::write(tub.join("images/2_cam_image_array_.jpg"), b"\xff\xd8nothing").unwrap());
     assert!(text.contains("line 3") && text.contains("is damaged"), "{text}");
     assert_eq!(skipped, 1);
     let rewrite = |tub: &Path, from: &str, to: &str| {
@@ -206,12 +218,18 @@ fn csv_mistakes_name_column_and_line() {
         ..small()
     };
     let error = run(&source, &dir.path().join("a"), options).unwrap_err().to_string();
-    assert!(error.contains("no column \"turn\"") && error.contains("action.speed"), "{error}");
+    assert!(
+        error.contains("no column \"turn\"") && error.contains("action.speed"),
+        "{error}"
+    );
     let csv = source.join("log.csv");
     let text = fs::read_to_string(&csv).unwrap();
     fs::write(&csv, text.replacen(",0.3,", ",NaN,", 1)).unwrap();
     let error = run(&source, &dir.path().join("b"), small()).unwrap_err().to_string();
-    assert!(error.contains("log.csv line 5") && error.contains("finite number"), "{error}");
+    assert!(
+        error.contains("log.csv line 5") && error.contains("finite number"),
+        "{error}"
+    );
 }
 
 #[test]

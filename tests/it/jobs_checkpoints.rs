@@ -3,7 +3,7 @@
 use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 
-use crate::service::{app, get, post, poll_until};
+use crate::service::{app, get, poll_until, post};
 
 const JOBS: &str = "/v1/jobs";
 

@@ -233,7 +233,11 @@ fn invalid_directories_are_refused_at_startup() {
     let server = RunningServer::start(dir.path(), &[]);
     assert!(server.get("/v1/models").contains("{\"models\":[]"));
     server.terminate();
-    assert!(server.wait_for_exit().contains("publish a trained model with `foreframe publish DIR`"));
+    assert!(
+        server
+            .wait_for_exit()
+            .contains("publish a trained model with `foreframe publish DIR`")
+    );
 }
 
 #[test]
@@ -291,7 +295,10 @@ fn the_directory_of_a_model_gives_it_its_name() {
     assert!(server.get("/v1/models/other").contains("\"name\":\"other\""));
     server.terminate();
     let log = server.wait_for_exit();
-    assert!(log.contains("my_model") && log.contains("is not a valid model name"), "{log}");
+    assert!(
+        log.contains("my_model") && log.contains("is not a valid model name"),
+        "{log}"
+    );
 }
 
 #[test]

@@ -113,11 +113,7 @@ async fn invalid_candidates_are_refused_with_the_field() {
     let app = app(dir.path(), config);
     let with = |candidates: Value| json!({"frames": context(), "state": [0.5], "candidates": candidates});
     for (body, status, detail) in [
-        (
-            with(json!([])),
-            422,
-            "candidates is empty; give at least one plan",
-        ),
+        (with(json!([])), 422, "candidates is empty; give at least one plan"),
         (
             with(json!([[[0, 0]]])),
             422,

@@ -147,7 +147,10 @@ async fn an_expired_lease_cannot_write() {
         let (row, fresh) = store.claim_at("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
         assert_eq!(
-            store.renew_at(stale, 99.0, report("from an expired lease")).await.unwrap(),
+            store
+                .renew_at(stale, 99.0, report("from an expired lease"))
+                .await
+                .unwrap(),
             None
         );
         assert!(

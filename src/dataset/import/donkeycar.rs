@@ -41,11 +41,17 @@ impl Manifest {
             .map(|(index, line)| serde_json::from_str(line).map_err(|error| wrong(index + 1, &error.to_string())))
             .collect::<Result<_, _>>()?;
         let [names, types, _, _, catalogs, ..] = lines.as_slice() else {
-            return Err(wrong(lines.len(), &format!("the file has {} lines of {MANIFEST_LINES}", lines.len())));
+            return Err(wrong(
+                lines.len(),
+                &format!("the file has {} lines of {MANIFEST_LINES}", lines.len()),
+            ));
         };
-        let inputs = texts(names).zip(texts(types)).map(|(names, types)| names.into_iter().zip(types).collect());
+        let inputs = texts(names)
+            .zip(texts(types))
+            .map(|(names, types)| names.into_iter().zip(types).collect());
         let inputs: Option<Vec<(String, String)>> = inputs;
-        let paths = texts(&catalogs["paths"]).ok_or_else(|| wrong(MANIFEST_LINES, "\"paths\" is not a list of file names"))?;
+        let paths =
+            texts(&catalogs["paths"]).ok_or_else(|| wrong(MANIFEST_LINES, "\"paths\" is not a list of file names"))?;
         let deleted = catalogs["deleted_indexes"].as_array();
         Ok(Self {
             inputs: inputs.ok_or_else(|| wrong(1, "the names and types of the inputs are not lists of texts"))?,
@@ -60,11 +66,17 @@ impl Manifest {
             Some(name) => self.inputs.iter().find(|(input, _)| input == name),
             None => self.inputs.iter().find(|(_, kind)| kind == "image_array"),
         };
-        found.map(|(name, _)| name.clone()).ok_or_else(|| self.missing("an image input", "--image"))
+        found
+            .map(|(name, _)| name.clone())
+            .ok_or_else(|| self.missing("an image input", "--image"))
     }
 
     fn missing(&self, what: &str, option: &str) -> ImportError {
-        let known: Vec<String> = self.inputs.iter().map(|(name, kind)| format!("{name} ({kind})")).collect();
+        let known: Vec<String> = self
+            .inputs
+            .iter()
+            .map(|(name, kind)| format!("{name} ({kind})"))
+            .collect();
         ImportError::Option(format!(
             "the tub has no {what} ({option}); its inputs are: {}",
             known.join(", ")
@@ -85,7 +97,10 @@ impl Manifest {
         if !options.actions.is_empty() {
             return self.named(&options.actions, "--action");
         }
-        let numbers = self.inputs.iter().filter(|(name, kind)| kind == "float" && name.starts_with("user/"));
+        let numbers = self
+            .inputs
+            .iter()
+            .filter(|(name, kind)| kind == "float" && name.starts_with("user/"));
         Ok(numbers.map(|(name, _)| name.clone()).collect())
     }
 }
@@ -158,8 +173,8 @@ struct Reader<'a> {
 impl Reader<'_> {
     /// Index, image and record of a catalog's line.
     fn record(&self, line: &str, place: &str) -> Result<(u64, PathBuf, Record), ImportError> {
-        let fields: Map<String, Value> =
-            serde_json::from_str(line).map_err(|error| ImportError::record(place, format!("not a JSON object: {error}")))?;
+        let fields: Map<String, Value> = serde_json::from_str(line)
+            .map_err(|error| ImportError::record(place, format!("not a JSON object: {error}")))?;
         let wrong = |field: &str, right: &str| {
             let found = fields.get(field).map_or_else(|| "missing".to_owned(), Value::to_string);
             ImportError::record(place, format!("{field:?} is {found}; it must be {right}"))
@@ -173,13 +188,19 @@ impl Reader<'_> {
         let numbers = |names: &[String]| -> Result<Vec<f32>, ImportError> {
             let number = |name: &String| {
                 let value = fields.get(name).and_then(Value::as_f64).map(|value| value as f32);
-                value.filter(|value| value.is_finite()).ok_or_else(|| wrong(name, "a finite number"))
+                value
+                    .filter(|value| value.is_finite())
+                    .ok_or_else(|| wrong(name, "a finite number"))
             };
             names.iter().map(number).collect()
         };
         let record = Record {
             timestamp_s: time_ms / 1000.0,
-            session: fields.get("_session_id").and_then(Value::as_str).unwrap_or_default().to_owned(),
+            session: fields
+                .get("_session_id")
+                .and_then(Value::as_str)
+                .unwrap_or_default()
+                .to_owned(),
             action: numbers(&self.actions)?,
             state: numbers(&self.states)?,
             image: 0,

@@ -126,7 +126,12 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         .trim(csv::Trim::All)
         .from_path(csv)
         .map_err(unreadable)?;
-    let header: Vec<String> = reader.headers().map_err(unreadable)?.iter().map(str::to_owned).collect();
+    let header: Vec<String> = reader
+        .headers()
+        .map_err(unreadable)?
+        .iter()
+        .map(str::to_owned)
+        .collect();
     let columns = Columns::find(&header, csv, options)?;
     let mut recording = Recording {
         name: name_of(folder),
@@ -181,7 +186,11 @@ fn channels(header: &[String], columns: &[usize], options: &ImportOptions) -> Ve
 
 impl Columns {
     fn find(header: &[String], csv: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
-        let position = |name: &str| header.iter().position(|text| text == name || name_and_unit(text).0 == name);
+        let position = |name: &str| {
+            header
+                .iter()
+                .position(|text| text == name || name_and_unit(text).0 == name)
+        };
         let missing = |name: &str, option: &str| {
             ImportError::Option(format!(
                 "{} has no column \"{name}\" ({option}); its columns are: {}",
@@ -194,7 +203,10 @@ impl Columns {
             names.iter().map(find).collect()
         };
         let prefixed = |prefix: &str| -> Vec<usize> {
-            let is_of = |text: &String| text.strip_prefix(prefix).is_some_and(|rest| rest.starts_with(['.', '_', '/']));
+            let is_of = |text: &String| {
+                text.strip_prefix(prefix)
+                    .is_some_and(|rest| rest.starts_with(['.', '_', '/']))
+            };
             (0..header.len()).filter(|&column| is_of(&header[column])).collect()
         };
         let file = match &options.image {
@@ -205,7 +217,10 @@ impl Columns {
                 .ok_or_else(|| missing("file", "name the images' column with --image"))?,
         };
         let time = match &options.time {
-            Some(name) => Some((position(name).ok_or_else(|| missing(name, "--time"))?, seconds_per_unit(name))),
+            Some(name) => Some((
+                position(name).ok_or_else(|| missing(name, "--time"))?,
+                seconds_per_unit(name),
+            )),
             None => TIME_COLUMNS
                 .iter()
                 .find_map(|(name, unit_s)| position(name).map(|column| (column, *unit_s))),
@@ -248,12 +263,19 @@ impl Columns {
         let number = |column: usize| -> Result<f64, ImportError> {
             let value = text(column).parse::<f64>().ok().filter(|value| value.is_finite());
             value.ok_or_else(|| {
-                let reason = format!("column {} is {:?}; it must be a finite number", column + 1, text(column));
+                let reason = format!(
+                    "column {} is {:?}; it must be a finite number",
+                    column + 1,
+                    text(column)
+                );
                 ImportError::record(place, reason)
             })
         };
         let numbers = |columns: &[usize]| -> Result<Vec<f32>, ImportError> {
-            columns.iter().map(|&column| number(column).map(|value| value as f32)).collect()
+            columns
+                .iter()
+                .map(|&column| number(column).map(|value| value as f32))
+                .collect()
         };
         let timestamp_s = match self.time {
             Some((column, unit_s)) => number(column)? * unit_s,
@@ -291,7 +313,10 @@ pub(super) fn inside(folder: &Path, name: &str, place: &str) -> Result<PathBuf, 
     if name.is_empty() || !is_inside {
         return Err(ImportError::record(
             place,
-            format!("the image's name is {name:?}; it must be a file below {}", folder.display()),
+            format!(
+                "the image's name is {name:?}; it must be a file below {}",
+                folder.display()
+            ),
         ));
     }
     Ok(folder.join(relative))

@@ -92,7 +92,10 @@ impl Layout {
             _ => {
                 return Err(ImportError::record(
                     path.display().to_string(),
-                    format!("the array's shape is {:?}; it must be T×H×W, T×N×H×W or N×T×H×W", header.shape),
+                    format!(
+                        "the array's shape is {:?}; it must be T×H×W, T×N×H×W or N×T×H×W",
+                        header.shape
+                    ),
                 ));
             }
         };
@@ -100,7 +103,10 @@ impl Layout {
         if !sides.contains(&height) || !sides.contains(&width) {
             return Err(ImportError::record(
                 path.display().to_string(),
-                format!("its frames are {width}×{height} px; each side must be 1 to {} px", crate::frame::MAX_SIDE_PX),
+                format!(
+                    "its frames are {width}×{height} px; each side must be 1 to {} px",
+                    crate::frame::MAX_SIDE_PX
+                ),
             ));
         }
         Ok(Self {
@@ -140,7 +146,9 @@ impl Header {
         read(&mut length[..length_bytes])?;
         let length = u32::from_le_bytes(length) as usize;
         if length > MAX_HEADER_BYTES {
-            return Err(wrong(format!("its header has {length} bytes; at most {MAX_HEADER_BYTES} are read")));
+            return Err(wrong(format!(
+                "its header has {length} bytes; at most {MAX_HEADER_BYTES} are read"
+            )));
         }
         let mut text = vec![0; length];
         read(&mut text)?;
@@ -225,7 +233,9 @@ mod tests {
     #[test]
     fn pickled_objects_and_other_types_are_refused() {
         for (kind, reason) in [("|O", "pickle"), ("<i8", "uint8"), (">f4", "little endian")] {
-            let error = read(&format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': (2, 4, 4), }}"));
+            let error = read(&format!(
+                "{{'descr': '{kind}', 'fortran_order': False, 'shape': (2, 4, 4), }}"
+            ));
             let error = error.unwrap_err().to_string();
             assert!(error.contains(reason), "{error}");
         }

@@ -34,7 +34,9 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     drop_backward_times(&mut recording, options)?;
     let records = &recording.records;
     let Some(period_s) = median_period(records) else {
-        return Err(ImportError::Empty(options.csv.clone().unwrap_or_else(|| recording.name.clone().into())));
+        return Err(ImportError::Empty(
+            options.csv.clone().unwrap_or_else(|| recording.name.clone().into()),
+        ));
     };
     let (frame_period_s, resampled) = match options.rate_hz {
         Some(rate) if (rate * period_s - 1.0).abs() > RATE_TOLERANCE => (1.0 / rate, true),
@@ -198,7 +200,10 @@ mod tests {
     fn planned(times_s: &[f64], options: &ImportOptions) -> Vec<Vec<(usize, f32)>> {
         let plan = plan(recording(times_s), options).unwrap();
         let of = |frame: &PlannedFrame| (frame.record, frame.action[0]);
-        plan.episodes.iter().map(|episode| episode.iter().map(of).collect()).collect()
+        plan.episodes
+            .iter()
+            .map(|episode| episode.iter().map(of).collect())
+            .collect()
     }
 
     #[test]
@@ -232,7 +237,10 @@ mod tests {
     #[test]
     fn time_that_does_not_grow_is_refused_or_skipped() {
         let times = [0.0, 0.1, 0.05, 0.2, 0.3];
-        let error = plan(recording(&times), &ImportOptions::default()).err().unwrap().to_string();
+        let error = plan(recording(&times), &ImportOptions::default())
+            .err()
+            .unwrap()
+            .to_string();
         assert!(error.starts_with("line 3: its time 0.05 s is not after"), "{error}");
         let options = ImportOptions {
             skip_bad: true,

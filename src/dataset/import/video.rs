@@ -72,9 +72,9 @@ fn frame_size(video: &Path) -> Result<(u32, u32), ImportError> {
     let found = probe(video, "stream=width,height")?;
     let stream = &found["streams"][0];
     let side = |name: &str| stream[name].as_u64().and_then(|side| u32::try_from(side).ok());
-    side("width").zip(side("height")).ok_or_else(|| {
-        ImportError::record(video.display().to_string(), "it holds no video stream")
-    })
+    side("width")
+        .zip(side("height"))
+        .ok_or_else(|| ImportError::record(video.display().to_string(), "it holds no video stream"))
 }
 
 /// The presentation time of every frame, in seconds.
@@ -82,10 +82,11 @@ fn frame_times(video: &Path) -> Result<Vec<f64>, ImportError> {
     let found = probe(video, "frame=pts_time,best_effort_timestamp_time")?;
     let frames = found["frames"].as_array().map(Vec::as_slice).unwrap_or_default();
     let time = |(index, frame): (usize, &Value)| {
-        let text = frame["pts_time"].as_str().or(frame["best_effort_timestamp_time"].as_str());
-        text.and_then(|text| text.parse().ok()).ok_or_else(|| {
-            ImportError::record(format!("{} frame {index}", video.display()), "the frame has no time")
-        })
+        let text = frame["pts_time"]
+            .as_str()
+            .or(frame["best_effort_timestamp_time"].as_str());
+        text.and_then(|text| text.parse().ok())
+            .ok_or_else(|| ImportError::record(format!("{} frame {index}", video.display()), "the frame has no time"))
     };
     frames.iter().enumerate().map(time).collect()
 }
@@ -93,7 +94,16 @@ fn frame_times(video: &Path) -> Result<Vec<f64>, ImportError> {
 fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
     let mut command = Command::new("ffprobe");
     command
-        .args(["-v", "error", "-select_streams", "v:0", "-of", "json", "-show_entries", entries])
+        .args([
+            "-v",
+            "error",
+            "-select_streams",
+            "v:0",
+            "-of",
+            "json",
+            "-show_entries",
+            entries,
+        ])
         .arg(argument(video));
     let output = run(command, "ffprobe", video)?;
     serde_json::from_slice(&output)
@@ -106,7 +116,16 @@ fn decode(video: &Path, decoded: &Path) -> Result<(), ImportError> {
     command
         .args(["-v", "error", "-nostdin", "-y", "-xerror", "-i"])
         .arg(argument(video))
-        .args(["-map", "0:v:0", "-fps_mode", "passthrough", "-pix_fmt", "gray", "-f", "rawvideo"])
+        .args([
+            "-map",
+            "0:v:0",
+            "-fps_mode",
+            "passthrough",
+            "-pix_fmt",
+            "gray",
+            "-f",
+            "rawvideo",
+        ])
         .arg(decoded);
     run(command, "ffmpeg", video).map(drop)
 }

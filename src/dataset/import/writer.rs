@@ -49,7 +49,10 @@ impl<'a> Directory<'a> {
         let path = out.join(IMPORT_ARGUMENTS);
         let arguments = Arguments {
             program_version: env!("CARGO_PKG_VERSION"),
-            source: &config.source.canonicalize().map_err(ImportError::io("read", &config.source))?,
+            source: &config
+                .source
+                .canonicalize()
+                .map_err(ImportError::io("read", &config.source))?,
             options: &config.options,
         };
         let text = serde_json::to_string_pretty(&arguments)
@@ -227,7 +230,8 @@ impl ShardWriter<'_> {
     fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), ImportError> {
         let built = build(self.info, self.start, episodes)?;
         write_atomically(&self.out.join(shard_path(self.written.len())), &built.bytes)?;
-        let records = serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
+        let records =
+            serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
         self.push(FinishedShard {
             sha256: sha256_hex(&built.bytes),
             records,
@@ -237,7 +241,10 @@ impl ShardWriter<'_> {
 
     /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
     /// are returned if the import was cancelled.
-    #[expect(clippy::type_complexity, reason = "episodes, if not cancelled, and what was left out")]
+    #[expect(
+        clippy::type_complexity,
+        reason = "episodes, if not cancelled, and what was left out"
+    )]
     fn encode(
         &self,
         episodes: Range<usize>,
