@@ -31,11 +31,12 @@ pub use layout::{INFO, METADATA};
 pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 
+use crate::error_text::comma_separated;
 use crate::files::hex;
 use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
+use crate::sim::WorldConfig;
 use crate::types::{Channel, Seed};
-use crate::error_text::comma_separated;
 
 /// Description of a data set: frame size, frame period, channels, origin and the hash of its content.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -66,6 +67,8 @@ pub struct DatasetInfo {
     pub has_masks: bool,
     /// How the camera projects; none where that is not known.
     pub camera: Option<CameraModel>,
+    /// How the simulated world was run and seen; none for recordings.
+    pub world: Option<WorldConfig>,
 }
 
 impl DatasetInfo {

@@ -113,10 +113,7 @@ mod tests {
     #[test]
     fn too_few_pixels_are_refused() {
         let error = Frame::new(4, 4, vec![0; 15]).unwrap_err();
-        assert_eq!(
-            error.to_string(),
-            "15 pixels given for a frame of 4×4 px; it needs 16"
-        );
+        assert_eq!(error.to_string(), "15 pixels given for a frame of 4×4 px; it needs 16");
     }
 
     #[test]

@@ -7,8 +7,8 @@ pub mod types;
 
 pub mod files;
 
-pub mod telemetry;
 pub mod error_text;
+pub mod telemetry;
 
 pub mod frame;
 

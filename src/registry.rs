@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 
 pub use self::loader::{LoadedModel, load};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
+use crate::error_text::existing;
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
-use crate::error_text::existing;
 
 /// Name of the weights file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";
@@ -171,11 +171,30 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
     Ok(manifest)
 }
 
-/// Replaces the metrics in a model's manifest, for example with the results of an evaluation. Errors: `Manifest`, `Io`.
+/// Writes metrics into a model's manifest, for example the results of an evaluation. Other metrics stay; a metric given as
+/// null is removed (JSON merge patch, RFC 7396). Errors: `Manifest`, `Io`.
 pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
     let mut manifest = manifest::read(model_dir)?;
-    manifest.metrics = metrics;
+    merge(&mut manifest.metrics, metrics);
     write_manifest(model_dir, &manifest)
+}
+
+fn merge(target: &mut serde_json::Value, patch: serde_json::Value) {
+    let serde_json::Value::Object(patch) = patch else {
+        *target = patch;
+        return;
+    };
+    if !target.is_object() {
+        *target = serde_json::json!({});
+    }
+    let Some(target) = target.as_object_mut() else { return };
+    for (key, value) in patch {
+        if value.is_null() {
+            target.remove(&key);
+        } else {
+            merge(target.entry(key).or_insert(serde_json::Value::Null), value);
+        }
+    }
 }
 
 /// Writes the manifest into a model's directory. Errors: `Manifest`, `Io`.
@@ -196,6 +215,14 @@ pub fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), Regis
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn recording_test_scores_keeps_the_validation_score() {
+        let mut metrics = serde_json::json!({"validation": {"mse": 1, "step": 7}, "test": {"mse": 2}, "old": 3});
+        merge(&mut metrics, serde_json::json!({"test": {"mse": 4}, "validation": {"mse": 5}, "old": null}));
+        let expected = serde_json::json!({"validation": {"mse": 5, "step": 7}, "test": {"mse": 4}});
+        assert_eq!(metrics, expected);
+    }
 
     #[test]
     fn a_name_that_leaves_the_directory_is_refused() {

@@ -9,12 +9,12 @@ use metrics::counter;
 use tokio::sync::Mutex;
 use tracing::{info, warn};
 
+use crate::error_text;
 use crate::files::write_atomically;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
 use crate::store::{Lease, Store, StoreError, unix_s};
 use crate::telemetry::names;
-use crate::error_text;
 
 /// Why a version could not be loaded, published, activated or deleted.
 #[derive(Debug, thiserror::Error)]

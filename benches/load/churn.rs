@@ -10,12 +10,12 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, OnLate, ServerMes
 use futures_util::SinkExt as _;
 use tokio::task::JoinSet;
 
-use crate::report::Bounds;
 use crate::http::{Http, Request};
-use crate::workload::{self, Workload};
 use crate::process_usage::Usage;
+use crate::report::Bounds;
 use crate::server::{Server, Target};
 use crate::session::{self, Session};
+use crate::workload::{self, Workload};
 
 /// Number of parts of the load; memory is printed after each.
 const PARTS: u64 = 5;
@@ -185,7 +185,11 @@ async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::h
     if answer.status == status {
         Ok(answer)
     } else {
-        Err(format!("status {} instead of {status}: {}", answer.status, answer.text()))
+        Err(format!(
+            "status {} instead of {status}: {}",
+            answer.status,
+            answer.text()
+        ))
     }
 }
 

@@ -9,12 +9,12 @@ use serde_json::{Value, json};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 
-use crate::report::{Bounds, Latencies};
-use crate::robots::{SendMode, RobotLoad};
 use crate::http::{Http, Request};
-use crate::workload::Workload;
+use crate::report::{Bounds, Latencies};
+use crate::robots::{RobotLoad, SendMode};
 use crate::schedule::{Schedule, Tick};
 use crate::server::{Server, Target};
+use crate::workload::Workload;
 
 const TRIALS: u64 = 40;
 const POLL: Duration = Duration::from_millis(100);
@@ -72,7 +72,10 @@ pub(crate) async fn run(args: &HealthArgs, bounds: &mut Bounds) {
     println!("during a training:");
     let (livez_p99_ms, p99_ms, faults) = measure(args, &server, &workload).await;
     let job = http.expect(200, &Request::get(&training)).await.json();
-    bounds.check(job["state"] == "running", "the training ran during the whole measurement");
+    bounds.check(
+        job["state"] == "running",
+        "the training ran during the whole measurement",
+    );
     http.expect(202, &Request::json(&format!("{training}/cancel"), &Value::Null))
         .await;
     bounds.check(

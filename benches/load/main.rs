@@ -4,19 +4,19 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
-mod report;
-mod robots;
 mod health;
 mod http;
-mod workload;
-mod schedule;
 mod process_usage;
+mod report;
 mod robot;
+mod robots;
 mod saturate;
+mod schedule;
 mod server;
 mod session;
 mod slow_reader;
 mod stream;
+mod workload;
 
 use std::process::ExitCode;
 use std::time::Instant;

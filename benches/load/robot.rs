@@ -7,8 +7,8 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, ErrorCode, Server
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 
-use crate::workload::{self, Workload};
 use crate::session::{self, Socket};
+use crate::workload::{self, Workload};
 
 /// Answers to the frames of one robot or of many.
 #[derive(Default)]

@@ -9,14 +9,14 @@ use futures_util::future::join_all;
 use tokio::sync::mpsc;
 use tokio::time::sleep_until;
 
-use crate::report::Latencies;
 use crate::http::Http;
-use crate::workload::Workload;
-use crate::schedule::Schedule;
 use crate::process_usage::{CpuShare, Process};
-use crate::robot::{self, PredictionTimes, FrameCounts};
+use crate::report::Latencies;
+use crate::robot::{self, FrameCounts, PredictionTimes};
+use crate::schedule::Schedule;
 use crate::server::Server;
 use crate::session::{self, Session};
+use crate::workload::Workload;
 
 /// Time between the last robot's connection and the first frame.
 const START_DELAY: Duration = Duration::from_millis(100);
@@ -104,7 +104,9 @@ impl RobotLoad {
 
     fn queue_length(&self) -> usize {
         match self.mode {
-            SendMode::Scheduled(rate_hz) => 1 + (rate_hz * (self.warm_up + self.measured).as_secs_f64()).ceil() as usize,
+            SendMode::Scheduled(rate_hz) => {
+                1 + (rate_hz * (self.warm_up + self.measured).as_secs_f64()).ceil() as usize
+            }
             SendMode::ScheduledOrDropped(_) => 1,
             SendMode::ClosedLoop(ahead) => ahead,
         }
@@ -128,12 +130,18 @@ impl RobotLoad {
         let not_sent = Arc::new(AtomicU64::new(0));
         match self.mode {
             SendMode::ClosedLoop(ahead) => {
-                for send_time in send_times.iter().flat_map(|send_time| std::iter::repeat_n(send_time, ahead)) {
-                    send_time.try_send(begin).expect("the channel has room for the first frames");
+                for send_time in send_times
+                    .iter()
+                    .flat_map(|send_time| std::iter::repeat_n(send_time, ahead))
+                {
+                    send_time
+                        .try_send(begin)
+                        .expect("the channel has room for the first frames");
                 }
             }
             SendMode::Scheduled(rate_hz) | SendMode::ScheduledOrDropped(rate_hz) => {
-                let schedule = Schedule::lasting(begin, rate_hz * send_times.len() as f64, self.warm_up + self.measured);
+                let schedule =
+                    Schedule::lasting(begin, rate_hz * send_times.len() as f64, self.warm_up + self.measured);
                 let count = Arc::clone(&not_sent);
                 schedule.start(move |tick| {
                     let send_time = &send_times[tick.index as usize % send_times.len()];

@@ -5,8 +5,8 @@ mod streams;
 
 use std::time::Duration;
 
-use crate::report::Bounds;
 use crate::process_usage::Process;
+use crate::report::Bounds;
 use crate::server::{Server, Target};
 
 /// Period of the memory samples.

@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::report::Bounds;
 use crate::http::{Http, Request};
 use crate::process_usage::Process;
+use crate::report::Bounds;
 
 /// How long the server may take to become ready.
 const START_LIMIT: Duration = Duration::from_mins(1);
@@ -103,10 +103,7 @@ impl Server {
             println!("  {line}");
         }
         let has_ended = self.child.try_wait().unwrap();
-        let what = format!(
-            "the server runs, and its log has no errors ({} found)",
-            errors.len()
-        );
+        let what = format!("the server runs, and its log has no errors ({} found)", errors.len());
         bounds.check(has_ended.is_none() && errors.is_empty(), what);
     }
 }

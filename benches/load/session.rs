@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::http::{Response, Http, TIMEOUT, Request};
+use crate::http::{Http, Request, Response, TIMEOUT};
 
 /// Size of the read buffer: larger than an answer, but small, because it is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;

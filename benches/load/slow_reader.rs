@@ -8,12 +8,12 @@ use foreframe::server::protocol::OnLate;
 use futures_util::SinkExt as _;
 use tokio::net::TcpSocket;
 
-use crate::report::{Bounds, median};
-use crate::robots::{SendMode, RobotLoad};
-use crate::workload::Workload;
 use crate::process_usage::Process;
+use crate::report::{Bounds, median};
+use crate::robots::{RobotLoad, SendMode};
 use crate::server::{Server, Target};
 use crate::session;
+use crate::workload::Workload;
 
 /// Small, so that unread data waits in the server and not in this process.
 const RECEIVE_BUFFER_BYTES: u32 = 4096;
@@ -83,7 +83,9 @@ pub(crate) async fn run(args: &SlowReaderArgs, bounds: &mut Bounds) {
     let noise_ms = alone.iter().map(|round| round.p99_ms).fold(0.0, f64::max)
         - alone.iter().map(|round| round.p99_ms).fold(f64::INFINITY, f64::min);
     let limit_ms = before_ms * (1.0 + args.p99_share) + noise_ms.max(args.noise_ms);
-    let what = format!("the median p99 is {after_ms:.2} ms, without the slow reader {before_ms:.2} ms; limit {limit_ms:.2} ms");
+    let what = format!(
+        "the median p99 is {after_ms:.2} ms, without the slow reader {before_ms:.2} ms; limit {limit_ms:.2} ms"
+    );
     bounds.check(after_ms <= limit_ms, what);
     let lost: u64 = alone.iter().chain(&beside).map(|round| round.unanswered).sum();
     bounds.check(lost == 0, "every frame of the other sessions was predicted");

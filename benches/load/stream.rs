@@ -6,9 +6,9 @@ use std::time::Duration;
 use foreframe::server::protocol::OnLate;
 
 use crate::report::Bounds;
-use crate::robots::{SendMode, RobotLoad, RobotLoadResult};
-use crate::workload::Workload;
+use crate::robots::{RobotLoad, RobotLoadResult, SendMode};
 use crate::server::{Server, Target};
+use crate::workload::Workload;
 
 /// Relative precision of the search.
 const FIND_PRECISION: f64 = 0.05;

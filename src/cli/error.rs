@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use crate::dataset::DatasetError;
+use crate::error_text;
 use crate::evaluation::EvaluationError;
 use crate::nn::NnError;
 use crate::registry::RegistryError;
@@ -13,7 +14,6 @@ use crate::serving::ServingError;
 use crate::sim::SimError;
 use crate::telemetry::TelemetryError;
 use crate::training::TrainError;
-use crate::error_text;
 
 /// What a subcommand fails with: a sentence for the user.
 pub(super) enum CliError {
@@ -116,7 +116,7 @@ impl Blame for TrainError {
             | Self::Config(_)
             | Self::NotARun(_)
             | Self::OtherRun { .. }
-            | Self::NoValidation { .. } => true,
+            | Self::NoWindows { .. } => true,
             Self::Dataset(error) => error.is_usage(),
             Self::Registry(error) => error.is_usage(),
             // The network's sizes come from the settings.

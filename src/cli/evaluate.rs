@@ -3,14 +3,15 @@
 use std::path::PathBuf;
 
 use super::{CliError, command_line, load_model, open_dataset, progress::ProgressLine, say};
-use crate::evaluation::{self, EvaluateConfig, EvaluationStage};
+use crate::evaluation::{self, EvaluateConfig, Purpose};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
-/// Measure a model on held-out trials: report, figures, GIF.
+/// Score a model on data that training never saw: report, figures, GIF.
 ///
-/// Two test sets: trials that training never saw, and start/goal pairs and controller gains that it never saw. The skill is
-/// the share of the best trivial baseline's error that the model takes away.
+/// Three test sets: trials, start/goal pairs and controller gains that training never saw. The skill is the share of the
+/// strongest baseline's error that the model removes. To choose between models or settings, use `--split validation`;
+/// the test sets are for the final numbers.
 #[derive(clap::Args)]
 #[command(after_help = "Example: foreframe evaluate --model paper --dataset static-observer --out reports/paper")]
 pub(super) struct EvaluateArgs {
@@ -23,10 +24,14 @@ pub(super) struct EvaluateArgs {
     /// The directory to write report.md, report.json and figures into [default: reports/MODEL]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// An unconditioned model of the same budget, for the table that tells whether the action matters
+    /// A model of the same training budget that lacks the action, the state or both, for the table that shows what each
+    /// input is worth; may be given several times
     #[arg(long, value_name = "MODEL")]
-    twin: Option<String>,
-    /// Windows of each test set at most, spread evenly over its trials
+    twin: Vec<String>,
+    /// What to score: the validation split, or the test sets
+    #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
+    split: SplitChoice,
+    /// Windows of each set at most, spread evenly over its trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
     /// Resamples of the trials for the intervals
@@ -35,7 +40,7 @@ pub(super) struct EvaluateArgs {
     /// Seed of the resamples and the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write the scores into the model's manifest too
+    /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
     record: bool,
     /// Where models are looked for by name
@@ -43,13 +48,22 @@ pub(super) struct EvaluateArgs {
     models: PathBuf,
 }
 
+/// What to score.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum SplitChoice {
+    /// The validation split, to choose between models or settings
+    Validation,
+    /// The test sets, for the final numbers
+    Test,
+}
+
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let (model_dir, loaded) = load_model(&args.model, &args.models)?;
-    let twin = args
+    let twins = args
         .twin
-        .as_deref()
-        .map(|twin| load_model(twin, &args.models))
-        .transpose()?;
+        .iter()
+        .map(|twin| Ok(load_model(twin, &args.models)?.1))
+        .collect::<Result<Vec<LoadedModel>, CliError>>()?;
     let out = args
         .out
         .clone()
@@ -57,26 +71,32 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let (_, dataset) = open_dataset(&args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?)?;
     evaluation::prepare(&out)?;
     let config = EvaluateConfig {
+        purpose: match args.split {
+            SplitChoice::Validation => Purpose::Validation,
+            SplitChoice::Test => Purpose::Test,
+        },
         max_windows: args.windows,
         bootstrap_samples: args.resamples,
         seed: Seed(args.seed),
-        twin: twin.as_ref().map(|(_, twin)| twin),
+        twins: twins.iter().collect(),
         command: command_line(),
         ..EvaluateConfig::default()
     };
     let progress = ProgressLine::new("windows");
     let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
-        let what = match now.stage {
-            EvaluationStage::Scores => "scores",
-            EvaluationStage::Actions => "actions",
-        };
-        progress.update(now.done as u64, now.total as u64, || format!("{} {what}", now.split));
+        let stage = now.stage.name();
+        progress.update(now.done as u64, now.total as u64, || format!("{} {stage}", now.split));
     })?;
     progress.finish();
     let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
     let [markdown, _] = evaluation::write(&out, &mut report, &inputs)?;
     if args.record {
-        registry::record_metrics(&model_dir, report.headline())?;
+        let mut scores = report.headline();
+        if config.purpose == Purpose::Test {
+            // Earlier versions scored unseen pairs and gains as one set.
+            scores["test-unseen"] = serde_json::Value::Null;
+        }
+        registry::record_metrics(&model_dir, scores)?;
     }
     for (split, score) in report.headline().as_object().into_iter().flatten() {
         say(format!("{split}: {score}"))?;
@@ -84,12 +104,12 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     say(markdown.display())
 }
 
-/// The scenario that the model was trained on, which is its data set's name unless another was given.
+/// The scenario that the model was trained on: also the name of its data set, unless another name was given.
 fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
     let manifest = &loaded.manifest;
     manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
         CliError::Usage(format!(
-            "--dataset is missing; model {:?} was trained on {:?}, which no scenario made",
+            "--dataset is missing; model {:?} was trained on {:?}, which is no simulated scenario",
             manifest.name, manifest.dataset.name
         ))
     })

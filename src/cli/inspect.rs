@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::{CliError, DATASETS_DIR, say};
 use crate::dataset::{self, Dataset, DatasetInfo};
+use crate::error_text::{comma_separated, existing};
 use crate::nn::{ChannelScale, ModelSpec, costs};
 use crate::registry::{self, Manifest};
-use crate::error_text::{comma_separated, existing};
 
 /// Describe a model or a data set.
 #[derive(clap::Args)]

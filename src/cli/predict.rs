@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::{CliError, load_model, say};
+use crate::error_text;
 use crate::evaluation::{self, figures::montage};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
@@ -12,7 +13,6 @@ use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
 use crate::types::{Action, RobotState};
-use crate::error_text;
 
 /// Predict the frames that follow those in a directory.
 ///
@@ -186,7 +186,8 @@ fn write(
         &codec::encode_png(&sheet).map_err(CliError::failed)?,
     )?;
     let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
-    let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
+    let film = seen.iter().chain(predicted).map(montage::enlarged);
+    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
     save(
         "prediction.gif".to_owned(),
         &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,

@@ -135,7 +135,7 @@ impl<'a> TrainingDisplay<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
             }
-            TrainingEvent::Recalled { .. } | TrainingEvent::Checkpointed { .. } => {}
+            TrainingEvent::Restored { .. } | TrainingEvent::Checkpointed { .. } => {}
         }
     }
 

@@ -13,8 +13,8 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
-use crate::frame::warp::CameraModel;
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
+use crate::frame::warp::CameraModel;
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -79,7 +79,7 @@ impl CollectionStatus {
             });
         }
         if out.join(INFO).exists() {
-            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info())));
+            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
         }
         let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
         let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
@@ -141,7 +141,13 @@ fn differences(found: &str, wanted: &str) -> String {
     let differing: Vec<_> = wanted
         .iter()
         .filter(|(key, value)| found.get(*key) != Some(value))
-        .map(|(key, value)| format!("{key}: {} in the directory, {} requested", text(found.get(key)), text(Some(value))))
+        .map(|(key, value)| {
+            format!(
+                "{key}: {} in the directory, {} requested",
+                text(found.get(key)),
+                text(Some(value))
+            )
+        })
         .collect();
     differing.join("; ")
 }
@@ -253,9 +259,7 @@ fn description(config: &CollectConfig) -> DatasetInfo {
         frame_count: 0,
         episode_count: 0,
         has_masks: true,
-        camera: Some(CameraModel {
-            horizontal_fov_rad: config.world.camera.horizontal_fov_rad as f32,
-            tilt_down_rad: config.world.camera.tilt_down_rad as f32,
-        }),
+        camera: Some(config.world.camera.model()),
+        world: Some(config.world.clone()),
     }
 }

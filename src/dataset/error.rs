@@ -35,7 +35,9 @@ pub enum DatasetError {
         value: f64,
     },
     /// The timestamps of an episode do not increase.
-    #[error("episode {episode}, frame {frame}: the timestamp is not later than the previous one; timestamps must increase")]
+    #[error(
+        "episode {episode}, frame {frame}: the timestamp is not later than the previous one; timestamps must increase"
+    )]
     TimeOrder {
         /// Position of the episode.
         episode: usize,

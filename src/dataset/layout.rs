@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::{DatasetError, DatasetInfo};
 use crate::files::sha256_hex;
 use crate::frame::warp::CameraModel;
+use crate::sim::{CameraConfig, WorldConfig};
 use crate::types::{Channel, Seed};
 
 /// LeRobot's description. It is written last, so a directory without it is unfinished.
@@ -98,6 +99,16 @@ impl DatasetMetadata {
         Self::parse(&path, &text)
     }
 
+    /// The description of the data set in that directory. Metadata of older data sets have no camera model; it is then taken
+    /// from the arguments of the collection. Errors: `Corrupt`, `Io`.
+    pub(super) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
+        let mut info = self.info();
+        info.world = collected_world(directory)?;
+        let camera = info.world.as_ref().map(|world| &world.camera);
+        info.camera = info.camera.or(camera.map(CameraConfig::model));
+        Ok(info)
+    }
+
     /// Parses and checks the text of a metadata file. Errors: `Corrupt`; they name `path`.
     pub(super) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
         let corrupt = |reason| DatasetError::Corrupt {
@@ -129,8 +140,29 @@ impl DatasetMetadata {
             episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
             has_masks: self.has_masks,
             camera: self.camera,
+            world: None,
         }
     }
+}
+
+/// The part of a collection's arguments that is used later.
+#[derive(Deserialize)]
+struct CollectedWith {
+    world: WorldConfig,
+}
+
+/// The world settings of a collection; `None` for other data sets. Errors: `Corrupt`, `Io`.
+fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError> {
+    let path = directory.join(ARGUMENTS);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+    let arguments: CollectedWith = serde_json::from_slice(&text).map_err(|error| DatasetError::Corrupt {
+        path,
+        reason: error.to_string(),
+    })?;
+    Ok(Some(arguments.world))
 }
 
 /// The SHA-256 of the shards' hexadecimal hashes, one after another, in hexadecimal.

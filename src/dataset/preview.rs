@@ -12,7 +12,7 @@ use crate::frame::Frame;
 /// The description of the finished data set in a directory, without reading its frames.
 /// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
 pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
-    Ok(DatasetMetadata::read(directory)?.info())
+    DatasetMetadata::read(directory)?.info_in(directory)
 }
 
 /// The description of a data set from the text of its metadata file ([`super::METADATA`]). Errors: `Corrupt`; they name

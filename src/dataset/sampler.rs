@@ -25,22 +25,31 @@ pub enum Split {
     Validation,
     /// For the final scores: trials that training never uses.
     Test,
-    /// Trials with start/goal pairs or PID gains that training never uses; empty for recordings.
-    TestUnseen,
+    /// Trials with a start/goal pair that training never uses; empty for recordings.
+    UnseenPairs,
+    /// Trials with a PID gain that training never uses, and with one of its start/goal pairs; empty for recordings.
+    UnseenGains,
 }
 
 impl Split {
     /// All splits, in the order of declaration.
-    pub const ALL: [Self; 4] = [Self::Train, Self::Validation, Self::Test, Self::TestUnseen];
+    pub const ALL: [Self; 5] = [
+        Self::Train,
+        Self::Validation,
+        Self::Test,
+        Self::UnseenPairs,
+        Self::UnseenGains,
+    ];
 
-    /// `train`, `validation`, `test` or `test-unseen`.
+    /// `train`, `validation`, `test`, `unseen-pairs` or `unseen-gains`.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Train => "train",
             Self::Validation => "validation",
             Self::Test => "test",
-            Self::TestUnseen => "test-unseen",
+            Self::UnseenPairs => "unseen-pairs",
+            Self::UnseenGains => "unseen-gains",
         }
     }
 }
@@ -80,8 +89,8 @@ struct EpisodeSegment {
 /// there are ten or more, otherwise by time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
-    episodes: [Vec<usize>; 4],
-    segments: [Vec<EpisodeSegment>; 4],
+    episodes: [Vec<usize>; Split::ALL.len()],
+    segments: [Vec<EpisodeSegment>; Split::ALL.len()],
     /// A longer time step is a gap, in seconds.
     max_step_s: f64,
 }
@@ -99,7 +108,8 @@ impl Splits {
         if by_trial || dataset.episodes().len() >= WHOLE_EPISODES {
             for episode in dataset.episodes() {
                 let split = match &episode.trial {
-                    Some(trial) if trial.is_held_out() => Split::TestUnseen,
+                    Some(trial) if trial.has_held_out_pair() => Split::UnseenPairs,
+                    Some(trial) if trial.is_held_out() => Split::UnseenGains,
                     Some(trial) => split_of(split_seed, trial.trial),
                     None => split_of(split_seed, episode.index as u64),
                 };

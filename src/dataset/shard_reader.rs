@@ -114,7 +114,10 @@ fn read_batch(
     let first = (slot.first_frame + row) as i64;
     let indexes = column.numbers::<Int64Type>("index")?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(corrupt(&slot.path, &"its column \"index\" does not number the frames one after another"));
+        return Err(corrupt(
+            &slot.path,
+            &"its column \"index\" does not number the frames one after another",
+        ));
     }
     Ok(())
 }
@@ -190,7 +193,10 @@ impl<'a> Column<'a> {
             .filter(|list| list.null_count() == 0)
             .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
         if list.value_length() as usize != size {
-            let reason = format!("column \"{key}\" has {} components; the metadata states {size}", list.value_length());
+            let reason = format!(
+                "column \"{key}\" has {} components; the metadata states {size}",
+                list.value_length()
+            );
             return Err(corrupt(self.path, &reason));
         }
         let values = list.values().as_primitive_opt::<Float32Type>();
@@ -200,7 +206,12 @@ impl<'a> Column<'a> {
         values
             .filter(|values| values.null_count() == 0)
             .and_then(|values| values.values().get(rows))
-            .ok_or_else(|| corrupt(self.path, &format!("column \"{key}\" does not contain 32-bit floating-point numbers")))
+            .ok_or_else(|| {
+                corrupt(
+                    self.path,
+                    &format!("column \"{key}\" does not contain 32-bit floating-point numbers"),
+                )
+            })
     }
 
     /// The texts of a column; null values become none. Errors: `Corrupt`.

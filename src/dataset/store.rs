@@ -19,7 +19,7 @@ impl Dataset {
     /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, `NotFinite`, `TimeOrder`.
     pub fn open(directory: &Path) -> Result<Self, DatasetError> {
         let metadata = DatasetMetadata::read(directory)?;
-        let info = metadata.info();
+        let info = metadata.info_in(directory)?;
         let path = directory.join(EPISODES);
         verify(&path, &metadata.episodes_sha256)?;
         let episodes = read_episodes(&path, &info)?;
@@ -32,8 +32,8 @@ impl Dataset {
             info,
             episodes,
         };
+        let info = dataset.info.clone();
         let slots = slots(&mut dataset, directory, &metadata.shards);
-        let info = metadata.info();
         let numbers: Result<Vec<ShardNumbers>, DatasetError> = slots
             .into_par_iter()
             .zip(&metadata.shards)
@@ -161,8 +161,9 @@ pub(super) fn complete(
     }
     let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
     let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
+    let world = info.world.clone();
     let metadata = metadata(info, shards, sha256_hex(&episodes));
-    let info = metadata.info();
+    let info = DatasetInfo { world, ..metadata.info() };
     write_atomically(&directory.join(EPISODES), &episodes)?;
     let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
     write_atomically(&directory.join(TASKS), &tasks)?;

@@ -74,7 +74,10 @@ pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, P
             "data/chunk_index".to_owned(),
             counts(&|_, row| shard_location(row.shard).0),
         ),
-        ("data/file_index".to_owned(), counts(&|_, row| shard_location(row.shard).1)),
+        (
+            "data/file_index".to_owned(),
+            counts(&|_, row| shard_location(row.shard).1),
+        ),
         ("dataset_from_index".to_owned(), counts(&|_, row| row.first_frame)),
         (
             "dataset_to_index".to_owned(),

@@ -38,7 +38,7 @@ pub struct SampleFigure {
     pub reconstructed: Vec<Frame>,
     /// The frames predicted, t+1…
     pub predicted: Vec<Frame>,
-    /// The frames that came; empty where they aren't known.
+    /// The true future frames; empty where they are not known.
     pub truth: Vec<Frame>,
 }
 
@@ -75,7 +75,7 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
     for sample in &inputs.samples {
         let panel = codec::encode_png(&prediction_panel(sample)?)?;
         let caption = format!(
-            "Prediction, truth and inputs (the paper's figure 8), {} window",
+            "Inputs, truth, prediction and error (the paper's figure 8), {} window",
             sample.name
         );
         put(format!("prediction-{}.png", sample.name), caption, &panel)?;
@@ -105,7 +105,7 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
     Ok(files)
 }
 
-/// The paper's figure 8: predicted frames above the true ones (where known), the inputs below.
+/// The paper's figure 8, from the top: inputs, true frames and errors (where the truth is known), predicted frames.
 pub fn prediction_panel(sample: &SampleFigure) -> Result<Frame, FrameError> {
     montage::prediction_panel(&sample.note, &sample.inputs, &sample.predicted, &sample.truth)
 }

@@ -81,7 +81,7 @@ pub struct WindowScores {
     pub episode: usize,
     /// Its first frame in the data set.
     pub first_frame: usize,
-    /// `frames[row][step]`, rows as in [`Method::ALL`].
+    /// `frames[row][step]`, one row for each method that was scored.
     pub frames: Vec<Vec<FrameScore>>,
     /// Mean squared error of the model in its own space, per step.
     pub model_space_mse: Vec<f64>,
@@ -113,13 +113,13 @@ pub struct MethodScores {
     pub mover_mse: Option<StepCurve>,
 }
 
-/// The tables' rows from the windows' scores.
+/// The tables' rows from the windows' scores of these methods.
 #[must_use]
-pub fn summarize(windows: &[WindowScores]) -> Vec<MethodScores> {
-    Method::ALL
-        .into_iter()
+pub fn summarize(methods: &[Method], windows: &[WindowScores]) -> Vec<MethodScores> {
+    methods
+        .iter()
         .enumerate()
-        .map(|(row, method)| MethodScores {
+        .map(|(row, &method)| MethodScores {
             method,
             mse: mean_curve(windows, row, |score| score.mse),
             psnr_db: mean_curve(windows, row, |score| score.psnr_db),
@@ -195,7 +195,7 @@ mod tests {
             model_space_mse: vec![0.0],
             reconstruction_mse: vec![0.0],
         };
-        let rows = summarize(&[window(20.0, 1), window(40.0, 3)]);
+        let rows = summarize(&Method::ALL, &[window(20.0, 1), window(40.0, 3)]);
         assert_eq!(rows[0].psnr_db.mean, 30.0);
         assert_eq!(rows[0].mover_mse.as_ref().unwrap().mean, 0.5);
     }

@@ -2,9 +2,9 @@
 
 use tracing::warn;
 
+use crate::error_text;
 use crate::store::{Objects, StoreError};
 use crate::training::{CHECKPOINT_FILE, CheckpointPosition};
-use crate::error_text;
 
 /// Fetches the run's checkpoint from the object store if it is later than the local one. The local one can be later,
 /// because a push can fail. Errors: `Io`, `Object`.

@@ -14,13 +14,13 @@ use super::runner::{JobExecutor, JobFailure, JobReporter, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
+use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
 use crate::store::{LossRow, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
-use crate::error_text;
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
@@ -185,17 +185,14 @@ impl Pipeline {
             max_windows: spec.windows,
             bootstrap_samples: spec.resamples,
             seed: Seed(spec.seed),
-            twin: twin.as_ref(),
+            twins: twin.iter().collect(),
             command: request_line(&JobSpec::Evaluate(spec.clone())),
             cancelled: Some(cancelled),
             ..EvaluateConfig::default()
         };
         let found = evaluation::run(&loaded, &dataset, &config, &|now| {
-            let what = match now.stage {
-                evaluation::EvaluationStage::Scores => "scores",
-                evaluation::EvaluationStage::Actions => "actions",
-            };
-            report.progress(now.done as u64, now.total as u64, &format!("{} {what}", now.split));
+            let stage = now.stage.name();
+            report.progress(now.done as u64, now.total as u64, &format!("{} {stage}", now.split));
         });
         let mut found = found.map_err(|error| failed(&error))?;
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
@@ -282,7 +279,7 @@ impl TrainingReporter<'_> {
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
             // A point that the last attempt did not write before it was killed must also be in the curves.
-            TrainingEvent::Recalled {
+            TrainingEvent::Restored {
                 stage,
                 step,
                 train_loss,

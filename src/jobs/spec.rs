@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::JobError;
 use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
+use crate::error_text;
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
 use crate::types::Seed;
-use crate::error_text;
 
 /// The maximum number of trials of one collection.
 pub const MAX_TRIALS: u64 = 1_000_000;

@@ -27,19 +27,21 @@ impl ConditioningTensors {
     /// conditioning is none. Errors: `Missing`, `Shape`.
     pub(super) fn inputs(&self, spec: &ModelSpec, batch: usize) -> Result<Option<Tensor>, NnError> {
         let horizon = spec.horizon;
-        let Some(count) = spec.action_inputs() else {
-            return Ok(None);
-        };
-        let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
-        let actions = scaled(actions, &spec.actions)?;
-        let Some(count) = spec.state_inputs() else {
-            return Ok(Some(actions));
-        };
-        let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
-        let state = scaled(state, &spec.states)?
-            .unsqueeze(1)?
-            .expand((batch, horizon, count))?;
-        Ok(Some(Tensor::cat(&[&actions, &state], 2)?))
+        let mut inputs = Vec::new();
+        if let Some(count) = spec.action_inputs() {
+            let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
+            inputs.push(scaled(actions, &spec.actions)?);
+        }
+        if let Some(count) = spec.state_inputs() {
+            let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+            let state = scaled(state, &spec.states)?.unsqueeze(1)?;
+            inputs.push(state.expand((batch, horizon, count))?.contiguous()?);
+        }
+        Ok(match inputs.as_slice() {
+            [] => None,
+            [only] => Some(only.clone()),
+            several => Some(Tensor::cat(several, 2)?),
+        })
     }
 }
 

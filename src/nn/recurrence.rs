@@ -51,10 +51,15 @@ struct Recurrence {
 
 /// Runs the cell over a sequence whose input `projection` `W_x x + b` `[T, B, 4H]` is already computed. Returns every h
 /// `[T, B, H]` and the last c `[B, H]`.
-pub(super) fn forward_sequence(cell: &PeepholeCell, projection: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
+pub(super) fn forward_sequence(
+    cell: &PeepholeCell,
+    projection: &Tensor,
+    state: &LstmState,
+) -> Result<(Tensor, Tensor)> {
     let steps = projection.dim(0)?;
     let start = Tensor::cat(&[&state.h, &state.c], 1)?;
-    let all = Recurrence::new(cell, None, steps)?.apply(&projection.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
+    let all =
+        Recurrence::new(cell, None, steps)?.apply(&projection.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
     Ok((all.narrow(0, 0, steps)?, all.get(steps)?))
 }
 
@@ -154,7 +159,9 @@ impl Recurrence {
             let mut advance = |parts: [&[f32]; 3]| self.advance(&mut trace, t, batch, parts);
             with_values(&recurrent, |recurrent| {
                 if let Some(projected_features) = &projected_features {
-                    with_values(projected_features, |projected_features| advance([projection, recurrent, projected_features]))
+                    with_values(projected_features, |projected_features| {
+                        advance([projection, recurrent, projected_features])
+                    })
                 } else {
                     advance([projection, recurrent, &[]]);
                     Ok(())

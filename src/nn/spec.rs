@@ -73,11 +73,13 @@ named_enum!(
 
 named_enum!(
     /// The inputs of a prediction besides the context frames.
-    Conditioning, "conditioning", "\"none\", \"action\" and \"state-action\"", {
+    Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
         /// No further inputs.
         None = "none",
         /// The action that leads to each predicted frame.
         Action = "action",
+        /// The state at the last context frame.
+        State = "state",
         /// The action that leads to each predicted frame, and the state at the last context frame.
         StateAction = "state-action",
     }
@@ -217,13 +219,13 @@ impl ModelSpec {
     /// Number of action components that the predictor gets; `None` if the conditioning does not include actions.
     #[must_use]
     pub fn action_inputs(&self) -> Option<usize> {
-        (self.conditioning != Conditioning::None).then_some(self.actions.len())
+        matches!(self.conditioning, Conditioning::Action | Conditioning::StateAction).then_some(self.actions.len())
     }
 
     /// Number of state components that the predictor gets; `None` if the conditioning does not include the state.
     #[must_use]
     pub fn state_inputs(&self) -> Option<usize> {
-        (self.conditioning == Conditioning::StateAction).then_some(self.states.len())
+        matches!(self.conditioning, Conditioning::State | Conditioning::StateAction).then_some(self.states.len())
     }
 
     /// Inputs of the predictor's LSTM: features, then the action, then the state.

@@ -89,7 +89,9 @@ pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
     };
     let size = std::fs::metadata(&path).map_err(failed)?.len();
     if size > MAX_MANIFEST_BYTES {
-        let source = std::io::Error::other(format!("the file has {size} bytes; at most {MAX_MANIFEST_BYTES} are allowed"));
+        let source = std::io::Error::other(format!(
+            "the file has {size} bytes; at most {MAX_MANIFEST_BYTES} are allowed"
+        ));
         return Err(RegistryError::Io {
             action: "read",
             path,

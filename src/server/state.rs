@@ -95,7 +95,7 @@ impl App {
     pub async fn with_store(config: ServerConfig, store: Store) -> Result<Self, ServerError> {
         config.validate()?;
         let versions = Versions::new(store.clone(), &config.models_dir);
-        let models = versions.serving().await?;
+        let models = versions.load_serving().await?;
         Self::start_with(config, models, store, versions)
     }
 
@@ -267,11 +267,11 @@ async fn follow(app: App) {
     let (mut stopping, mut refused) = (app.streams().stopping(), BTreeSet::new());
     loop {
         tokio::select! {
-            () = app.jobs().ended() => {}
+            () = app.jobs().job_ended() => {}
             () = tokio::time::sleep(FOLLOW_EVERY) => {}
             () = stop_requested(&mut stopping) => return,
         }
-        if let Err(error) = app.versions().follow(app.predictor(), &mut refused).await {
+        if let Err(error) = app.versions().load_activated(app.predictor(), &mut refused).await {
             warn!(%error, "could not check for newly activated versions");
         }
     }

@@ -59,6 +59,7 @@ impl ConditioningInput {
             check_length(|| (fields.past)(index), model, action.as_slice(), &spec.actions)?;
         }
         let actions = match (raw.future, raw.past.last()) {
+            _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
                 check_actions(fields.future, model, spec, actions)?;
                 actions.to_vec()
@@ -86,7 +87,7 @@ impl ConditioningInput {
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Vec<Self>, InputError> {
-        if spec.conditioning == Conditioning::None {
+        if spec.action_inputs().is_none() {
             return Err(InputError::Unconditioned {
                 model: model.to_owned(),
             });
@@ -163,7 +164,7 @@ fn check_actions(field: &str, model: &str, spec: &ModelSpec, actions: &[Action])
 
 /// Checks the state; `None` if the model takes none.
 fn check_state(model: &str, spec: &ModelSpec, state: Option<RobotState>) -> Result<Option<RobotState>, InputError> {
-    if spec.conditioning != Conditioning::StateAction {
+    if spec.state_inputs().is_none() {
         return Ok(None);
     }
     let Some(state) = state else {

@@ -81,7 +81,11 @@ impl Camera {
     }
 
     /// Renders an image with noise, and its segmentation mask. Errors: `Frame` if the size is out of range.
-    pub(super) fn capture(&self, robots: &[RenderedRobot], mut noise: ChaCha8Rng) -> Result<(Frame, Vec<u8>), SimError> {
+    pub(super) fn capture(
+        &self,
+        robots: &[RenderedRobot],
+        mut noise: ChaCha8Rng,
+    ) -> Result<(Frame, Vec<u8>), SimError> {
         let samples = self.render(robots);
         let pixels = samples
             .iter()

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{SimError, arena};
 use crate::frame::MAX_SIDE_PX;
+use crate::frame::warp::CameraModel;
 
 /// Tb1's camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -17,6 +18,17 @@ pub struct CameraConfig {
     pub horizontal_fov_rad: f64,
     /// Standard deviation of the sensor's Gaussian noise, where black is 0 and white is 1.
     pub noise_std: f64,
+}
+
+impl CameraConfig {
+    /// How it projects.
+    #[must_use]
+    pub fn model(&self) -> CameraModel {
+        CameraModel {
+            horizontal_fov_rad: self.horizontal_fov_rad as f32,
+            tilt_down_rad: self.tilt_down_rad as f32,
+        }
+    }
 }
 
 impl Default for CameraConfig {

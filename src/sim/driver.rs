@@ -84,7 +84,11 @@ impl Driver {
 fn avoid_obstacles(pose: PlanarPose, others: &[[f32; 2]], [linear, angular]: [f32; 2]) -> [f32; 2] {
     let clearance = |angle: f32| {
         let heading_rad = pose.heading_rad + angle;
-        arena::clearance(PlanarPose { heading_rad, ..pose }, appearance::TURTLEBOT.radius_m, others)
+        arena::clearance(
+            PlanarPose { heading_rad, ..pose },
+            appearance::TURTLEBOT.radius_m,
+            others,
+        )
     };
     let ahead = clearance(0.0).min(clearance(0.35) + 0.1).min(clearance(-0.35) + 0.1);
     let speed_factor = ((ahead - STOP_M) / (SLOW_DOWN_M - STOP_M)).clamp(0.0, 1.0);

@@ -106,17 +106,19 @@ impl PhysicsScene {
         self.physics.step();
     }
 
-    /// The robot's true pose.
+    /// The robot's true pose. `robot` is the number of an added robot.
+    #[expect(clippy::expect_used, reason = "the caller numbers the robots as it added them")]
     pub(super) fn pose(&self, robot: usize) -> PlanarPose {
         let body = self
             .robots
             .get(robot)
             .and_then(|robot| self.physics.bodies.get(robot.handle));
-        body.map_or(arena::OBSERVER, |body| PlanarPose {
+        let body = body.expect("the pose of a robot that was not added is a bug");
+        PlanarPose {
             x_m: body.translation().x,
             y_m: body.translation().y,
             heading_rad: heading(body.rotation()),
-        })
+        }
     }
 
     /// The robot's wheel odometry, with the components of [`super::state_channels`].

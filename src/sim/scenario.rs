@@ -218,10 +218,13 @@ impl TrialParameters {
         HELD_OUT_PAIRS.contains(&(self.start, self.goal))
     }
 
-    /// The route of Tb2, then those of the other robots.
+    /// The route of Tb2, then those of the other robots. Call it only after [`Self::validate`] has passed.
+    #[expect(clippy::expect_used, reason = "validate() has checked both indexes")]
     pub(super) fn routes(&self) -> Vec<Route> {
-        let start_m = arena::STARTS_M.get(self.start).copied().unwrap_or(arena::STARTS_M[0]);
-        let goal_m = arena::GOALS_M.get(self.goal).copied().unwrap_or(arena::GOALS_M[0]);
+        let start_m = arena::STARTS_M.get(self.start).copied();
+        let start_m = start_m.expect("an unknown start after validate() is a bug");
+        let goal_m = arena::GOALS_M.get(self.goal).copied();
+        let goal_m = goal_m.expect("an unknown goal after validate() is a bug");
         let tb2 = Route {
             pose: pose(start_m, self.start_heading_rad),
             goal_m,
@@ -253,7 +256,11 @@ fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32)
         let is_clear_of_pillars = arena::PILLARS
             .iter()
             .all(|pillar| arena::distance(pillar.position_m, [x, y]) > pillar.radius_m + 0.3);
-        if is_clear_of_pillars && taken.iter().all(|&other| arena::distance(other, [x, y]) >= min_distance) {
+        if is_clear_of_pillars
+            && taken
+                .iter()
+                .all(|&other| arena::distance(other, [x, y]) >= min_distance)
+        {
             return [x, y];
         }
     }

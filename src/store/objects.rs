@@ -13,7 +13,7 @@ use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::{files_below, none_if_missing, is_partial, remove_stale_partials, remove_dir, write_atomically};
+use crate::files::{files_below, is_partial, none_if_missing, remove_dir, remove_stale_partials, write_atomically};
 
 /// The data directory, and the shared object store if there is one.
 #[derive(Clone)]

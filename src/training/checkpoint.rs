@@ -1,4 +1,4 @@
-//! A run's directory: its configuration, and the state of its last checkpoint in one safetensors file, replaced whole.
+//! A run's directory: its configuration, and its last checkpoint in one safetensors file that is replaced atomically.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File, TryLockError};
@@ -16,11 +16,11 @@ use super::stage::{HistoryPoint, TrainState};
 use crate::files::{is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
-/// The file of a run that says how far it is.
+/// Name of the checkpoint file of a run.
 pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
-/// The key of the state's numbers in the file's metadata.
+/// Key of the training state in the file's metadata.
 const META_KEY: &str = "foreframe.training";
-/// Names the data that the run trains on.
+/// Name of the file with the hash of the training data.
 const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
 const BEST: &str = "best.";
@@ -34,7 +34,7 @@ pub(super) struct RunFiles {
 }
 
 impl RunFiles {
-    /// Checks that the directory is free, or that the run in it is of the same configuration and data; writes nothing.
+    /// Checks that the directory is unused, or contains a run with the same configuration and data. Writes nothing.
     /// Errors: `NotARun`, `OtherRun`, `Io`.
     pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let files = Self {
@@ -57,10 +57,10 @@ impl RunFiles {
             return Ok(files);
         }
         let (config, data) = (files.config(), files.data());
-        let left_by_a_killed_start =
+        let is_left_by_a_killed_start =
             |path: &Path| path == data || is_partial_of(&data, path) || is_partial_of(&config, path);
         let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
-            entries.any(|entry| entry.is_ok_and(|entry| !left_by_a_killed_start(&entry.path())))
+            entries.any(|entry| entry.is_ok_and(|entry| !is_left_by_a_killed_start(&entry.path())))
         });
         if is_occupied || run_dir.is_file() {
             return Err(TrainError::NotARun(run_dir.to_owned()));
@@ -68,11 +68,11 @@ impl RunFiles {
         Ok(files)
     }
 
-    /// Makes the directory of a new run. Nobody else trains in it until the file is dropped. Errors: `Busy`, `Io`.
-    pub(super) fn claim(&self) -> Result<File, TrainError> {
+    /// Creates the directory of a new run, if needed, and locks it until the returned file is dropped. Errors: `Busy`, `Io`.
+    pub(super) fn lock(&self) -> Result<File, TrainError> {
         let (config, data) = (self.config(), self.data());
         if !config.is_file() {
-            fs::create_dir_all(&self.run_dir).map_err(io_failed("make", &self.run_dir))?;
+            fs::create_dir_all(&self.run_dir).map_err(io_failed("create", &self.run_dir))?;
             write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
             write_atomically(&config, self.config_text.as_bytes()).map_err(io_failed("write", &config))?;
         }
@@ -87,7 +87,7 @@ impl RunFiles {
         }
     }
 
-    /// What two runs must share for one to go on from the other's checkpoint.
+    /// Identifies configuration and data. A checkpoint can be resumed only with the same fingerprint.
     fn fingerprint(&self) -> String {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
@@ -100,12 +100,12 @@ impl RunFiles {
         self.run_dir.join(DATA_FILE)
     }
 
-    /// Where the trained model is published.
+    /// The directory of the published model.
     pub(super) fn model_dir(&self) -> PathBuf {
         self.run_dir.join("model")
     }
 
-    /// Where the loss curves are written.
+    /// The file of the loss curves.
     pub(super) fn history(&self) -> PathBuf {
         self.run_dir.join("history.json")
     }
@@ -124,7 +124,7 @@ fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> Tr
     }
 }
 
-/// The numbers beside the tensors.
+/// The training state without the tensors.
 #[derive(Serialize, Deserialize)]
 struct CheckpointMeta {
     fingerprint: String,
@@ -135,17 +135,17 @@ struct CheckpointMeta {
     history: Vec<HistoryPoint>,
 }
 
-/// How far a training is: the later, the greater.
+/// How far a training is. A later position is greater.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 pub struct CheckpointPosition {
-    /// In this stage.
+    /// The stage.
     pub stage: TrainingStage,
-    /// Updates made in it.
+    /// Completed updates of the stage.
     pub step: usize,
 }
 
 impl CheckpointPosition {
-    /// How far the training was whose checkpoint these bytes are; none if they are no checkpoint.
+    /// The position of the checkpoint in these bytes; none if they are not a checkpoint.
     #[must_use]
     pub fn of(checkpoint: &[u8]) -> Option<Self> {
         let (_, header) = SafeTensors::read_metadata(checkpoint).ok()?;
@@ -153,13 +153,13 @@ impl CheckpointPosition {
     }
 }
 
-/// A training's state as read from disk.
+/// A training state that was read from disk.
 pub(super) struct Checkpoint {
     state: TrainState,
 }
 
 impl Checkpoint {
-    /// Replaces the run's checkpoint by this state. Errors: `Io`, `Checkpoint`.
+    /// Replaces the run's checkpoint with this state. Errors: `Io`, `Checkpoint`.
     pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
         let path = files.checkpoint();
         let meta = CheckpointMeta {
@@ -189,7 +189,7 @@ impl Checkpoint {
         write_atomically(&path, &bytes).map_err(io_failed("write", &path))
     }
 
-    /// The run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or of another run.
+    /// Reads the run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or belongs to another run.
     pub(super) fn load(files: &RunFiles, spec: &ModelSpec, run: &RunConfig) -> Result<Option<Self>, TrainError> {
         let path = files.checkpoint();
         if !path.is_file() {
@@ -205,7 +205,7 @@ impl Checkpoint {
             .metadata()
             .as_ref()
             .and_then(|metadata| metadata.get(META_KEY))
-            .ok_or_else(|| failed("it carries no training state".to_owned()))?;
+            .ok_or_else(|| failed("it contains no training state".to_owned()))?;
         let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
         if meta.fingerprint != files.fingerprint() {
             return Err(failed("it belongs to another run".to_owned()));
@@ -217,8 +217,8 @@ impl Checkpoint {
                 .filter_map(|(name, tensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone())))
                 .collect()
         };
-        let misfit = |error: crate::nn::NnError| failed(error.to_string());
-        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(misfit)?;
+        let wrong_weights = |error: crate::nn::NnError| failed(error.to_string());
+        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(wrong_weights)?;
         let optimizer = Adam::import(run.adam(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
         let state = TrainState {
             stage: meta.stage,
@@ -226,7 +226,7 @@ impl Checkpoint {
             parameters,
             optimizer,
             best: Parameters::from_tensors(spec, group(BEST))
-                .map_err(misfit)?
+                .map_err(wrong_weights)?
                 .snapshot()?,
             best_step: meta.best_step,
             best_loss: meta.best_loss,
@@ -235,7 +235,7 @@ impl Checkpoint {
         Ok(Some(Self { state }))
     }
 
-    /// The state to go on from.
+    /// The training state.
     pub(super) fn into_state(self) -> TrainState {
         self.state
     }

@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_preset_is_answered_with_the_names_there_are() {
+    fn the_error_for_an_unknown_preset_lists_the_presets() {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
         assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving");
     }

@@ -17,13 +17,30 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("training", &["types", "files", "frame", "nn", "dataset", "registry"]),
     (
         "evaluation",
-        &["types", "files", "error_text", "frame", "nn", "sim", "dataset", "registry"],
+        &[
+            "types",
+            "files",
+            "error_text",
+            "frame",
+            "nn",
+            "sim",
+            "dataset",
+            "registry",
+        ],
     ),
     ("serving", &["types", "telemetry", "frame", "nn", "registry"]),
     ("store", &["types", "files"]),
     (
         "versions",
-        &["types", "files", "error_text", "telemetry", "registry", "serving", "store"],
+        &[
+            "types",
+            "files",
+            "error_text",
+            "telemetry",
+            "registry",
+            "serving",
+            "store",
+        ],
     ),
     (
         "jobs",
@@ -133,7 +150,10 @@ fn dependencies_are_used_only_in_their_modules() {
     for (file, text) in sources() {
         for (name, modules) in USED_IN.iter().filter(|(_, modules)| !modules.contains(&module(&file))) {
             let uses = |line: &str| line.trim_start().starts_with(&format!("use {name}"));
-            assert!(!code(&text).any(uses), "{file} uses {name}, which is for {modules:?} only");
+            assert!(
+                !code(&text).any(uses),
+                "{file} uses {name}, which is for {modules:?} only"
+            );
         }
     }
 }

@@ -16,7 +16,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::keys::new_key;
-use crate::service::{TIMEOUT, InProcessServer, post, run};
+use crate::service::{InProcessServer, TIMEOUT, post, run};
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -195,7 +195,8 @@ async fn the_page_drives_a_robot_and_shows_predictions() {
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
     page.wait_until(IS_COMPLETE).await;
     assert_eq!(page.value("document.getElementById('model').value").await, "static");
-    let choose = "const list = document.getElementById('model'); list.value = 'moving'; list.dispatchEvent(new Event('change'))";
+    let choose =
+        "const list = document.getElementById('model'); list.value = 'moving'; list.dispatchEvent(new Event('change'))";
     page.value(choose).await;
     page.wait_until("document.getElementById('status').textContent.includes('automatic driver')")
         .await;
@@ -208,8 +209,10 @@ async fn the_page_drives_a_robot_and_shows_predictions() {
     page.wait_until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
         .await;
     // The second job is still running.
-    page.wait_until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
-        .await;
+    page.wait_until(
+        "[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)",
+    )
+    .await;
     for (width_px, colors) in [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")] {
         page.screenshot("page", width_px, colors).await;
     }
@@ -251,7 +254,8 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
     );
     // The tab keeps the key.
     page.call("Page.reload", json!({})).await;
-    page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+    page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}"))
+        .await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     app.store().revoke_key(&key.id, 2.0).await.unwrap();
     keys.refresh().await.unwrap();
@@ -276,7 +280,8 @@ async fn page_deletes_its_environment_when_it_closes() {
     for _ in 0..5 {
         page.wait_until(IS_COMPLETE).await;
         page.call("Page.reload", json!({})).await;
-        page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+        page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}"))
+            .await;
     }
     server.stop().await;
 }

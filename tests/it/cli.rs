@@ -233,8 +233,11 @@ fn damaged_files_exit_with_1_and_the_cause() {
     let bytes = fs::read(&shard).unwrap();
     fs::write(&shard, &bytes[..bytes.len() / 2]).unwrap();
     let (code, text) = run(dir.path(), "inspect static-observer");
-    assert!(code == 1 && text.contains("file-000.parquet has the sha256"), "{text}");
-    assert!(text.contains("restore the file or collect the data set again"), "{text}");
+    assert!(code == 1 && text.contains("file-000.parquet has the SHA-256"), "{text}");
+    assert!(
+        text.contains("restore the file or collect the data set again"),
+        "{text}"
+    );
 
     record_hash(
         &dir.path().join("data/datasets/static-observer"),

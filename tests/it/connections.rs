@@ -9,7 +9,7 @@ use foreframe::server::ServerConfig;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::service::{TIMEOUT, InProcessServer, app, get, run, send};
+use crate::service::{InProcessServer, TIMEOUT, app, get, run, send};
 
 const ASK: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
 

@@ -7,7 +7,7 @@ use axum::http::Request;
 use foreframe::server::{App, ServerConfig, openapi_document};
 use serde_json::{Value, json};
 
-use crate::service::{app, get, post, post_text, send, poll_until};
+use crate::service::{app, get, poll_until, post, post_text, send};
 
 const PLAIN: &str = "/v1/models/plain/predict";
 

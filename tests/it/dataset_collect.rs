@@ -96,7 +96,7 @@ fn a_data_set_reads_back_what_was_simulated() {
 }
 
 #[test]
-fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
+fn the_camera_is_recorded_and_older_data_sets_still_open() {
     let (_directory, out) = finished();
     let recorded = Dataset::open(&out).unwrap();
     let camera = &config(&out).world.camera;
@@ -108,12 +108,19 @@ fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
     stamp.as_object_mut().unwrap().remove("camera");
     fs::write(&path, stamp.to_string()).unwrap();
     let older = Dataset::open(&out).unwrap();
-    assert_eq!(older.info().content_hash, recorded.info().content_hash);
+    assert_eq!(older.info(), recorded.info(), "the collection's arguments describe the camera too");
+    let arguments = fs::read(out.join("meta/collect.json")).unwrap();
+    fs::remove_file(out.join("meta/collect.json")).unwrap();
+    assert_eq!(Dataset::open(&out).unwrap().info().camera, None);
+    fs::write(out.join("meta/collect.json"), arguments).unwrap();
 
     stamp["camera"] = serde_json::json!({"horizontal_fov_rad": 4.0, "tilt_down_rad": 0.0});
     fs::write(&path, stamp.to_string()).unwrap();
     let refused = Dataset::open(&out).unwrap_err().to_string();
-    assert!(refused.contains("the camera model has a field of view of 4 rad"), "{refused}");
+    assert!(
+        refused.contains("the camera model has a field of view of 4 rad"),
+        "{refused}"
+    );
 }
 
 #[test]

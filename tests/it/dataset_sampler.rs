@@ -107,8 +107,11 @@ proptest! {
         all.sort_unstable();
         prop_assert_eq!(all, (0..100).collect::<Vec<_>>());
         for episode in dataset.episodes() {
-            let held_out = episode.trial.as_ref().unwrap().is_held_out();
-            prop_assert_eq!(splits.episodes(Split::TestUnseen).contains(&episode.index), held_out);
+            let trial = episode.trial.as_ref().unwrap();
+            let (pair, held_out) = (trial.has_held_out_pair(), trial.is_held_out());
+            let is_in = |split| splits.episodes(split).contains(&episode.index);
+            prop_assert_eq!(is_in(Split::UnseenPairs), pair);
+            prop_assert_eq!(is_in(Split::UnseenGains), held_out && !pair);
         }
     }
 }
@@ -118,7 +121,7 @@ fn recordings_are_split_80_10_10() {
     let dataset = recorded(&[12; 100], &[]);
     let splits = Splits::new(&dataset, Seed(3));
     let counts = Split::ALL.map(|split| splits.episodes(split).len());
-    assert_eq!(counts, [80, 10, 10, 0]);
+    assert_eq!(counts, [80, 10, 10, 0, 0]);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, ErrorC
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened, step};
+use crate::client::{Client, SessionHandle, numbered_frame};
 use crate::service::{CONTEXT, HEIGHT, WIDTH, app, get, png, post, run};
 use crate::sessions::{code, frames};
 
@@ -79,13 +79,13 @@ async fn a_session_resizes_its_frames_as_asked() {
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
     let frame_message = |seq: u64, file: Vec<u8>| {
-        let mut message = step(seq);
+        let mut message = numbered_frame(seq);
         message.image = ImageBytes(file);
         message.format = ImageFormat::Png;
         ClientMessage::Frame(message)
     };
-    let with_fit = Opened::open(&app, &json!({"model": "moving", "fit": "letterbox"})).await;
-    let without = Opened::open(&app, &json!({"model": "moving"})).await;
+    let with_fit = SessionHandle::open(&app, &json!({"model": "moving", "fit": "letterbox"})).await;
+    let without = SessionHandle::open(&app, &json!({"model": "moving"})).await;
     let mut resized = Client::connect(server.address, &with_fit.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();

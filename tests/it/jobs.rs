@@ -15,7 +15,7 @@ use foreframe::versions::Versions;
 use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
 
-use crate::service::{app, get, model, post, run, send, spec, store, poll_until, with_data};
+use crate::service::{app, get, model, poll_until, post, run, send, spec, store, with_data};
 
 const JOBS: &str = "/v1/jobs";
 

@@ -8,7 +8,7 @@ use foreframe::server::{App, ServerConfig};
 use futures_util::FutureExt as _;
 use serde_json::{Value, json};
 
-use crate::service::{Answer, app, context, get, post, send, store, poll_until, with_data};
+use crate::service::{Answer, app, context, get, poll_until, post, send, store, with_data};
 
 const JOBS: &str = "/v1/jobs";
 
@@ -60,10 +60,7 @@ async fn a_collected_data_set_trains_a_served_model() {
     let app = app(dir.path(), ServerConfig::default());
     let collection = collect_data_set(&app).await;
     assert_eq!(
-        (
-            &collection["progress"]["done"],
-            &collection["progress"]["total"]
-        ),
+        (&collection["progress"]["done"], &collection["progress"]["total"]),
         (&json!(40), &json!(40))
     );
     let again = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
@@ -185,8 +182,10 @@ async fn model_versions_are_activated_refused_and_deleted() {
     let and_gone = post(&app, "/v1/models/plain/versions/1/activate", &Value::Null).now_or_never();
     assert!(and_gone.is_none());
     wait_for_version(&app, "plain", 1).await;
-    poll_until(async || (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(()))
-        .await;
+    poll_until(async || {
+        (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(())
+    })
+    .await;
     post(&app, "/v1/models/plain/versions/2/activate", &Value::Null)
         .await
         .json();

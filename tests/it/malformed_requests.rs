@@ -83,7 +83,9 @@ async fn an_incomplete_body_is_answered_408() {
     let length = format!("{PREDICT}content-length: 99\r\n\r\n{{");
     let chunks = format!("{PREDICT}transfer-encoding: chunked\r\n\r\n5\r\n{{\"fra\r\n");
     for half in [&length, &chunks] {
-        let answer = setup.while_robot_streams(send_and_read(address, &[half.as_bytes()])).await;
+        let answer = setup
+            .while_robot_streams(send_and_read(address, &[half.as_bytes()]))
+            .await;
         assert_problem(&answer, 408, "over 200 ms");
     }
     let gone = async { connect(address).await.write_all(length.as_bytes()).await.unwrap() };
@@ -100,7 +102,9 @@ async fn a_compressed_body_is_answered_415() {
     let length = compressed.len();
     for encoding in ["gzip", "br, gzip", "zstd"] {
         let head = format!("{PREDICT}content-encoding: {encoding}\r\ncontent-length: {length}\r\n\r\n");
-        let answer = setup.while_robot_streams(send_and_read(address, &[head.as_bytes(), &compressed])).await;
+        let answer = setup
+            .while_robot_streams(send_and_read(address, &[head.as_bytes(), &compressed]))
+            .await;
         assert_problem(&answer, 415, "Content-Encoding");
     }
     setup.close().await;
@@ -118,7 +122,9 @@ async fn a_body_over_the_limit_is_answered_413() {
     let length = format!("{PREDICT}content-length: {}\r\n\r\n", long.len());
     let chunks = format!("{PREDICT}transfer-encoding: chunked\r\n\r\n{:x}\r\n", long.len());
     for head in [&length, &chunks] {
-        let answer = setup.while_robot_streams(send_and_read(address, &[head.as_bytes(), &long])).await;
+        let answer = setup
+            .while_robot_streams(send_and_read(address, &[head.as_bytes(), &long]))
+            .await;
         assert_problem(&answer, 413, "longer than this server takes");
     }
     setup.close().await;

@@ -39,7 +39,10 @@ async fn a_message_over_the_limit_closes_with_1009() {
             client.send(&numbered_message(answered as u64)).await;
             let image = ImageBytes(vec![0; 3 << 20]);
             client
-                .send(&ClientMessage::Frame(FrameMessage { image, ..numbered_frame(9) }))
+                .send(&ClientMessage::Frame(FrameMessage {
+                    image,
+                    ..numbered_frame(9)
+                }))
                 .await;
             assert!(matches!(client.receive().await, ServerMessage::Buffering { .. }));
             let refused = client.receive().await;

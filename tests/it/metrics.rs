@@ -163,7 +163,11 @@ async fn a_slow_reader(server: &RunningServer) {
         }
     }
     assert!(dropped_total > 0);
-    assert_metric(server, "foreframe_stream_predictions_dropped_total", dropped_total as f64);
+    assert_metric(
+        server,
+        "foreframe_stream_predictions_dropped_total",
+        dropped_total as f64,
+    );
     assert_metric(
         server,
         "foreframe_stream_frames_total{model=\"large\"}",

@@ -56,7 +56,12 @@ pub(crate) fn in_f64(condition: &ConditioningTensors) -> ConditioningTensors {
 
 pub(crate) fn all_kinds() -> Vec<(ModelSpec, bool)> {
     let mut kinds = Vec::new();
-    for conditioning in [Conditioning::None, Conditioning::Action, Conditioning::StateAction] {
+    for conditioning in [
+        Conditioning::None,
+        Conditioning::Action,
+        Conditioning::State,
+        Conditioning::StateAction,
+    ] {
         for reconstruction in [Reconstruction::Sequence, Reconstruction::Stepwise] {
             for truth in [false, true] {
                 kinds.push((tiny(conditioning, reconstruction), truth));

@@ -144,7 +144,10 @@ async fn invalid_candidates_are_refused_with_the_field() {
     let unconditioned = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
         .await
         .detail(422);
-    assert!(unconditioned.starts_with("model \"plain\" takes no actions"), "{unconditioned}");
+    assert!(
+        unconditioned.starts_with("model \"plain\" takes no actions"),
+        "{unconditioned}"
+    );
 }
 
 #[tokio::test]

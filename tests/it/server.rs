@@ -211,7 +211,10 @@ async fn a_full_queue_is_answered_503_with_retry_after() {
     let refused: Vec<_> = answers.iter().filter(|answer| answer.status != 200).collect();
     assert!(!refused.is_empty() && refused.len() < answers.len());
     for answer in refused {
-        assert_eq!(answer.detail(503), "1 predictions are waiting already; try again in 1 s");
+        assert_eq!(
+            answer.detail(503),
+            "1 predictions are waiting already; try again in 1 s"
+        );
         assert_eq!(answer.headers[header::RETRY_AFTER], "1");
     }
 }

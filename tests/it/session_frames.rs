@@ -47,7 +47,10 @@ async fn on_gap_skip_accepts_a_gap_and_reports_it() {
     };
     assert_eq!(format, ImageFormat::Png);
     assert!(frames[0].0.starts_with(b"\x89PNG"));
-    assert_eq!(code(&client.ask(&numbered_message(u64::MAX)).await), (ErrorCode::Invalid, 7));
+    assert_eq!(
+        code(&client.ask(&numbered_message(u64::MAX)).await),
+        (ErrorCode::Invalid, 7)
+    );
     let settings = get(&app, &session.path("/state")).await.json();
     assert_eq!(
         (&settings["on_gap"], &settings["format"]),
@@ -61,7 +64,10 @@ async fn on_late_skip_predicts_only_from_the_newest_frame() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let (skipping, predicting) = (SessionHandle::open(&app, &moving()).await, SessionHandle::open(&app, &moving()).await);
+    let (skipping, predicting) = (
+        SessionHandle::open(&app, &moving()).await,
+        SessionHandle::open(&app, &moving()).await,
+    );
     let connect = async |session: &SessionHandle| {
         let client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack).await;
         client.unwrap()
@@ -181,7 +187,10 @@ async fn run_with_faults(faults: &[NetworkFault]) -> Result<(), TestCaseError> {
             }
             NetworkFault::Twice(_) => {}
             NetworkFault::Ahead(by) => {
-                prop_assert_eq!(code(&client.ask(&numbered_message(next + by)).await), (ErrorCode::Gap, next));
+                prop_assert_eq!(
+                    code(&client.ask(&numbered_message(next + by)).await),
+                    (ErrorCode::Gap, next)
+                );
             }
             NetworkFault::Swapped => {
                 client.ask(&numbered_message(next + 1)).await;

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Error;
 
 use crate::client::{Client, SessionHandle, numbered_message};
-use crate::service::{CONTEXT, app, get, post, run, send, poll_until};
+use crate::service::{CONTEXT, app, get, poll_until, post, run, send};
 
 const MOVING: &str = r#"{"model": "moving"}"#;
 
@@ -37,7 +37,10 @@ async fn a_session_continues_after_reconnecting() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let (broken, whole) = (SessionHandle::open(&app, &moving()).await, SessionHandle::open(&app, &moving()).await);
+    let (broken, whole) = (
+        SessionHandle::open(&app, &moving()).await,
+        SessionHandle::open(&app, &moving()).await,
+    );
     let mut reference = Client::connect(server.address, &whole.path("/stream"), Codec::Json)
         .await
         .unwrap();

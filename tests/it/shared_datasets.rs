@@ -8,7 +8,7 @@ use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::service::{Answer, get, post, send, poll_until};
+use crate::service::{Answer, get, poll_until, post, send};
 
 const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";

@@ -7,7 +7,7 @@ use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMess
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 
 use crate::client::Client;
-use crate::service::{self, TIMEOUT, InProcessServer, model, run, spec, poll_until, with_data};
+use crate::service::{self, InProcessServer, TIMEOUT, model, poll_until, run, spec, with_data};
 
 const SIDE: u32 = 256;
 const SEND_TIMEOUT: Duration = Duration::from_millis(500);

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use foreframe::store::{
-    EnqueueResult, JobOutcome, JobPage, JobRow, JobReport, Lease, LossRow, NewJob, Store, StoreConfig,
+    EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, Lease, LossRow, NewJob, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
@@ -143,7 +143,10 @@ async fn an_expired_lease_cannot_write() {
         assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
         let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
-        assert_eq!(store.renew(stale, 99.0, report("from an expired lease")).await.unwrap(), None);
+        assert_eq!(
+            store.renew(stale, 99.0, report("from an expired lease")).await.unwrap(),
+            None
+        );
         assert!(
             !store
                 .end(stale, outcome("failed"), report("from an expired lease"))

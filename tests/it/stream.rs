@@ -14,7 +14,8 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::service::{
-    CONTEXT, TIMEOUT, InProcessServer, app, context, frame, get, model, png, post, run, spec, start, poll_until, with_data,
+    CONTEXT, InProcessServer, TIMEOUT, app, context, frame, get, model, png, poll_until, post, run, spec, start,
+    with_data,
 };
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;

@@ -4,9 +4,11 @@ use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::Dataset;
+use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
 use foreframe::registry;
+use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
+use foreframe::types::Seed;
 
 use crate::fixtures::moving_squares;
 
@@ -93,7 +95,11 @@ fn a_stopped_and_resumed_run_has_the_same_bits() {
             "{name}: the last checkpoints differ"
         );
         let model = |run: &Path| std::fs::read(run.join("model").join(registry::WEIGHTS_FILE)).unwrap();
-        assert_eq!(model(&resumed), model(&uninterrupted), "{name}: the published weights differ");
+        assert_eq!(
+            model(&resumed),
+            model(&uninterrupted),
+            "{name}: the published weights differ"
+        );
     }
 }
 
@@ -156,18 +162,18 @@ fn a_diverging_run_keeps_its_last_good_checkpoint() {
         "fit.steps=500",
     ]);
     let error = train(&config, &dataset, dir.path()).unwrap_err();
-    let TrainError::Diverged { stage, step, kept, .. } = &error else {
+    let TrainError::Diverged { stage, step, checkpoint_step, .. } = &error else {
         panic!("{error}")
     };
     assert_eq!(stage.to_string(), "fit");
-    assert!(kept < step && step - kept <= 7, "{error}");
+    assert!(checkpoint_step < step && step - checkpoint_step <= 7, "{error}");
     assert!(dir.path().join("checkpoint.safetensors").is_file());
     assert!(!dir.path().join("model").exists());
     let again = train(&config, &dataset, dir.path()).unwrap_err();
     assert_eq!(
         again.to_string(),
         error.to_string(),
-        "the kept checkpoint leads to the same end"
+        "the same checkpoint leads to the same error"
     );
 }
 
@@ -228,6 +234,41 @@ fn a_damaged_checkpoint_is_refused_with_advice() {
         error.contains("cannot resume from the checkpoint") && error.contains("delete it to start again"),
         "{error}"
     );
+}
+
+#[test]
+fn a_data_set_without_training_windows_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("two-trials");
+    let mut two_trials = CollectConfig::new(Scenario::MovingObserver, 2, Seed(0), &out);
+    two_trials.world = WorldConfig {
+        frame_width_px: 12,
+        frame_height_px: 12,
+        max_duration_s: 4.0,
+        ..WorldConfig::default()
+    };
+    collect(&two_trials, &|_| {}, &AtomicBool::new(false)).unwrap();
+    let dataset = Dataset::open(&out).unwrap();
+    // Find a split that puts one trial into validation and none into training.
+    let split_seed = (0..10_000)
+        .find(|&seed| {
+            let splits = Splits::new(&dataset, Seed(seed));
+            splits.episodes(Split::Train).is_empty() && !splits.episodes(Split::Validation).is_empty()
+        })
+        .unwrap();
+    let config = small_config(&["data.windows=all", &format!("data.split_seed={split_seed}")]);
+    let run_dir = dir.path().join("run");
+    let error = train(&config, &dataset, &run_dir).unwrap_err();
+    assert!(
+        matches!(error, TrainError::NoWindows { train: 0, validation, .. } if validation > 0),
+        "{error}"
+    );
+    assert!(
+        error.to_string().contains("has 0 training windows and")
+            && error.to_string().contains("training needs at least 1 of each"),
+        "{error}"
+    );
+    assert!(!run_dir.exists());
 }
 
 #[test]

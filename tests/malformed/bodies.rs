@@ -7,8 +7,8 @@ use proptest::prelude::*;
 use proptest::sample::Index;
 use serde_json::{Value, json};
 
-use crate::exclusive;
 use crate::corpus::{CorpusFile, files};
+use crate::exclusive;
 use crate::mutation::{mutated, mutations};
 use crate::service::Answer;
 use crate::test_service::SERVICE;

@@ -27,11 +27,7 @@ fn corpus_images_are_accepted_or_refused_as_named() {
         let expected = if file.part(0) == "ok" { 200 } else { 422 };
         assert_eq!(answer.status, expected, "{}: {text}", file.name);
         if expected == 422 {
-            assert!(
-                answer.detail(422).starts_with("frames[0] is "),
-                "{}: {text}",
-                file.name
-            );
+            assert!(answer.detail(422).starts_with("frames[0] is "), "{}: {text}", file.name);
         }
     }
 }

@@ -9,12 +9,12 @@ use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
 use super::{SaturateArgs, watch_memory};
-use crate::report::{Bounds, Latencies};
 use crate::http::{Http, Request};
-use crate::workload::Workload;
-use crate::schedule::Schedule;
 use crate::process_usage::CpuShare;
+use crate::report::{Bounds, Latencies};
+use crate::schedule::Schedule;
 use crate::server::Server;
+use crate::workload::Workload;
 
 /// Numbers of connections tried to find the peak.
 const LEVELS: [usize; 3] = [16, 64, 128];

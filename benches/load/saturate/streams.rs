@@ -8,10 +8,10 @@ use tokio_tungstenite::tungstenite::Error;
 
 use super::{SaturateArgs, watch_memory};
 use crate::report::Bounds;
-use crate::robots::{SendMode, RobotLoad};
-use crate::workload::Workload;
+use crate::robots::{RobotLoad, SendMode};
 use crate::server::Server;
 use crate::session;
+use crate::workload::Workload;
 
 const WARM_UP: Duration = Duration::from_millis(500);
 /// Frames that each robot is ahead of its answers when the peak is measured.
@@ -50,7 +50,8 @@ pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
         measured: args.time(),
     };
     let memory = tokio::spawn(watch_memory(server.process.clone(), args.time()));
-    let (result, (refused_streams, unexpected)) = tokio::join!(load.run(&server, &workload), open_over_limit(args, &server));
+    let (result, (refused_streams, unexpected)) =
+        tokio::join!(load.run(&server, &workload), open_over_limit(args, &server));
     let (goodput_hz, counts) = (result.goodput_hz(), &result.counts);
     println!(
         "streams: {offered_hz:.0} frames/s offered for {} s: {goodput_hz:.0} predictions/s, {:.0} µs each; of {} frames {} \

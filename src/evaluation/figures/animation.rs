@@ -1,4 +1,4 @@
-//! What the model sees ahead over a whole trial, as an endless GIF.
+//! Predictions over a whole trial, as an endless GIF.
 
 use super::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
@@ -6,11 +6,11 @@ use crate::frame::{Frame, FrameError, codec};
 /// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
 #[derive(Clone, Debug)]
 pub struct AnimationFrame {
-    /// What came.
+    /// The true frame.
     pub truth: Frame,
     /// What the model predicted.
     pub predicted: Frame,
-    /// What a trivial baseline predicted.
+    /// What a baseline predicted.
     pub copied: Frame,
 }
 
@@ -51,11 +51,9 @@ impl Animation {
                     cell("last seen", &moment.copied),
                 ],
             };
-            // Smaller than a panel: every moment costs bytes.
-            let panel = Style::for_frames_of(moment.truth.width());
             let style = Style {
-                scale: (panel.scale * 2 / 3).max(1),
                 grid_lines: 0,
+                ..Style::for_frames_of(moment.truth.width())
             };
             montage(&format!("{} frames ahead", self.steps_ahead), &[row], &style)
         });

@@ -46,7 +46,10 @@ impl Admission {
 
     fn full(&self) -> ApiError {
         counter!(names::PREDICTIONS_REFUSED, "reason" => "full").increment(1);
-        ApiError::unavailable(format!("{} predictions are waiting already; try again in 1 s", self.capacity))
+        ApiError::unavailable(format!(
+            "{} predictions are waiting already; try again in 1 s",
+            self.capacity
+        ))
     }
 }
 

@@ -9,6 +9,7 @@ use utoipa_axum::routes;
 
 use super::picture::PictureError;
 use crate::dataset::{self, Dataset, DatasetError, DatasetInfo};
+use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::jobs::{JobError, datasets};
@@ -17,7 +18,6 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::types::Channel;
-use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

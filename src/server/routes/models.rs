@@ -6,6 +6,7 @@ use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use crate::error_text::with_causes;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::blocking::run_to_completion;
@@ -14,7 +15,6 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::versions::VersionError;
-use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

@@ -3,10 +3,10 @@
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 
+use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::server::http::problem::ApiError;
-use crate::error_text::with_causes;
 
 /// How long an animation stays on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;

@@ -9,6 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
+use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
@@ -21,7 +22,6 @@ use crate::server::state::App;
 use crate::server::stream::protocol::Timing;
 use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
 use crate::types::{Action, RobotState, ValueError};
-use crate::error_text::with_causes;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(predict))

@@ -156,7 +156,7 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let task = state.futures(conditioning(
+    let task = state.rollout_task(conditioning(
         request.candidates,
         robot_state,
         &model.manifest,
@@ -173,7 +173,7 @@ impl RolloutRequest {
         let seen = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, seen.len())?;
         let conditioning = conditioning(self.candidates, state, manifest, config)?;
-        let task = Task::futures(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
+        let task = Task::rollout(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
     }
 }

@@ -10,7 +10,7 @@ use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
 use crate::serving::{
-    ConditioningInput, InputError, RawConditioning, STEP, ServingError, SessionState, Task, TaskOutput,
+    ConditioningInput, InputError, RawConditioning, STEP_FIELDS, ServingError, SessionState, Task, TaskOutput,
 };
 use crate::types::{Action, RobotState, ValueError};
 
@@ -52,7 +52,7 @@ impl FrameStep {
         Ok(Self {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            conditioning: ConditioningInput::new(given, &STEP, &manifest.name, &manifest.spec)?,
+            conditioning: ConditioningInput::new(given, &STEP_FIELDS, &manifest.name, &manifest.spec)?,
             frame: images::decode("image", message.image, ImageInput { format, fit }, manifest)?,
             format,
             is_overtaken: false,
@@ -145,7 +145,7 @@ impl SessionCore {
             return Err(StepError::Seq(step.seq));
         }
         if step.seq < next {
-            return Ok(match (&self.last_answer, self.state.again(spec)) {
+            return Ok(match (&self.last_answer, self.state.repeat_task(spec)) {
                 (Some(answer), _) => PendingStep::Answered(answer.clone()),
                 (None, Some(task)) => PendingStep::Again(task),
                 (None, None) => PendingStep::Answered(self.answer(step.timestamp_us, 0, None)),
@@ -189,7 +189,7 @@ impl SessionCore {
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
         };
-        let future = computed.futures.into_iter().next();
+        let future = computed.predictions.into_iter().next();
         let prediction = future.map(|frames| (frames.into(), timing));
         let answer = self.answer(timestamp_us, skipped, prediction);
         self.last_answer = Some(answer.clone());
@@ -201,7 +201,7 @@ impl SessionCore {
             seq: self.state.next_seq().saturating_sub(1),
             timestamp_us,
             skipped,
-            have: self.state.have(),
+            have: self.state.frame_count(),
             prediction,
         }
     }

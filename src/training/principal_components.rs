@@ -1,6 +1,6 @@
-//! Where the codec's training starts: the principal components of the training frames. A dense codec whose last layer is
-//! linear can do no better than they do (Baldi & Hornik 1989), and gradient descent from random weights takes long to get
-//! there; what is left to training is the encoder's tanh.
+//! Initial weights of the codec from the principal components of the training frames. They are optimal for a linear codec
+//! (Baldi & Hornik 1989), and gradient descent from random weights needs many steps to reach them. Training then only has
+//! to adapt to the encoder's tanh.
 
 use candle_core::{Device, Tensor};
 use rand_distr::{Distribution, StandardNormal};
@@ -9,21 +9,22 @@ use super::TrainError;
 use crate::nn::{NnError, Parameters};
 use crate::types::Seed;
 
-/// Directions that are followed beside those asked for, so that the last of these converge too (Halko et al. 2011).
+/// Additional directions in the iteration, so that the last requested ones converge too (Halko et al. 2011).
 const OVERSAMPLING: usize = 16;
-/// Rounds of orthogonal iteration.
+/// Steps of orthogonal iteration.
 const ITERATIONS: usize = 6;
-/// Root mean square over the features of their standard deviations before the tanh: small enough for tanh to be nearly
-/// straight.
+/// Standard deviation of the features before the tanh (root mean square over the features): small, so that tanh is almost
+/// linear.
 const FEATURE_STD: f64 = 0.15;
-/// What power of a component's own standard deviation its feature keeps: at 0 every feature varies alike and the network
-/// overfits the fine ones, at 1 it hardly sees them.
+/// A feature's standard deviation is that of its component to this power. With 0, all features vary equally and the network
+/// overfits fine details; with 1, fine details are almost lost.
 const STD_POWER: f64 = 0.5;
-/// The least standard deviation of a component, in the model's space; below it there is only noise.
+/// Smallest standard deviation of a component, in the model's value range; below it there is only noise.
 const MIN_STD: f64 = 1e-4;
 
-/// Sets the encoder to the leading principal components of `frames` `[N, P]`, scaled by [`FEATURE_STD`] and [`STD_POWER`],
-/// and the reconstruction layer to what these best write `targets` `[N, P]` with. Errors: `Network` if the tensors don't fit.
+/// Sets the frame encoder to the first principal components of `frames` `[N, P]`, scaled by [`FEATURE_STD`] and
+/// [`STD_POWER`], and the frame decoder to the least-squares weights for `targets` `[N, P]`. Errors: `Network` if the shapes
+/// do not match.
 pub(super) fn set_codec(
     parameters: &Parameters,
     frames: &Tensor,
@@ -45,7 +46,7 @@ pub(super) fn set_codec(
     }
     orthonormalize(&mut directions);
     directions.truncate(features);
-    // Fewer pixels than features: the rest of the features stay silent.
+    // If there are fewer pixels than features, the other features stay 0.
     directions.resize(features, vec![0.0; pixels]);
     let basis = Tensor::from_vec(directions.concat(), (features, pixels), &Device::Cpu)?;
     let scores = centered.matmul(&basis.t()?)?;
@@ -53,12 +54,12 @@ pub(super) fn set_codec(
         .sqrt()?
         .clamp(MIN_STD, f64::MAX)?
         .reshape((features, 1))?;
-    let kept = std.powf(STD_POWER)?;
-    let rms = kept.sqr()?.mean_all()?.to_scalar::<f32>()?.sqrt();
-    // What one unit of a component becomes in its feature.
-    let gain = (kept.div(&std)? * (FEATURE_STD / f64::from(rms)))?;
+    let feature_std = std.powf(STD_POWER)?;
+    let rms = feature_std.sqr()?.mean_all()?.to_scalar::<f32>()?.sqrt();
+    // Feature value per unit of the component.
+    let gain = (feature_std.div(&std)? * (FEATURE_STD / f64::from(rms)))?;
     let encoder = basis.broadcast_mul(&gain)?.t()?.contiguous()?;
-    // Components are uncorrelated, so each one's least-squares weights stand alone: covariance over variance.
+    // Components are uncorrelated, so the least-squares weights of each are covariance / variance.
     let target_mean = targets.mean(0)?;
     let covariance = (scores.t()?.matmul(&targets.broadcast_sub(&target_mean)?)? / count as f64)?;
     let decoder = covariance.broadcast_div(&(std.sqr()? * gain)?)?;
@@ -88,7 +89,7 @@ fn random_directions(pixels: usize, width: usize, seed: Seed) -> Vec<Vec<f32>> {
         .collect()
 }
 
-/// Gram–Schmidt, twice over each row as rounding asks for; a row that depends on those before it becomes zero.
+/// Gram–Schmidt, applied twice to each row because of rounding. A row that depends linearly on earlier rows becomes zero.
 fn orthonormalize(rows: &mut [Vec<f32>]) {
     for index in 0..rows.len() {
         let (before, rest) = rows.split_at_mut(index);
@@ -118,7 +119,7 @@ mod tests {
     use crate::nn::{Model, ModelSpec};
 
     #[test]
-    fn frames_of_few_components_come_back_through_the_codec() {
+    fn the_codec_restores_frames_of_few_components() {
         let spec = ModelSpec {
             frame_width_px: 8,
             frame_height_px: 8,
