@@ -6,11 +6,13 @@ mod error;
 mod evaluate;
 mod export;
 mod healthcheck;
+mod import;
 mod inspect;
 mod interrupt;
 mod keys;
 mod predict;
 mod progress;
+mod run_job;
 mod serve;
 mod settings;
 mod train;
@@ -45,6 +47,8 @@ struct Cli {
 enum Command {
     /// Simulate trials and store their frames, actions and states
     Collect(collect::CollectArgs),
+    /// Turn a recording of a real robot into a data set
+    Import(import::ImportArgs),
     /// Train a model on a data set
     Train(train::TrainArgs),
     /// Measure a model on held-out trials: report, figures, GIF
@@ -61,6 +65,9 @@ enum Command {
     Healthcheck(healthcheck::HealthcheckArgs),
     /// Work on jobs without serving
     Worker(worker::WorkerArgs),
+    /// Run one job for a server or worker, which starts this command
+    #[command(hide = true)]
+    RunJob,
     /// Describe a model or a data set
     Inspect(inspect::InspectArgs),
     /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
@@ -88,6 +95,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
     };
     match command {
         Command::Collect(args) => collect::run(args),
+        Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),
@@ -96,6 +104,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::RunJob => run_job::run(),
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }

@@ -9,6 +9,7 @@ pub mod collect;
 mod collection;
 mod error;
 mod files;
+pub mod import;
 mod layout;
 mod preview;
 pub mod sampler;

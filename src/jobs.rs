@@ -4,13 +4,16 @@
 //! and several processes can share them.
 
 mod checkpoints;
+pub mod child;
 pub mod datasets;
 mod instance;
 pub mod job;
+pub mod memory;
 pub mod pipeline;
 mod priority;
 mod progress;
 pub mod queue;
+mod report;
 mod runner;
 pub mod spec;
 pub mod state;
@@ -22,7 +25,8 @@ use crate::versions::VersionError;
 pub use job::{Job, JobFilter};
 pub use progress::{JobProgress, Losses};
 pub use queue::{JobLimits, Jobs};
-pub use runner::{JobExecutor, JobFailure, JobReporter, JobResult};
+pub use report::JobReporter;
+pub use runner::{JobExecutor, JobFailure, JobResult};
 pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
 pub use state::{JobState, JobTransition};
 

@@ -219,7 +219,10 @@ mod tests {
     #[test]
     fn recording_test_scores_keeps_the_validation_score() {
         let mut metrics = serde_json::json!({"validation": {"mse": 1, "step": 7}, "test": {"mse": 2}, "old": 3});
-        merge(&mut metrics, serde_json::json!({"test": {"mse": 4}, "validation": {"mse": 5}, "old": null}));
+        merge(
+            &mut metrics,
+            serde_json::json!({"test": {"mse": 4}, "validation": {"mse": 5}, "old": null}),
+        );
         let expected = serde_json::json!({"validation": {"mse": 5, "step": 7}, "test": {"mse": 4}});
         assert_eq!(metrics, expected);
     }

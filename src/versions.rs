@@ -135,6 +135,17 @@ impl Versions {
         Ok(self.all().await?.remove(model).unwrap_or_default())
     }
 
+    /// The metrics of a model: the latest that an evaluation job measured with these weights, else those of the manifest.
+    /// Errors: `Store`.
+    pub async fn metrics(&self, manifest: &Manifest) -> Result<serde_json::Value, VersionError> {
+        let measured = self.store.model_metrics().await?.into_iter().find(|measured| {
+            (measured.model.as_str(), measured.version) == (manifest.name.as_str(), manifest.version)
+                && measured.weights_sha256 == manifest.weights_sha256
+        });
+        let parsed = measured.and_then(|measured| serde_json::from_str(&measured.metrics).ok());
+        Ok(parsed.unwrap_or_else(|| manifest.metrics.clone()))
+    }
+
     /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions
     /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
     pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {

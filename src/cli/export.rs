@@ -6,7 +6,7 @@ use clap::value_parser;
 use serde_json::json;
 
 use super::{CliError, open_dataset, say};
-use crate::evaluation;
+use crate::evaluation::{self, figures::animation::enlarged_gif};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
 
@@ -78,7 +78,7 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     let delay_ms = (info.frame_period_s * 1000.0).round() as u32;
     write(
         &args.out.join("episode.gif"),
-        &codec::encode_gif(&frames, delay_ms).map_err(CliError::failed)?,
+        &enlarged_gif(&frames, delay_ms).map_err(CliError::failed)?,
     )?;
     let actions: Vec<&[f32]> = range.clone().map(|frame| dataset.action(frame)).collect();
     let states: Vec<&[f32]> = range.map(|frame| dataset.state(frame)).collect();

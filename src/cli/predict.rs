@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::{CliError, load_model, say};
 use crate::error_text;
-use crate::evaluation::{self, figures::montage};
+use crate::evaluation::{self, figures::animation, figures::montage};
 use crate::files::write_atomically;
 use crate::frame::{Frame, codec};
 use crate::nn::ModelSpec;
@@ -186,10 +186,9 @@ fn write(
         &codec::encode_png(&sheet).map_err(CliError::failed)?,
     )?;
     let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
-    let film = seen.iter().chain(predicted).map(montage::enlarged);
-    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
+    let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
     save(
         "prediction.gif".to_owned(),
-        &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,
+        &animation::enlarged_gif(&film, delay_ms).map_err(CliError::failed)?,
     )
 }

@@ -24,7 +24,8 @@ pub(super) struct ServeArgs {
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let config = checked(args.settings.load()?)?;
+    let mut config = checked(args.settings.load()?)?;
+    config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -61,7 +62,12 @@ async fn listen(config: Config) -> Result<(), CliError> {
         warn!("{advice}");
     }
     say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
+    let store = app.store().clone();
     server::serve(listener, app, server::shutdown::requested()).await;
+    // From now on the database file alone is complete.
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
+    }
     Ok(())
 }
 

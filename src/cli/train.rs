@@ -135,6 +135,9 @@ impl<'a> TrainingDisplay<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
             }
+            TrainingEvent::CheckpointDamaged { is_previous } => {
+                tracing::warn!(is_previous, "a checkpoint is damaged and is not used");
+            }
             TrainingEvent::Restored { .. } | TrainingEvent::Checkpointed { .. } => {}
         }
     }

@@ -1,14 +1,13 @@
 //! `foreframe worker`
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::settings::{StoreSettings, checked};
 use super::{CliError, say};
-use crate::jobs::Jobs;
 use crate::jobs::pipeline::Pipeline;
+use crate::jobs::{Jobs, child};
 use crate::server::{self, ServerConfig};
 use crate::store::Store;
 use crate::telemetry;
@@ -33,14 +32,19 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(CliError::failed)?;
-    runtime.block_on(work(&config.server))
+    let server = ServerConfig {
+        job_program: Some(std::env::current_exe().map_err(CliError::failed)?),
+        ..config.server
+    };
+    runtime.block_on(work(&server))
 }
 
 async fn work(config: &ServerConfig) -> Result<(), CliError> {
     let store = Store::open(&config.store()).await?;
     let versions = Versions::new(store.clone(), &config.models_dir);
-    let pipeline = Pipeline::new(store.clone(), versions, config.job_threads);
-    let jobs = Jobs::start(store, config.jobs(), Arc::new(pipeline), true).map_err(CliError::failed)?;
+    let pipeline = Pipeline::new(store.clone(), versions, config.job_threads).with_memory_limit(config.job_memory_mb);
+    let executor = child::executor(pipeline, config.job_process());
+    let jobs = Jobs::start(store.clone(), config.jobs(), executor, true).map_err(CliError::failed)?;
     say("Foreframe works on jobs — Ctrl-C stops it")?;
     server::shutdown::requested().await;
     info!("stopping");
@@ -48,6 +52,9 @@ async fn work(config: &ServerConfig) -> Result<(), CliError> {
     let deadline = Instant::now() + Duration::from_millis(config.shutdown_deadline_ms);
     if jobs.finish_stop(deadline).await {
         info!("stopped");
+    }
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
     }
     Ok(())
 }

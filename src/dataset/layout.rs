@@ -17,6 +17,8 @@ pub const INFO: &str = "meta/info.json";
 pub const METADATA: &str = "meta/foreframe.json";
 /// The arguments of the collection. They are written first.
 pub(super) const ARGUMENTS: &str = "meta/collect.json";
+/// The source and options of an import. They are written first.
+pub(super) const IMPORT_ARGUMENTS: &str = "meta/import.json";
 /// Statistics of every column.
 pub(super) const STATS: &str = "meta/stats.json";
 /// The table of tasks, with one task.
@@ -84,7 +86,8 @@ impl DatasetMetadata {
     pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
-            return Err(match std::fs::read_to_string(arguments) {
+            let found = std::fs::read_to_string(arguments);
+            return Err(match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
                 Ok(text) => DatasetError::Unfinished {
                     path: directory.to_owned(),
                     arguments: one_line(&text),

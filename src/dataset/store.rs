@@ -163,7 +163,10 @@ pub(super) fn complete(
     let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
     let world = info.world.clone();
     let metadata = metadata(info, shards, sha256_hex(&episodes));
-    let info = DatasetInfo { world, ..metadata.info() };
+    let info = DatasetInfo {
+        world,
+        ..metadata.info()
+    };
     write_atomically(&directory.join(EPISODES), &episodes)?;
     let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
     write_atomically(&directory.join(TASKS), &tasks)?;

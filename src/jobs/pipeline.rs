@@ -10,14 +10,15 @@ use serde_json::json;
 use tokio::runtime::Handle;
 
 use super::checkpoints::{self, CheckpointSync};
-use super::runner::{JobExecutor, JobFailure, JobReporter, JobResult};
+use super::report::JobReporter;
+use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
+use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets, memory};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
-use crate::store::{LossRow, Store};
+use crate::store::{LossRow, ModelMetrics, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
@@ -36,6 +37,7 @@ pub struct Pipeline {
     store: Store,
     versions: Versions,
     threads: usize,
+    memory_mb: u64,
     runtime: Handle,
 }
 
@@ -47,8 +49,15 @@ impl Pipeline {
             store,
             versions,
             threads,
+            memory_mb: 0,
             runtime: Handle::current(),
         }
+    }
+
+    /// Refuses trainings that need more memory, in MiB. 0 means no limit.
+    #[must_use]
+    pub fn with_memory_limit(self, memory_mb: u64) -> Self {
+        Self { memory_mb, ..self }
     }
 }
 
@@ -75,6 +84,10 @@ impl Pipeline {
         let objects = self.store.objects();
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
         let data_dir = objects.data_dir().to_owned();
+        let training = match &spec {
+            JobSpec::Train(spec) => Some(spec.clone()),
+            JobSpec::Collect(_) | JobSpec::Evaluate(_) => None,
+        };
         // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
         let checked = tokio::task::spawn_blocking(move || {
             spec.check(AvailableInputs {
@@ -83,7 +96,27 @@ impl Pipeline {
                 models: &models,
             })
         });
-        checked.await.unwrap_or(Err(JobError::Stopping))
+        checked.await.unwrap_or(Err(JobError::Stopping))?;
+        match training {
+            Some(spec) => self.check_memory(&spec).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Refuses a training that certainly needs more memory than a job can use. Errors: `Invalid`, `Dataset`, `Store`.
+    async fn check_memory(&self, spec: &TrainSpec) -> Result<(), JobError> {
+        let (allowed, config) = (self.memory_mb, spec.config()?);
+        let needed = memory::training_mb(&config, &datasets::describe(self.store.objects(), &spec.dataset).await?);
+        if allowed == 0 || needed <= allowed {
+            return Ok(());
+        }
+        Err(JobError::Invalid {
+            field: "settings",
+            reason: format!(
+                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mb); \
+                 use a smaller model, batch or data set"
+            ),
+        })
     }
 
     fn collect(
@@ -99,6 +132,10 @@ impl Pipeline {
         self.runtime.block_on(clearing).map_err(|error| failed(&error))?;
         let on_progress =
             |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
+        // Whole shards are saved; a new attempt continues after them.
+        if let Ok(dataset::CollectionStatus::Unfinished { trials }) = dataset::CollectionStatus::of(&config) {
+            report.checkpoint(trials);
+        }
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         let info = retry_while_busy(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
@@ -109,6 +146,7 @@ impl Pipeline {
                 "content_hash": info.content_hash,
             }),
             published: None,
+            measured: None,
         })
     }
 
@@ -154,6 +192,7 @@ impl Pipeline {
                 Ok(JobResult {
                     result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
                     published: Some((spec.name.clone(), version, activates)),
+                    measured: None,
                 })
             }
         }
@@ -215,6 +254,12 @@ impl Pipeline {
                 "model": spec.model, "version": loaded.manifest.version, "scores": found.headline(), "files": files,
             }),
             published: None,
+            measured: Some(ModelMetrics {
+                model: spec.model.clone(),
+                version: loaded.manifest.version,
+                weights_sha256: loaded.manifest.weights_sha256.clone(),
+                metrics: found.headline().to_string(),
+            }),
         })
     }
 
@@ -275,6 +320,7 @@ impl TrainingReporter<'_> {
         match event {
             TrainingEvent::Started { stage, step, windows } => {
                 self.progress(stage, step);
+                self.report.checkpoint(self.done(stage, step));
                 self.report
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
@@ -322,18 +368,30 @@ impl TrainingReporter<'_> {
                 self.report
                     .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
             }
-            TrainingEvent::Checkpointed { .. } => {}
+            TrainingEvent::CheckpointDamaged { is_previous } => self.report.line(
+                if is_previous {
+                    "the previous checkpoint is damaged too; starting from the beginning"
+                } else {
+                    "the latest checkpoint is damaged; resuming from the previous one"
+                }
+                .to_owned(),
+            ),
+            TrainingEvent::Checkpointed { stage, step } => self.report.checkpoint(self.done(stage, step)),
         }
     }
 
     fn progress(&self, stage: TrainingStage, step: usize) {
-        let [pretrain, fit] = self.steps;
-        let done = match stage {
-            TrainingStage::Pretrain => step,
-            TrainingStage::Fit => pretrain + step,
-        };
-        self.report
-            .progress(done as u64, (pretrain + fit) as u64, &stage.to_string());
+        let total = self.steps.iter().sum::<usize>() as u64;
+        self.report.progress(self.done(stage, step), total, &stage.to_string());
+    }
+
+    /// The steps of both stages that are done.
+    fn done(&self, stage: TrainingStage, step: usize) -> u64 {
+        let [pretrain, _] = self.steps;
+        match stage {
+            TrainingStage::Pretrain => step as u64,
+            TrainingStage::Fit => (pretrain + step) as u64,
+        }
     }
 
     fn point(&self, stage: TrainingStage, step: usize, validation: Option<f64>) {

@@ -9,6 +9,8 @@ use crate::store::LossRow;
 
 /// How many lines and points are buffered at most; the oldest are dropped first.
 const MAX_WAITING: usize = 1000;
+/// The shortest time that a rate is computed from, in seconds.
+const MIN_MEASURED_S: f64 = 1.0;
 
 /// How much of a job is done.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -51,6 +53,8 @@ pub(super) struct ReportBuffer {
     points: VecDeque<LossRow>,
     /// When the rate measurement started, and how many units were done then, for example in an earlier attempt.
     measured_from: Option<(f64, u64)>,
+    /// Units that are saved.
+    checkpoint: u64,
 }
 
 impl ReportBuffer {
@@ -64,9 +68,14 @@ impl ReportBuffer {
 
     /// Sets the units done, their total, and what the job is doing.
     pub(super) fn progress(&mut self, (done, total): (u64, u64), message: &str, now_s: f64) {
+        // Without a total nothing is measured yet; fewer units than before belong to new work.
+        let restarts = total != self.stored.progress.total || done < self.stored.progress.done;
+        if total == 0 || restarts {
+            self.measured_from = None;
+        }
         let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
         let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
-        let rate = (gained > 0.0 && elapsed_s > 0.0).then(|| gained / elapsed_s);
+        let rate = (gained > 0.0 && elapsed_s >= MIN_MEASURED_S).then(|| gained / elapsed_s);
         self.stored.progress = JobProgress {
             done,
             total,
@@ -88,6 +97,16 @@ impl ReportBuffer {
             train: losses.train.or(last.train),
             validation: losses.validation.or(last.validation),
         };
+    }
+
+    /// Sets how many units are saved.
+    pub(super) fn checkpoint(&mut self, units: u64) {
+        self.checkpoint = self.checkpoint.max(units);
+    }
+
+    /// How many units are saved, as far as this attempt knows.
+    pub(super) fn saved(&self) -> u64 {
+        self.checkpoint
     }
 
     /// Adds a line to the log.
@@ -142,6 +161,18 @@ mod tests {
         buffer.progress((120, 200), "", 20.0);
         let progress = &buffer.stored().progress;
         assert_eq!((progress.rate_per_s, progress.remaining_s), (Some(2.0), Some(40.0)));
+    }
+
+    #[test]
+    fn a_resumed_attempt_measures_no_earlier_work() {
+        let mut buffer = ReportBuffer::default();
+        buffer.progress((0, 0), "reading the data set", 0.0);
+        buffer.progress((500, 1000), "fit", 10.0);
+        assert_eq!(buffer.stored().progress.rate_per_s, None);
+        buffer.progress((501, 1000), "fit", 10.001);
+        assert_eq!(buffer.stored().progress.rate_per_s, None);
+        buffer.progress((520, 1000), "fit", 20.0);
+        assert_eq!(buffer.stored().progress.rate_per_s, Some(2.0));
     }
 
     #[test]

@@ -28,6 +28,10 @@ pub struct JobLimits {
     pub log_lines: usize,
     /// How many threads a job uses.
     pub threads: usize,
+    /// After this many attempts in a row that ended abnormally without progress, a job fails.
+    pub max_attempts: u32,
+    /// How long one attempt can run.
+    pub time_limit: Option<Duration>,
     /// After this time without a sign of life from the runner, another runner can claim its job.
     pub lease: Duration,
 }

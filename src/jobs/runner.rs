@@ -1,22 +1,23 @@
 //! Claims jobs one after another. Runs each on its own threads, renews its lease, writes its reports, and records its
 //! outcome.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::future::BoxFuture;
-use metrics::{counter, gauge};
+use metrics::counter;
 use rayon::ThreadPool;
+use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, watch};
 use tracing::{info, warn};
 
 use super::instance::Instance;
-use super::job::id_of;
 use super::progress::{ReportBuffer, StoredProgress};
 use super::queue::JobsInner;
-use super::{Job, JobError, JobSpec, JobState, JobTransition, Losses, priority, unix_s};
-use crate::store::{JobOutcome, JobReport, JobRow, Lease, LossRow};
+use super::report::JobReporter;
+use super::{Job, JobError, JobSpec, JobState, JobTransition, priority, unix_s};
+use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics};
 use crate::telemetry::names;
 
 /// How often a job's report is written, unless the lease needs it more often.
@@ -27,21 +28,26 @@ const POLL_EVERY: Duration = Duration::from_secs(1);
 const END_ATTEMPTS: u32 = 5;
 
 /// Why a job's work ended without a result.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum JobFailure {
     /// It was asked to stop, or its lease was lost.
     Cancelled,
     /// The work failed. One sentence says why.
     Failed(String),
+    /// The job's process ended abnormally, so another attempt can succeed. One sentence says how.
+    Crashed(String),
 }
 
 /// The result of a job that succeeded.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct JobResult {
     /// The result in the API.
     pub result: serde_json::Value,
     /// The name and version of a published model, and whether it becomes active if no version is.
     pub published: Option<(String, u32, bool)>,
+    /// What an evaluation measured.
+    pub measured: Option<ModelMetrics>,
 }
 
 /// Does the work of jobs.
@@ -52,61 +58,6 @@ pub trait JobExecutor: Send + Sync + 'static {
 
     /// Does the work, or resumes it. Returns `Cancelled` soon after `cancelled` becomes true. Blocks.
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
-}
-
-/// Receives the report of a running job.
-#[derive(Clone)]
-pub struct JobReporter {
-    buffer: Arc<Mutex<ReportBuffer>>,
-    lease: Lease,
-}
-
-impl JobReporter {
-    fn buffer(&self) -> MutexGuard<'_, ReportBuffer> {
-        self.buffer.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The job's id.
-    #[must_use]
-    pub fn id(&self) -> String {
-        id_of(self.lease.number)
-    }
-
-    /// The lease of this attempt.
-    #[must_use]
-    pub fn lease(&self) -> Lease {
-        self.lease
-    }
-
-    /// Sets the units done, their total, and what the job is doing.
-    pub fn progress(&self, done: u64, total: u64, message: &str) {
-        self.buffer().progress((done, total), message, unix_s());
-    }
-
-    /// Restarts the rate measurement, because the units of a new stage take a different time.
-    pub fn stage(&self) {
-        self.buffer().stage();
-    }
-
-    /// Sets the latest losses.
-    pub fn losses(&self, losses: Losses) {
-        for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
-            if let Some(loss) = loss {
-                gauge!(names::TRAINING_LOSS, "split" => split).set(loss);
-            }
-        }
-        self.buffer().losses(losses);
-    }
-
-    /// Adds a line to the job's log.
-    pub fn line(&self, line: String) {
-        self.buffer().line(line, unix_s());
-    }
-
-    /// Adds a point to the loss curves.
-    pub fn point(&self, point: LossRow) {
-        self.buffer().point(point);
-    }
 }
 
 /// The threads for jobs, separate from those for predictions and with lower priority. Errors: `Threads`.
@@ -127,9 +78,11 @@ pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: Thread
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     while !*stop.borrow() {
-        let now_s = unix_s();
-        let until_s = now_s + shared.limits.lease.as_secs_f64();
-        match shared.store.claim(&instance.id, now_s, until_s).await {
+        match shared
+            .store
+            .claim(&instance.id, shared.limits.lease.as_secs_f64())
+            .await
+        {
             Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
@@ -161,6 +114,12 @@ struct JobRun<'a> {
     /// Whether the job was cancelled by request.
     cancel_requested: bool,
     lease_lost: bool,
+    /// How many attempts before this one ended abnormally without progress.
+    stalled_attempts: i64,
+    /// The units that were saved when this attempt started.
+    claimed_checkpoint: i64,
+    /// When the time limit is reached.
+    deadline: Option<Instant>,
 }
 
 /// Stops the work when its supervision ends, for whatever reason.
@@ -175,10 +134,10 @@ impl<'a> JobRun<'a> {
         let stored: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
         Self {
             shared,
-            report: JobReporter {
-                buffer: Arc::new(Mutex::new(ReportBuffer::new(stored))),
-                lease,
-            },
+            report: JobReporter::to_buffer(lease, ReportBuffer::new(stored)),
+            stalled_attempts: row.stalled_attempts,
+            claimed_checkpoint: row.checkpoint,
+            deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
             cancelled: Arc::new(AtomicBool::new(false)),
             cancel_requested: row.cancelling,
             lease_lost: false,
@@ -186,7 +145,7 @@ impl<'a> JobRun<'a> {
     }
 
     async fn run(mut self, row: &JobRow, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
-        let id = self.report.id();
+        let (id, stopping) = (self.report.id(), stop.clone());
         info!(job.id = %id, job.attempt = row.token, "job started");
         self.report.line(match row.token {
             1 => "started".to_owned(),
@@ -194,6 +153,7 @@ impl<'a> JobRun<'a> {
         });
         let result = match Job::of(row) {
             Ok(_) if self.cancel_requested => Err(JobFailure::Cancelled),
+            Ok(_) if self.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
             Ok(job) => self.supervise(job.spec, pool, stop).await,
             Err(error) => Err(JobFailure::Failed(error.to_string())),
         };
@@ -205,6 +165,17 @@ impl<'a> JobRun<'a> {
             warn!(job.id = %id, "the job's lease was lost; another worker continues it");
             return;
         }
+        let is_stopping = *stopping.borrow();
+        let result = match result {
+            Err(JobFailure::Cancelled) if !self.cancel_requested && self.is_over_time() && !is_stopping => {
+                let limit_s = self.shared.limits.time_limit.unwrap_or_default().as_secs();
+                Err(JobFailure::Failed(format!(
+                    "the attempt reached the time limit of {limit_s} s (setting job_time_limit_s); a resumed job continues \
+                     from its last checkpoint"
+                )))
+            }
+            result => self.check_attempts(result),
+        };
         self.end(&row.kind, result).await;
     }
 
@@ -239,8 +210,15 @@ impl<'a> JobRun<'a> {
                 () = stop_requested(&mut stop), if !is_stopping => {
                     is_stopping = true;
                     self.cancelled.store(true, Ordering::Release);
+                    // If the process ends before the work has stopped, that is no failure of the job.
+                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                        warn!(%error, "could not mark an attempt as stopped");
+                    }
                 }
-                _ = ticks.tick() => self.renew().await,
+                _ = ticks.tick() => {
+                    self.renew().await;
+                    self.check_deadline();
+                }
             }
         }
     }
@@ -249,13 +227,15 @@ impl<'a> JobRun<'a> {
     async fn renew(&mut self) {
         let report = self.take_report();
         let (lines, losses) = (report.lines.clone(), report.losses.clone());
-        let until_s = unix_s() + self.shared.limits.lease.as_secs_f64();
-        match self.shared.store.renew(self.report.lease, until_s, report).await {
+        let lease_s = self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease(), lease_s, report).await {
             Ok(Some(cancelling)) => self.cancel_requested |= cancelling,
             Ok(None) => self.lease_lost = true,
             Err(error) => {
                 warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
-                self.report.buffer().restore_unwritten(lines, losses);
+                if let Some(mut buffer) = self.report.buffer() {
+                    buffer.restore_unwritten(lines, losses);
+                }
             }
         }
         if self.cancel_requested || self.lease_lost {
@@ -264,23 +244,67 @@ impl<'a> JobRun<'a> {
     }
 
     fn take_report(&self) -> JobReport {
-        let mut buffer = self.report.buffer();
+        let max_lines = self.shared.limits.log_lines as i64;
+        let Some(mut buffer) = self.report.buffer() else {
+            return JobReport::default();
+        };
         let (lines, losses) = buffer.drain();
         JobReport {
             // Two structs of numbers and strings always serialize.
             progress: serde_json::to_string(buffer.stored()).unwrap_or_default(),
             lines,
             losses,
-            max_lines: self.shared.limits.log_lines as i64,
+            max_lines,
+            checkpoint: buffer.saved() as i64,
         }
+    }
+
+    fn max_attempts(&self) -> i64 {
+        i64::from(self.shared.limits.max_attempts)
+    }
+
+    fn give_up(&self, how: &str) -> JobFailure {
+        JobFailure::Failed(format!(
+            "{} attempts in a row ended without progress (setting job_max_attempts); the last one: {how}",
+            self.max_attempts()
+        ))
+    }
+
+    /// Turns a crash into a failure if too many attempts in a row made no progress.
+    fn check_attempts(&self, result: Result<JobResult, JobFailure>) -> Result<JobResult, JobFailure> {
+        let Err(JobFailure::Crashed(reason)) = &result else {
+            return result;
+        };
+        let saved = self.report.buffer().map_or(0, |buffer| buffer.saved() as i64);
+        let is_stalled = saved <= self.claimed_checkpoint;
+        if is_stalled && self.stalled_attempts + 1 >= self.max_attempts() {
+            return Err(self.give_up(reason));
+        }
+        result
+    }
+
+    /// Stops the work when the time limit is reached.
+    fn check_deadline(&self) {
+        if self.is_over_time() {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    fn is_over_time(&self) -> bool {
+        self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
     }
 
     async fn end(&self, kind: &str, result: Result<JobResult, JobFailure>) {
         let id = self.report.id();
+        let crash = match &result {
+            Err(JobFailure::Crashed(reason)) => Some(reason.clone()),
+            _ => None,
+        };
         let (event, error, outcome) = match result {
             Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
             Err(JobFailure::Cancelled) if self.cancel_requested => (JobTransition::Cancel, None, None),
-            Err(JobFailure::Cancelled) => (JobTransition::Release, None, None),
+            Err(JobFailure::Crashed(_)) if self.cancel_requested => (JobTransition::Cancel, None, None),
+            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) => (JobTransition::Release, None, None),
             Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
         };
         // All of these transitions are legal for a running job.
@@ -291,7 +315,13 @@ impl<'a> JobRun<'a> {
             None => info!(job.id = %id, job.outcome = ?event, "job ended"),
             Some(reason) => warn!(job.id = %id, reason, "job failed"),
         }
+        if let Some(reason) = &crash {
+            warn!(job.id = %id, reason, "an attempt of a job crashed");
+        }
         self.report.line(match &error {
+            None if state == JobState::Queued && crash.is_some() => {
+                format!("the attempt crashed: {}", crash.as_deref().unwrap_or_default())
+            }
             None if state == JobState::Queued => "stopped with the server; the next attempt resumes it".to_owned(),
             None => state.name().to_owned(),
             Some(reason) => format!("failed: {reason}"),
@@ -301,7 +331,9 @@ impl<'a> JobRun<'a> {
             error,
             outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
             ended_s: state.is_final().then(unix_s),
-            published: outcome.and_then(|outcome| outcome.published),
+            published: outcome.as_ref().and_then(|outcome| outcome.published.clone()),
+            measured: outcome.and_then(|outcome| outcome.measured),
+            crashed: crash.is_some(),
         };
         self.write_outcome(&id, outcome).await;
         self.shared.ended.notify_one();
@@ -313,7 +345,7 @@ impl<'a> JobRun<'a> {
             let written = self
                 .shared
                 .store
-                .end(self.report.lease, outcome.clone(), report.clone());
+                .end(self.report.lease(), outcome.clone(), report.clone());
             match written.await {
                 Ok(true) => return self.shared.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),

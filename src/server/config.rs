@@ -7,6 +7,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::jobs::JobLimits;
+use crate::jobs::child::JobProcess;
 use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
 
@@ -77,6 +78,15 @@ pub struct ServerConfig {
     pub job_threads: usize,
     /// Number of threads that decode and encode images, simulate and read files for requests; more such work waits.
     pub request_threads: usize,
+    /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
+    pub job_memory_mb: u64,
+    /// After this many attempts in a row that ended abnormally without progress, a job fails.
+    pub job_max_attempts: u32,
+    /// How long one attempt of a job can run, in seconds; 0 for no limit.
+    pub job_time_limit_s: u64,
+    /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
+    #[serde(skip)]
+    pub job_program: Option<PathBuf>,
     /// How long a lease of a job lasts without renewal, in milliseconds. After that, another process can claim the job.
     pub job_lease_ms: u64,
     /// How long a prediction may take, including its time in the queue, in milliseconds.
@@ -141,6 +151,10 @@ impl Default for ServerConfig {
             max_job_log_lines: 1000,
             job_threads: spare_cores(),
             request_threads: 4,
+            job_memory_mb: crate::jobs::memory::default_limit_mb(),
+            job_max_attempts: 3,
+            job_time_limit_s: 0,
+            job_program: None,
             job_lease_ms: 30_000,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
@@ -220,6 +234,9 @@ impl ServerConfig {
             ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
             ("job_threads", self.job_threads as u64, 1..=1024),
             ("request_threads", self.request_threads as u64, 1..=1024),
+            ("job_memory_mb", self.job_memory_mb, 0..=1 << 30),
+            ("job_max_attempts", u64::from(self.job_max_attempts), 1..=1_000_000),
+            ("job_time_limit_s", self.job_time_limit_s, 0..=100_000_000),
             ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
@@ -253,8 +270,22 @@ impl ServerConfig {
             ended: self.max_ended_jobs,
             log_lines: self.max_job_log_lines,
             threads: self.job_threads,
+            max_attempts: self.job_max_attempts,
+            time_limit: (self.job_time_limit_s > 0).then(|| Duration::from_secs(self.job_time_limit_s)),
             lease: Duration::from_millis(self.job_lease_ms),
         }
+    }
+
+    /// How to run jobs in child processes, if `job_program` is set.
+    #[must_use]
+    pub fn job_process(&self) -> Option<JobProcess> {
+        Some(JobProcess {
+            program: self.job_program.clone()?,
+            store: self.store(),
+            models_dir: self.models_dir.clone(),
+            threads: self.job_threads,
+            memory_mb: self.job_memory_mb,
+        })
     }
 
     /// Where metadata and files are kept.

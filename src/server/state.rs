@@ -16,6 +16,7 @@ use super::http::keys::Keys;
 use super::http::streams::{Streams, stop_requested};
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
+use crate::jobs::child;
 use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{JobError, Jobs};
 use crate::registry::LoadedModel;
@@ -114,8 +115,10 @@ impl App {
     ) -> Result<Self, ServerError> {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
-        let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_threads);
-        let jobs = Jobs::start(store.clone(), config.jobs(), Arc::new(pipeline), !config.no_jobs)?;
+        let pipeline =
+            Pipeline::new(store.clone(), versions.clone(), config.job_threads).with_memory_limit(config.job_memory_mb);
+        let executor = child::executor(pipeline, config.job_process());
+        let jobs = Jobs::start(store.clone(), config.jobs(), executor, !config.no_jobs)?;
         let app = Self::with_parts(
             config,
             AppParts {

@@ -3,9 +3,11 @@
 //! A lease expires unless it is renewed. Each claim increments the row's fencing token, and every write names the token of
 //! its claim. So a worker whose lease expired cannot write any more.
 
+use serde::{Deserialize, Serialize};
+
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::reports::{JobReport, write_report};
-use super::{Store, StoreError};
+use super::{ModelMetrics, Store, StoreError};
 
 /// The row of a job. Structured values are JSON.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,6 +36,10 @@ pub struct JobRow {
     pub ended_s: Option<f64>,
     /// How often it was claimed.
     pub token: i64,
+    /// How many units of work are saved.
+    pub checkpoint: i64,
+    /// How many attempts in a row ended abnormally without saving more.
+    pub stalled_attempts: i64,
 }
 
 impl JobRow {
@@ -51,6 +57,8 @@ impl JobRow {
             started_s: row.get("started_s")?,
             ended_s: row.get("ended_s")?,
             token: row.get("token")?,
+            checkpoint: row.get("checkpoint")?,
+            stalled_attempts: row.get("stalled_attempts")?,
         })
     }
 }
@@ -84,7 +92,7 @@ pub enum EnqueueResult {
 }
 
 /// The right to work on a job: its number and the fencing token of the claim.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Lease {
     /// The job.
     pub number: i64,
@@ -105,6 +113,10 @@ pub struct JobOutcome {
     pub ended_s: Option<f64>,
     /// The published model's name and version, and whether it becomes active if no version is.
     pub published: Option<(String, u32, bool)>,
+    /// What an evaluation measured.
+    pub measured: Option<ModelMetrics>,
+    /// Whether the attempt ended abnormally.
+    pub crashed: bool,
 }
 
 /// Which jobs to list, the newest first.
@@ -192,7 +204,7 @@ impl Store {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
-             lease_until_s = NULL WHERE number = $1 RETURNING *";
+             stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
         let row = first_job(&tx.fetch(sql, vec![number.into()]).await?)?;
         tx.commit().await?;
         Ok(row.map(EnqueueResult::New))
@@ -244,8 +256,15 @@ impl Store {
             .collect()
     }
 
-    /// Claims the oldest job that is queued or whose lease has expired. Errors: `Query`.
-    pub async fn claim(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+    /// Claims the oldest job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds.
+    /// Errors: `Query`.
+    pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.claim_at(owner, now_s, now_s + lease_s).await
+    }
+
+    /// As [`Self::claim`], at a given time. Errors: `Query`.
+    pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
              ORDER BY number LIMIT 1";
@@ -253,6 +272,8 @@ impl Store {
         let Some(row) = rows.first() else { return Ok(None) };
         let number: i64 = row.get("number")?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
+             claimed_checkpoint = checkpoint, stalled_attempts = CASE \
+             WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4) WHERE number = $1 RETURNING *";
         let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
         let row = first_job(&tx.fetch(sql, values).await?)?;
@@ -274,15 +295,23 @@ impl Store {
 
     /// Renews a lease and writes the report. Returns whether the job was asked to stop; if the lease is lost, writes nothing
     /// and returns `None`. Errors: `Query`.
-    pub async fn renew(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+    pub async fn renew(&self, lease: Lease, lease_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.renew_at(lease, now_s + lease_s, report).await
+    }
+
+    /// As [`Self::renew`], until a given time. Errors: `Query`.
+    pub async fn renew_at(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
         let mut tx = self.database.begin().await?;
-        let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4 \
+        let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4, \
+             checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \
              WHERE number = $1 AND token = $2 AND state = 'running' RETURNING cancelling";
         let values = vec![
             lease.number.into(),
             lease.token.into(),
             until_s.into(),
             report.progress.as_str().into(),
+            report.checkpoint.into(),
         ];
         let rows = tx.fetch(sql, values).await?;
         let Some(row) = rows.first() else { return Ok(None) };
@@ -292,11 +321,21 @@ impl Store {
         Ok(Some(cancelling))
     }
 
+    /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
+    pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
+        let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
+        let values = vec![lease.number.into(), lease.token.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
     /// Writes the outcome of an attempt. If the lease is lost, writes nothing and returns false. Errors: `Query`.
     pub async fn end(&self, lease: Lease, outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
              cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \
+             checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
+             stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
+             WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
         let values = vec![
             lease.number.into(),
@@ -306,6 +345,8 @@ impl Store {
             outcome.outcome.into(),
             outcome.ended_s.into(),
             report.progress.as_str().into(),
+            report.checkpoint.into(),
+            i64::from(outcome.crashed).into(),
         ];
         if tx.execute(sql, values).await? == 0 {
             return Ok(false);
@@ -313,6 +354,9 @@ impl Store {
         if let Some((model, version, activates)) = outcome.published {
             let now_s = outcome.ended_s.unwrap_or_default();
             super::models::write_published(&mut tx, (&model, version), activates, now_s).await?;
+        }
+        if let Some(measured) = outcome.measured {
+            super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;
         }
         write_report(&mut tx, lease.number, report).await?;
         tx.commit().await?;

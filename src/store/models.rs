@@ -1,5 +1,7 @@
 //! The published versions of the models, and which version is active. Their files are in the object store.
 
+use serde::{Deserialize, Serialize};
+
 use super::database::{DatabaseRow, Tx};
 use super::jobs::Lease;
 use super::{Store, StoreError};
@@ -13,6 +15,19 @@ pub struct VersionRow {
     pub version: u32,
     /// When it was published, in seconds since 1970.
     pub published_s: f64,
+}
+
+/// What an evaluation measured of a version.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelMetrics {
+    /// The model's name.
+    pub model: String,
+    /// Its version.
+    pub version: u32,
+    /// The hash of the weights that were measured.
+    pub weights_sha256: String,
+    /// The metrics, as JSON.
+    pub metrics: String,
 }
 
 fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
@@ -67,6 +82,20 @@ impl Store {
             .collect()
     }
 
+    /// The latest metrics of all versions that were evaluated. Errors: `Query`.
+    pub async fn model_metrics(&self) -> Result<Vec<ModelMetrics>, StoreError> {
+        let rows = self.database.fetch("SELECT * FROM model_metrics", vec![]).await?;
+        let metrics = |row: &DatabaseRow| {
+            Ok(ModelMetrics {
+                model: row.get("model")?,
+                version: version_of(row)?,
+                weights_sha256: row.get("weights_sha256")?,
+                metrics: row.get("metrics")?,
+            })
+        };
+        rows.iter().map(metrics).collect()
+    }
+
     /// Makes a version active. Errors: `Query`.
     pub async fn set_active(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
@@ -99,4 +128,19 @@ pub(super) async fn write_published(
         tx.execute(sql, values()).await?;
     }
     Ok(())
+}
+
+/// Replaces the metrics of a version.
+pub(super) async fn write_metrics(tx: &mut Tx, measured: ModelMetrics, now_s: f64) -> Result<(), StoreError> {
+    let sql = "INSERT INTO model_metrics (model, version, weights_sha256, metrics, measured_s) \
+         VALUES ($1, $2, $3, $4, $5) ON CONFLICT (model, version) DO UPDATE SET \
+         weights_sha256 = excluded.weights_sha256, metrics = excluded.metrics, measured_s = excluded.measured_s";
+    let values = vec![
+        measured.model.into(),
+        measured.version.into(),
+        measured.weights_sha256.into(),
+        measured.metrics.into(),
+        now_s.into(),
+    ];
+    tx.execute(sql, values).await.map(drop)
 }

@@ -1,10 +1,12 @@
 //! The reports of running jobs: a bounded log, and the loss curves of trainings.
 
+use serde::{Deserialize, Serialize};
+
 use super::database::{DatabaseRow, Tx};
 use super::{Store, StoreError};
 
 /// A point of a training's loss curves.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LossRow {
     /// `pretrain` or `fit`.
     pub stage: String,
@@ -38,6 +40,8 @@ pub struct JobReport {
     pub losses: Vec<LossRow>,
     /// How many lines of its log are kept.
     pub max_lines: i64,
+    /// How many units of work are saved; a smaller number than before changes nothing.
+    pub checkpoint: i64,
 }
 
 impl Store {

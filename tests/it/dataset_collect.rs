@@ -108,7 +108,11 @@ fn the_camera_is_recorded_and_older_data_sets_still_open() {
     stamp.as_object_mut().unwrap().remove("camera");
     fs::write(&path, stamp.to_string()).unwrap();
     let older = Dataset::open(&out).unwrap();
-    assert_eq!(older.info(), recorded.info(), "the collection's arguments describe the camera too");
+    assert_eq!(
+        older.info(),
+        recorded.info(),
+        "the collection's arguments describe the camera too"
+    );
     let arguments = fs::read(out.join("meta/collect.json")).unwrap();
     fs::remove_file(out.join("meta/collect.json")).unwrap();
     assert_eq!(Dataset::open(&out).unwrap().info().camera, None);

@@ -97,6 +97,10 @@ async fn a_collected_data_set_trains_a_served_model() {
     let body = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 40, "resamples": 100});
     let measured = run_job(&app, &body).await;
     assert!(measured["result"]["scores"]["test"]["skill"].is_number(), "{measured}");
+    let described = get(&app, "/v1/models/fresh").await.json();
+    assert_eq!(described["metrics"], measured["result"]["scores"]);
+    let listed = get(&app, "/v1/models").await.json();
+    assert_eq!(listed["models"][0]["metrics"], described["metrics"]);
     let report = get(&app, "/v1/jobs/job-3/files/report.json").await;
     assert_eq!(report.headers["content-type"], "application/json");
     assert_eq!(report.json()["stamp"]["model"], "fresh");

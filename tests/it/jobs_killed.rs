@@ -149,7 +149,7 @@ fn killed_at_random_points(whole: &Path, took: Duration) {
         .into_iter()
         .find_map(|share| kill_repeatedly(whole, took.mul_f64(share)));
     let dir = killed.expect("the training ended before it was killed often enough");
-    let (_server, address) = serve(dir.path(), &[]);
+    let (_server, address) = serve(dir.path(), &["--set", "job_max_attempts=100"]);
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], KILLS + 1);
     assert!(weights(dir.path()) == weights(whole), "the weights differ");
@@ -166,7 +166,8 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
     copy_dataset(whole, dir.path());
     let mut rng = Seed(3).rng();
     for kill in 0..KILLS {
-        let (_server, address) = serve(dir.path(), &[]);
+        // It is killed faster than it saves.
+        let (_server, address) = serve(dir.path(), &["--set", "job_max_attempts=100"]);
         if kill == 0 {
             ask(&address, "POST /v1/jobs", &train());
         }

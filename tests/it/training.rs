@@ -162,7 +162,13 @@ fn a_diverging_run_keeps_its_last_good_checkpoint() {
         "fit.steps=500",
     ]);
     let error = train(&config, &dataset, dir.path()).unwrap_err();
-    let TrainError::Diverged { stage, step, checkpoint_step, .. } = &error else {
+    let TrainError::Diverged {
+        stage,
+        step,
+        checkpoint_step,
+        ..
+    } = &error
+    else {
         panic!("{error}")
     };
     assert_eq!(stage.to_string(), "fit");

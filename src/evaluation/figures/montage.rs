@@ -12,7 +12,7 @@ const LETTER_SCALE: usize = 3;
 pub const CELL_WIDTH_PX: u32 = 256;
 /// Frames in a row at most; longer rows are wrapped.
 const ROW_CELLS: usize = 10;
-/// Errors are drawn so much brighter than they are.
+/// Errors are drawn brighter by this factor.
 const ERROR_GAIN: u8 = 3;
 /// Share of the contrast colour in a grid line.
 const GRID_STRENGTH: f32 = 0.3;
@@ -51,7 +51,7 @@ impl MontageRow {
 /// How a montage looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Style {
-    /// Every pixel becomes a square of so many, or of fewer where the picture would get too large.
+    /// Every pixel becomes a square of this side, or of a smaller one where the picture would get too large.
     pub scale: usize,
     /// Vertical lines over every frame, evenly spaced, by which movement shows (paper, figure 8); 0 for none.
     pub grid_lines: usize,
@@ -88,7 +88,10 @@ pub fn enlarged(frame: &Frame) -> Result<Frame, FrameError> {
     }
     let mut pixels = Vec::with_capacity(width * height * scale * scale);
     for row in frame.pixels().chunks_exact(width) {
-        let wide: Vec<u8> = row.iter().flat_map(|&value| std::iter::repeat_n(value, scale)).collect();
+        let wide: Vec<u8> = row
+            .iter()
+            .flat_map(|&value| std::iter::repeat_n(value, scale))
+            .collect();
         for _ in 0..scale {
             pixels.extend_from_slice(&wide);
         }
@@ -112,7 +115,10 @@ pub(super) fn prediction_panel(
     let mut rows = wrapped("inputs", seen, 1 - seen.len() as i64);
     let truth = &truth[..truth.len().min(predicted.len())];
     for (part, first) in predicted.chunks(ROW_CELLS).zip((1..).step_by(ROW_CELLS)) {
-        let known = truth.chunks(ROW_CELLS).nth((first - 1) as usize / ROW_CELLS).unwrap_or_default();
+        let known = truth
+            .chunks(ROW_CELLS)
+            .nth((first - 1) as usize / ROW_CELLS)
+            .unwrap_or_default();
         if !known.is_empty() {
             rows.push(MontageRow::in_time("truth", known, first));
         }
@@ -143,9 +149,15 @@ fn error_row(predicted: &[Frame], truth: &[Frame]) -> Result<MontageRow, FrameEr
             .zip(truth.pixels())
             .map(|(&predicted, &truth)| predicted.abs_diff(truth))
             .collect();
-        let squares: f64 = differences.iter().map(|&value| (f64::from(value) / 255.0).powi(2)).sum();
+        let squares: f64 = differences
+            .iter()
+            .map(|&value| (f64::from(value) / 255.0).powi(2))
+            .sum();
         let mse = squares / differences.len().max(1) as f64;
-        let pixels = differences.iter().map(|value| value.saturating_mul(ERROR_GAIN)).collect();
+        let pixels = differences
+            .iter()
+            .map(|value| value.saturating_mul(ERROR_GAIN))
+            .collect();
         let frame = Frame::new(predicted.width(), predicted.height(), pixels)?;
         Ok((format!("MSE {:.1}e-4", mse * 1e4), frame))
     });
@@ -317,7 +329,7 @@ mod tests {
         let column: Vec<u8> = (0..sheet.height() as usize)
             .map(|y| sheet.pixels()[y * sheet.width() as usize + left])
             .collect();
-        // Cells alone are tall runs of one value; letters are short ones.
+        // Only cells are tall runs of one value.
         let cells: Vec<(u8, usize)> = column
             .chunk_by(u8::eq)
             .map(|run| (run[0], run.len()))
@@ -338,8 +350,14 @@ mod tests {
         let frame = Frame::new(3, 2, vec![1, 2, 3, 4, 5, 6]).unwrap();
         let large = enlarged(&frame).unwrap();
         assert_eq!((large.width(), large.height()), (258, 172));
-        assert_eq!((large.pixels()[85], large.pixels()[86], large.pixels()[258 * 86]), (1, 2, 4));
-        assert_eq!(enlarged(&Frame::new(300, 1, vec![0; 300]).unwrap()).unwrap().width(), 300);
+        assert_eq!(
+            (large.pixels()[85], large.pixels()[86], large.pixels()[258 * 86]),
+            (1, 2, 4)
+        );
+        assert_eq!(
+            enlarged(&Frame::new(300, 1, vec![0; 300]).unwrap()).unwrap().width(),
+            300
+        );
     }
 
     #[test]
@@ -350,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_show_and_too_much_are_refused() {
+    fn empty_and_oversized_sheets_are_refused() {
         let style = Style::for_frames_of(64);
         assert!(montage("title", &[], &style).is_err());
         let many: Vec<Frame> = (0..900).map(|_| frame(0)).collect();

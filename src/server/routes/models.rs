@@ -82,7 +82,7 @@ struct Lineage {
 
 impl ModelDescription {
     /// Of the active version and the numbers of all versions.
-    fn new(manifest: &Manifest, mut versions: Vec<u32>) -> Self {
+    fn new(manifest: &Manifest, mut versions: Vec<u32>, metrics: serde_json::Value) -> Self {
         // A model that was given to the server at its start may be in no directory.
         if let Err(place) = versions.binary_search(&manifest.version) {
             versions.insert(place, manifest.version);
@@ -92,7 +92,7 @@ impl ModelDescription {
             versions,
             active_version: manifest.version,
             spec: manifest.spec.clone(),
-            metrics: manifest.metrics.clone(),
+            metrics,
             lineage: Lineage {
                 dataset: manifest.dataset.name.clone(),
                 dataset_hash: manifest.dataset.content_hash.clone(),
@@ -117,15 +117,14 @@ impl ModelDescription {
 async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
     let (manifests, next) = page.of(app.predictor().models(), |manifest| &manifest.name)?;
     let mut versions = app.versions().all().await?;
-    let models = manifests.iter().map(|manifest| {
+    let mut models = Vec::with_capacity(manifests.len());
+    for manifest in &manifests {
         let versions = versions.remove(&manifest.name).unwrap_or_default();
-        ModelDescription::new(manifest, versions)
-    });
-    Ok(axum::Json(ModelList {
-        models: models.collect(),
-        next,
-        notice: app.no_model_advice(),
-    }))
+        let metrics = app.versions().metrics(manifest).await?;
+        models.push(ModelDescription::new(manifest, versions, metrics));
+    }
+    let notice = app.no_model_advice();
+    Ok(axum::Json(ModelList { models, next, notice }))
 }
 
 /// Describes one model.
@@ -140,7 +139,8 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
 async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let versions = app.versions().of(&model).await?;
-    Ok(axum::Json(ModelDescription::new(&manifest, versions)))
+    let metrics = app.versions().metrics(&manifest).await?;
+    Ok(axum::Json(ModelDescription::new(&manifest, versions, metrics)))
 }
 
 /// Makes a version the active one, on every server of the store and after a restart. Open streams keep their version.
@@ -191,6 +191,7 @@ impl From<VersionError> for ApiError {
             VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
+            VersionError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
                 Self::Internal(with_causes(&error))
             }

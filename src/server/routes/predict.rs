@@ -229,7 +229,8 @@ impl From<ServingError> for ApiError {
                 retry_after_s,
             },
             ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
-            ServingError::Model { .. }
+            ServingError::Panicked
+            | ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
             | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
