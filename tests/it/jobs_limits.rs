@@ -15,14 +15,19 @@ fn collect(name: &str, trials: u64) -> Value {
 
 /// The process ids of a process's children.
 fn children(process: u32) -> Vec<u32> {
-    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
-    let lists = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("children")).ok());
-    let ids = lists.map(|list| {
-        list.split_whitespace()
-            .map(|id| id.parse().unwrap())
-            .collect::<Vec<u32>>()
-    });
-    ids.flatten().collect()
+    let processes = std::fs::read_dir("/proc").unwrap();
+    let ids = processes.filter_map(|entry| entry.unwrap().file_name().to_str()?.parse::<u32>().ok());
+    ids.filter(|id| parent(*id) == Some(process)).collect()
+}
+
+/// The parent of a process that is alive: the second field of its status after its name.
+fn parent(process: u32) -> Option<u32> {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
+    let mut fields = stat.rsplit_once(") ")?.1.split(' ');
+    if fields.next()? == "Z" {
+        return None;
+    }
+    fields.next()?.parse().ok()
 }
 
 /// The niceness of a process's first thread: the 19th field of its status, the 17th after its name.
