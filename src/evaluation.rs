@@ -66,11 +66,11 @@ impl Purpose {
 pub struct EvaluateConfig<'a> {
     /// Validation or test.
     pub purpose: Purpose,
-    /// Seed of the split into trials; that of the model's training where none is given.
+    /// Seed of the split; that of the model's training if none is given.
     pub split_seed: Option<Seed>,
     /// Frames from the start of one window to that of the next.
     pub stride: usize,
-    /// Windows of each test set at most, evenly spread over its trials.
+    /// Windows of each set at most, evenly spread over its trials.
     pub max_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,
@@ -143,10 +143,10 @@ impl EvaluationStage {
     }
 }
 
-/// How far the evaluation is.
+/// Progress of the evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluationProgress {
-    /// The test set.
+    /// The set.
     pub split: Split,
     /// What is being computed.
     pub stage: EvaluationStage,
@@ -156,7 +156,7 @@ pub struct EvaluationProgress {
     pub total: usize,
 }
 
-/// What every pass over a test set needs besides its windows.
+/// What every pass over a set needs besides its windows.
 pub struct EvaluationContext<'a> {
     split: Split,
     batch: usize,

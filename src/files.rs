@@ -34,6 +34,15 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     }
 }
 
+/// Opens a lock file and leaves its content. A symbolic link is refused, because another file would be locked.
+pub(crate) fn open_lock(path: &Path) -> io::Result<File> {
+    if path.symlink_metadata().is_ok_and(|found| found.is_symlink()) {
+        return Err(io::Error::other("the lock file is a symbolic link; delete it"));
+    }
+    let mut options = File::options();
+    options.read(true).write(true).create(true).truncate(false).open(path)
+}
+
 /// The temporary path of a file. It is different in each call, because several writers can write the same file at once.
 fn partial_path(path: &Path) -> io::Result<PathBuf> {
     let name = path.file_name();

@@ -66,6 +66,9 @@ pub enum ServingError {
     /// The predictor is stopping, or its thread has ended.
     #[error("the predictor has stopped")]
     Stopped,
+    /// The computation panicked. The thread was restarted.
+    #[error("the computation of the prediction panicked; the server's log says where")]
+    Panicked,
     /// The model's computation failed.
     #[error("model \"{model}\" could not be computed")]
     Model {
@@ -189,7 +192,7 @@ impl Predictor {
         })
     }
 
-    /// Whether every model has made its first prediction.
+    /// Whether every model has made its first prediction and the last computations did not panic.
     #[must_use]
     pub fn is_ready(&self) -> bool {
         self.shared.catalog.is_ready()
@@ -278,7 +281,8 @@ impl Predictor {
         })?;
         match tokio::time::timeout_at(deadline.into(), answer).await {
             Ok(Ok(answer)) => answer,
-            Ok(Err(_)) => Err(ServingError::Stopped),
+            Ok(Err(_)) if self.shared.queue.is_closed() => Err(ServingError::Stopped),
+            Ok(Err(_)) => Err(ServingError::Panicked),
             Err(_) => Err(ServingError::Deadline {
                 limit_ms: self.shared.deadline.as_millis(),
             }),

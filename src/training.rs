@@ -18,6 +18,8 @@ use std::sync::atomic::AtomicBool;
 
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
+#[cfg(test)]
+pub(crate) use self::checkpoint::{hash_entry, seal};
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
@@ -177,9 +179,17 @@ pub fn run(
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(TrainingOutcome::Finished { model_dir, manifest });
     }
-    let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
+    let mut state = match Checkpoint::load_latest(&files, (&plan.spec, &config.run), observer)? {
         Some(checkpoint) => checkpoint.into_state(),
-        None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
+        None => match initial_parameters(&plan, config, cancelled)? {
+            Some(parameters) => TrainState::new(parameters, &config.run)?,
+            None => {
+                return Ok(TrainingOutcome::Interrupted {
+                    stage: TrainingStage::Pretrain,
+                    step: 0,
+                });
+            }
+        },
     };
     for point in &state.history {
         observer.on_event(TrainingEvent::Restored {
@@ -224,7 +234,12 @@ pub fn run(
     Ok(TrainingOutcome::Finished { model_dir, manifest })
 }
 
-fn initial_parameters(plan: &TrainingPlan<'_>, config: &TrainConfig) -> Result<Parameters, TrainError> {
+/// The weights to start from; `None` if cancelled.
+fn initial_parameters(
+    plan: &TrainingPlan<'_>,
+    config: &TrainConfig,
+    cancelled: &AtomicBool,
+) -> Result<Option<Parameters>, TrainError> {
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if config.pretrain.start == CodecStart::Principal {
         let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
@@ -232,9 +247,11 @@ fn initial_parameters(plan: &TrainingPlan<'_>, config: &TrainConfig) -> Result<P
         let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
         let (inputs, targets) = (plan.source.inputs(&frames)?, plan.source.targets(&frames)?);
         let seed = config.seed.derive("principal", 0);
-        principal_components::set_codec(&parameters, &inputs, &targets, seed)?;
+        if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
+            return Ok(None);
+        }
     }
-    Ok(parameters)
+    Ok(Some(parameters))
 }
 
 fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::settings::{CommonArgs, open_store, with_checked_directories};
 use super::{CliError, print_line};
@@ -50,6 +50,9 @@ async fn work(config: &Config) -> Result<(), CliError> {
     let deadline = Instant::now() + Duration::from_millis(server.shutdown_deadline_ms);
     if jobs.finish_stop(deadline).await {
         info!("stopped");
+    }
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
     }
     Ok(())
 }

@@ -97,7 +97,7 @@ pub struct ActionRow {
     pub mse: StepCurve,
     /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
     pub interval: Option<Interval>,
-    /// 1 − MSE(true) / MSE(this): by how much the true actions lower the error.
+    /// 1 − MSE(true) / MSE(this): the share of this error that the true actions remove.
     pub reduction: f64,
     /// Its 95 % interval, both resampled together.
     pub reduction_interval: Option<Interval>,

@@ -409,29 +409,22 @@ mod tests {
             (0..32 * 32).map(at).collect()
         };
         let dataset = recordings(32, frame, pan);
-        let (warped, copied) = (
-            error_of(Method::EgoMotion, &dataset),
-            error_of(Method::CopyLast, &dataset),
-        );
-        assert!(warped < 0.1 * copied, "{warped} {copied}");
+        let (warped, copied) = (error_of(Method::EgoMotion, &dataset), error_of(Method::CopyLast, &dataset));
+        assert!(warped < 0.3 * copied, "{warped} {copied}");
     }
 
     #[test]
     fn a_moving_square_is_cut_out_and_moved_on() {
         let frame = |episode: usize, time: usize| -> Vec<f32> {
-            let left = (episode * 5 + time) % (SIDE - 4);
-            let inside = |i: usize| (left..left + 4).contains(&(i % SIDE)) && (4..8).contains(&(i / SIDE));
+            let top = episode % 4 * 3;
+            let inside = |i: usize| (time..time + 4).contains(&(i % SIDE)) && (top..top + 4).contains(&(i / SIDE));
             (0..SIDE * SIDE)
                 .map(|i| if inside(i) { 0.1 } else { 0.6 + 0.01 * (i % 7) as f32 })
                 .collect()
         };
         let dataset = recordings(SIDE, frame, |_, _| 0.0);
-        let (moved, copied) = (
-            error_of(Method::MovingCutOut, &dataset),
-            error_of(Method::CopyLast, &dataset),
-        );
-        // The square jumps back to the left once a trial, which nothing foresees.
-        assert!(moved < 0.6 * copied, "{moved} {copied}");
+        let (moved, copied) = (error_of(Method::MovingCutOut, &dataset), error_of(Method::CopyLast, &dataset));
+        assert!(moved < 0.1 * copied, "{moved} {copied}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
 
-/// Periods that differ by less than this share of themselves are the same.
+/// Frame periods count as equal if they differ by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.01;
 
 /// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model cannot run on the data set.

@@ -1,4 +1,4 @@
-//! Pictures of what a model does: panels like the paper's figures 6–8, error by horizon, an animation.
+//! Pictures of a model's predictions: panels like the paper's figures 6–8, error by horizon, an animation.
 
 pub mod animation;
 pub mod chart;
@@ -28,9 +28,9 @@ pub struct FigureFile {
 /// One window in pictures, as the camera would see them.
 #[derive(Clone, Debug, Default)]
 pub struct SampleFigure {
-    /// Goes into the files' names.
+    /// The end of the files' names.
     pub name: String,
-    /// What window it is; empty for none.
+    /// The title above the pictures; may be empty.
     pub note: String,
     /// The frames seen, t−4…t.
     pub inputs: Vec<Frame>,

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use super::baselines::Method;
 use crate::frame::quality;
 
-/// The PSNR of a frame counts as at most this, in dB: it is the error that rounding to 8 bits makes, and a still
-/// scene without noise must not make a mean infinite.
+/// The greatest PSNR of a frame, in dB: that of rounding to 8 bits. Without it, one perfect frame would make a mean
+/// infinite.
 pub const PSNR_CAP_DB: f64 = 59.0;
 
 /// Scores of one predicted frame against the true one, intensities 0…1.
@@ -24,12 +24,12 @@ pub struct FrameScore {
     pub mover_pixels: usize,
 }
 
-/// A true frame and whose its pixels are.
+/// A true frame and the mask of its movers.
 #[derive(Clone, Copy, Debug)]
 pub struct TargetFrame<'a> {
     /// Intensities 0…1.
     pub pixels: &'a [f32],
-    /// 0 where the scene is, other values where a mover is; absent for recordings.
+    /// 0 for pixels of the scene, other values for pixels of movers; absent for recordings.
     pub mask: Option<&'a [u8]>,
     /// Width in pixels.
     pub width: usize,
@@ -101,7 +101,7 @@ impl WindowScores {
 /// One row of a test set's tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MethodScores {
-    /// Who predicted.
+    /// The method.
     pub method: Method,
     /// Mean squared error per pixel.
     pub mse: StepCurve,
@@ -109,7 +109,7 @@ pub struct MethodScores {
     pub psnr_db: StepCurve,
     /// Structural similarity: mean over frames.
     pub ssim: StepCurve,
-    /// Mean squared error over all pixels of movers; absent where the data has no masks or nobody moved in view.
+    /// Mean squared error over all pixels of movers; absent where the data set has no masks or no mover is in view.
     pub mover_mse: Option<StepCurve>,
 }
 
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn the_psnr_of_a_set_is_the_mean_of_its_frames_and_not_of_its_error() {
+    fn the_psnr_of_a_set_is_the_mean_of_its_frames() {
         let window = |psnr_db, mover_pixels| WindowScores {
             episode: 0,
             first_frame: 0,

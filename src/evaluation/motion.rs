@@ -15,7 +15,7 @@ pub struct Shift {
     pub y_px: f32,
 }
 
-/// The global shift that leads from `before` to `after`, both `width` pixels wide, to a fraction of a pixel.
+/// The global shift from `before` to `after`, both `width` pixels wide, to a fraction of a pixel.
 /// Zero where the images are flat or equal.
 #[must_use]
 pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
@@ -48,7 +48,7 @@ pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
     }
 }
 
-/// The image moved by the shift; what comes into view repeats the edge pixel, fractions are interpolated bilinearly.
+/// The image moved by the shift, bilinear; new parts repeat the edge pixel.
 #[must_use]
 pub fn shifted(image: &[f32], width: usize, shift: Shift) -> Vec<f32> {
     if width == 0 || image.is_empty() {
@@ -78,7 +78,7 @@ fn mix(a: f32, b: f32, weight: f32) -> f32 {
     a + (b - a) * weight
 }
 
-/// The second half of a periodic axis are negative shifts.
+/// Positions in the second half of a periodic axis are negative shifts.
 fn signed(position: usize, len: usize) -> f32 {
     if position > len / 2 {
         position as f32 - len as f32
@@ -87,7 +87,7 @@ fn signed(position: usize, len: usize) -> f32 {
     }
 }
 
-/// Where between −½ and ½ the parabola through three neighbours peaks.
+/// The place of the peak, −½ to ½, of the parabola through three neighbours.
 fn vertex(before: f32, peak: f32, after: f32) -> f32 {
     let curvature = before - 2.0 * peak + after;
     if curvature < -1e-9 {
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_into_view_repeats_the_edge() {
+    fn new_parts_of_a_shifted_image_repeat_the_edge() {
         let moved = shifted(&[1.0, 2.0, 3.0, 4.0], 4, Shift { x_px: 1.5, y_px: 0.0 });
         assert_eq!(moved, [1.0, 1.0, 1.5, 2.5]);
     }

@@ -21,7 +21,7 @@ use crate::types::{Action, Seed};
 /// Plans at each context: the one that was carried out, and those of other windows.
 pub const PLANS: usize = 8;
 /// Contexts at most, evenly spread over the windows.
-const MAX_CONTEXTS: usize = 100;
+const MAX_CONTEXTS: usize = 60;
 /// A replayed frame that differs by more than this mean squared error is not the recorded one.
 const REPLAY_TOLERANCE: f64 = 1e-4;
 

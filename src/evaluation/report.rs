@@ -1,4 +1,4 @@
-//! What an evaluation found: `report.json` as it is, `report.md` by [`EvaluationReport::to_markdown`].
+//! The result of an evaluation. `report.json` holds it as it is, `report.md` by [`EvaluationReport::to_markdown`].
 
 use std::time::Duration;
 
@@ -17,16 +17,16 @@ use crate::dataset::{Dataset, Window};
 use crate::registry::{DatasetStamp, LoadedModel, ProgramStamp};
 use crate::types::Seed;
 
-/// All that an evaluation found, and how to find it again.
+/// The result of an evaluation, and how to repeat it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationReport {
-    /// What was tested, with what, where.
+    /// What was evaluated, how and where.
     pub stamp: ReportStamp,
     /// The model's sizes.
     pub model: ModelSummary,
     /// The test sets, or the validation split.
     pub sets: Vec<SetReport>,
-    /// The pictures beside the report; filled in when they are written.
+    /// The pictures in the same directory; filled in when they are written.
     pub figures: Vec<FigureFile>,
 }
 
@@ -70,7 +70,7 @@ impl EvaluationReport {
     }
 }
 
-/// What was tested, with what, where.
+/// What was evaluated, how and where.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReportStamp {
     /// The data set's name.
@@ -99,11 +99,11 @@ pub struct ReportStamp {
     pub bootstrap_samples: usize,
     /// Seed of the resamples and of the shuffled actions.
     pub seed: Seed,
-    /// Time that it took in seconds.
+    /// Duration in seconds.
     pub wall_time_s: f64,
     /// The processor's name.
     pub cpu: String,
-    /// Threads that it was given.
+    /// Threads of the computation.
     pub threads: usize,
 }
 
@@ -162,9 +162,9 @@ pub struct ModelSummary {
     pub horizon: usize,
     /// What it is conditioned on.
     pub conditioning: String,
-    /// Whether it sees inverted intensities.
+    /// Whether its inputs have inverted intensities.
     pub inverted: bool,
-    /// Trained numbers.
+    /// Number of trained values.
     pub parameters: u64,
     /// Multiply–adds to predict one frame.
     pub multiply_adds_per_frame: u64,
@@ -229,7 +229,7 @@ impl SetOutcome {
 pub struct SetScores {
     /// Windows tested.
     pub windows: usize,
-    /// Windows that there are at that stride.
+    /// Windows available at that stride.
     pub windows_available: usize,
     /// Trials that they come from.
     pub trials: usize,
@@ -237,8 +237,8 @@ pub struct SetScores {
     pub skill: Skill,
     /// Model, baselines and codec.
     pub methods: Vec<MethodScores>,
-    /// Mean squared error of the model in its own space (smoothed, inverted where it inverts): not comparable between
-    /// models that preprocess differently.
+    /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
+    /// between models that preprocess differently.
     pub model_space_mse: StepCurve,
     /// Mean squared error of the reconstruction of the frames seen, the oldest first.
     pub reconstruction_mse: StepCurve,

@@ -22,7 +22,7 @@ pub fn evenly(windows: &[Window], count: usize) -> Vec<Window> {
     (0..count).map(|i| windows[i * windows.len() / count]).collect()
 }
 
-/// The mean frame, 0…1, of the training split: of every frame that another one of the split follows.
+/// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
 /// Errors: those of [`Splits::windows`].
 pub fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
     let pair = WindowShape { context: 1, horizon: 1 };

@@ -1,11 +1,12 @@
 //! The id of a runner. It is stored in a file, so that the runner has the same id after a restart. The runner locks the
 //! file while it lives; the lock ends with the process, so no two processes have the same id at the same time.
 
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, TryLockError};
 use std::io::{Read as _, Write as _};
 use std::path::Path;
 
 use super::JobError;
+use crate::files::open_lock;
 
 /// The maximum number of runners in one data directory.
 const MAX_RUNNERS: usize = 64;
@@ -24,9 +25,7 @@ impl Instance {
         std::fs::create_dir_all(&dir).map_err(JobError::Instance)?;
         for slot in 0..MAX_RUNNERS {
             let path = dir.join(format!("{slot}.lock"));
-            let mut options = OpenOptions::new();
-            let file = options.create(true).truncate(false).read(true).write(true).open(path);
-            let file = file.map_err(JobError::Instance)?;
+            let file = open_lock(&path).map_err(JobError::Instance)?;
             match file.try_lock() {
                 Ok(()) => return Self::read(file).map_err(JobError::Instance),
                 Err(TryLockError::WouldBlock) => {}

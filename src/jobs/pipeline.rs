@@ -368,6 +368,14 @@ impl TrainingReporter<'_> {
                 self.report
                     .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
             }
+            TrainingEvent::CheckpointDamaged { is_previous } => self.report.line(
+                if is_previous {
+                    "the previous checkpoint is damaged too; starting from the beginning"
+                } else {
+                    "the latest checkpoint is damaged; resuming from the previous one"
+                }
+                .to_owned(),
+            ),
             TrainingEvent::Checkpointed { stage, step } => self.report.checkpoint(self.done(stage, step)),
         }
     }

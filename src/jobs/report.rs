@@ -34,7 +34,7 @@ pub(super) enum ReportEvent {
 type WriteEvent = fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>;
 
 #[derive(Clone)]
-enum Target {
+enum ReportTarget {
     Buffer(Arc<Mutex<ReportBuffer>>),
     Stdout(WriteEvent),
 }
@@ -42,35 +42,35 @@ enum Target {
 /// Receives the report of a running job.
 #[derive(Clone)]
 pub struct JobReporter {
-    target: Target,
+    target: ReportTarget,
     lease: Lease,
 }
 
 impl JobReporter {
     /// A reporter into a buffer.
     pub(super) fn to_buffer(lease: Lease, buffer: ReportBuffer) -> Self {
-        let target = Target::Buffer(Arc::new(Mutex::new(buffer)));
+        let target = ReportTarget::Buffer(Arc::new(Mutex::new(buffer)));
         Self { target, lease }
     }
 
     /// A reporter that writes each event to standard output.
     pub(super) fn to_writer(lease: Lease, write: WriteEvent) -> Self {
-        let target = Target::Stdout(write);
+        let target = ReportTarget::Stdout(write);
         Self { target, lease }
     }
 
     /// The buffer, if the report goes to one.
     pub(super) fn buffer(&self) -> Option<MutexGuard<'_, ReportBuffer>> {
         match &self.target {
-            Target::Buffer(buffer) => Some(buffer.lock().unwrap_or_else(PoisonError::into_inner)),
-            Target::Stdout(_) => None,
+            ReportTarget::Buffer(buffer) => Some(buffer.lock().unwrap_or_else(PoisonError::into_inner)),
+            ReportTarget::Stdout(_) => None,
         }
     }
 
     /// Adds an event to the report.
     pub(super) fn apply(&self, event: ReportEvent) {
         let Some(mut buffer) = self.buffer() else {
-            if let Target::Stdout(write) = &self.target {
+            if let ReportTarget::Stdout(write) = &self.target {
                 // The parent has ended if this fails, and this process with it.
                 let _ = write(event, &mut std::io::stdout().lock());
             }

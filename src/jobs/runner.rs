@@ -78,9 +78,11 @@ pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: Thread
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     while !*stop.borrow() {
-        let now_s = unix_s();
-        let until_s = now_s + shared.limits.lease.as_secs_f64();
-        match shared.store.claim(&instance.id, now_s, until_s).await {
+        match shared
+            .store
+            .claim(&instance.id, shared.limits.lease.as_secs_f64())
+            .await
+        {
             Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
@@ -208,6 +210,10 @@ impl<'a> JobRun<'a> {
                 () = stop_requested(&mut stop), if !is_stopping => {
                     is_stopping = true;
                     self.cancelled.store(true, Ordering::Release);
+                    // If the process ends before the work has stopped, that is no failure of the job.
+                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                        warn!(%error, "could not mark an attempt as stopped");
+                    }
                 }
                 _ = ticks.tick() => {
                     self.renew().await;
@@ -221,8 +227,8 @@ impl<'a> JobRun<'a> {
     async fn renew(&mut self) {
         let report = self.take_report();
         let (lines, losses) = (report.lines.clone(), report.losses.clone());
-        let until_s = unix_s() + self.shared.limits.lease.as_secs_f64();
-        match self.shared.store.renew(self.report.lease(), until_s, report).await {
+        let lease_s = self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease(), lease_s, report).await {
             Ok(Some(cancelling)) => self.cancel_requested |= cancelling,
             Ok(None) => self.lease_lost = true,
             Err(error) => {

@@ -1,15 +1,20 @@
 //! The active version of each model, by name. A handle keeps its version loaded after another version becomes active.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::ServingError;
 use crate::registry::LoadedModel;
 
+/// After so many panics in a row the predictor is not ready.
+const MAX_PANICS: u32 = 3;
+
 pub(super) struct Catalog {
     models: RwLock<BTreeMap<String, Arc<LoadedModel>>>,
     ready: AtomicBool,
+    /// Panics of the inference thread since its last batch.
+    panics: AtomicU32,
 }
 
 impl Catalog {
@@ -20,6 +25,7 @@ impl Catalog {
         Self {
             models: RwLock::new(named.collect()),
             ready: AtomicBool::new(false),
+            panics: AtomicU32::new(0),
         }
     }
 
@@ -46,6 +52,14 @@ impl Catalog {
     }
 
     pub(super) fn is_ready(&self) -> bool {
-        self.ready.load(Ordering::Acquire)
+        self.ready.load(Ordering::Acquire) && self.panics.load(Ordering::Acquire) < MAX_PANICS
+    }
+
+    pub(super) fn record_panic(&self) {
+        self.panics.fetch_add(1, Ordering::AcqRel);
+    }
+
+    pub(super) fn reset_panics(&self) {
+        self.panics.store(0, Ordering::Release);
     }
 }

@@ -22,6 +22,11 @@ pub(super) fn record_refusal(reason: &'static str) {
     counter!(names::PREDICTIONS_REFUSED, "reason" => reason).increment(1);
 }
 
+/// Counts a panic of the inference thread.
+pub(super) fn record_panic() {
+    counter!(names::INFERENCE_PANICS).increment(1);
+}
+
 /// Sets how many predictions are waiting now.
 pub(super) fn set_waiting(count: usize) {
     gauge!(names::PREDICTIONS_WAITING).set(count as f64);

@@ -105,6 +105,10 @@ impl Queue {
         self.arrived.notify_all();
     }
 
+    pub(super) fn is_closed(&self) -> bool {
+        self.state().closed
+    }
+
     /// Blocks until there is something to do.
     pub(super) fn next_work(&self) -> WorkItem {
         let mut state = self.state();

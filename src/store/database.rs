@@ -14,6 +14,7 @@ use sqlx::{
 };
 
 use super::StoreError;
+use crate::files::open_lock;
 
 /// The maximum number of connections to the database.
 const MAX_CONNECTIONS: u32 = 8;
@@ -97,7 +98,7 @@ where
 }
 
 impl Database {
-    pub(super) async fn open(url: &str) -> Result<Self, StoreError> {
+    pub(super) async fn open(url: &str, is_first: bool) -> Result<Self, StoreError> {
         let scheme = url.split(':').next().unwrap_or_default();
         match scheme {
             "sqlite" => {
@@ -105,7 +106,7 @@ impl Database {
                     database: "SQLite",
                     source,
                 })?;
-                Self::open_sqlite(options).await
+                Self::open_sqlite(options, is_first).await
             }
             "postgres" | "postgresql" => Box::pin(Self::open_postgres(url)).await,
             _ => Err(StoreError::Url {
@@ -116,16 +117,17 @@ impl Database {
         }
     }
 
-    pub(super) async fn open_file(path: &Path) -> Result<Self, StoreError> {
-        Self::open_sqlite(SqliteConnectOptions::new().filename(path)).await
+    pub(super) async fn open_file(path: &Path, is_first: bool) -> Result<Self, StoreError> {
+        Self::open_sqlite(SqliteConnectOptions::new().filename(path), is_first).await
     }
 
-    async fn open_sqlite(options: SqliteConnectOptions) -> Result<Self, StoreError> {
+    async fn open_sqlite(options: SqliteConnectOptions, is_first: bool) -> Result<Self, StoreError> {
+        let path = options.get_filename().to_owned();
         // SQLite's migrations take no lock, and two processes can start at the same time.
         let lock_path = options.get_filename().with_extension("lock");
         let failed = StoreError::io("lock", &lock_path);
         let locked = tokio::task::spawn_blocking(move || {
-            let lock = std::fs::File::create(&lock_path)?;
+            let lock = open_lock(&lock_path)?;
             lock.lock().map(|()| lock)
         });
         let _lock = locked.await.unwrap_or_else(|error| Err(error.into())).map_err(failed)?;
@@ -136,14 +138,46 @@ impl Database {
         let pool = SqlitePoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
             .acquire_timeout(BUSY_TIMEOUT)
+            // A failed commit or rollback, for example on a full disk, leaves the connection unusable: discard it.
+            .after_release(|connection, _| {
+                Box::pin(async move {
+                    connection.ping().await?;
+                    Ok(!connection.is_in_transaction())
+                })
+            })
             .connect_with(options)
             .await
-            .map_err(|source| StoreError::Open {
-                database: "SQLite",
-                source,
-            })?;
+            .map_err(|source| sqlite_failed(&path, source))?;
+        if is_first {
+            check_integrity(&pool, &path).await?;
+        }
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Sqlite(pool))
+    }
+
+    /// The database's time in seconds since 1970, so that the clocks of several machines need not agree.
+    pub(super) async fn now_s(&self) -> Result<f64, StoreError> {
+        let sql = match self {
+            Self::Sqlite(_) => "SELECT (julianday('now') - 2440587.5) * 86400.0 AS now_s",
+            Self::Postgres(_) => "SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION) AS now_s",
+        };
+        let rows = self.fetch(sql, vec![]).await?;
+        rows.first()
+            .ok_or(StoreError::Query(sqlx::Error::RowNotFound))?
+            .get("now_s")
+    }
+
+    /// Moves everything from the write-ahead log into the database file and closes all connections.
+    pub(super) async fn close(&self) -> Result<(), StoreError> {
+        let checkpointed = match self {
+            Self::Sqlite(_) => self.fetch("PRAGMA wal_checkpoint(TRUNCATE)", vec![]).await.map(drop),
+            Self::Postgres(_) => Ok(()),
+        };
+        match self {
+            Self::Sqlite(pool) => pool.close().await,
+            Self::Postgres(pool) => pool.close().await,
+        }
+        checkpointed
     }
 
     async fn open_postgres(url: &str) -> Result<Self, StoreError> {
@@ -247,6 +281,72 @@ fn sqlite_rows(rows: Vec<SqliteRow>) -> Vec<DatabaseRow> {
 
 fn postgres_rows(rows: Vec<PgRow>) -> Vec<DatabaseRow> {
     rows.into_iter().map(DatabaseRow::Postgres).collect()
+}
+
+fn sqlite_failed(path: &Path, source: sqlx::Error) -> StoreError {
+    match sqlite_code(&source) {
+        Some(SQLITE_CORRUPT | SQLITE_NOTADB) => StoreError::Damaged {
+            path: path.to_owned(),
+            reason: source.to_string(),
+        },
+        _ => StoreError::Open {
+            database: "SQLite",
+            source,
+        },
+    }
+}
+
+/// Errors: `Damaged` if the database's structure is not sound.
+async fn check_integrity(pool: &SqlitePool, path: &Path) -> Result<(), StoreError> {
+    let found: Result<String, sqlx::Error> = sqlx::query_scalar("PRAGMA quick_check(1)").fetch_one(pool).await;
+    match found {
+        Ok(found) if found == "ok" => Ok(()),
+        Ok(reason) => Err(StoreError::Damaged {
+            path: path.to_owned(),
+            reason: reason.replace('\n', "; "),
+        }),
+        Err(error) => Err(sqlite_failed(path, error)),
+    }
+}
+
+const SQLITE_BUSY: i32 = 5;
+const SQLITE_READONLY: i32 = 8;
+const SQLITE_IOERR: i32 = 10;
+const SQLITE_CORRUPT: i32 = 11;
+const SQLITE_FULL: i32 = 13;
+const SQLITE_CANTOPEN: i32 = 14;
+const SQLITE_NOTADB: i32 = 26;
+
+/// SQLite's primary error code.
+fn sqlite_code(error: &sqlx::Error) -> Option<i32> {
+    let database = error
+        .as_database_error()?
+        .try_downcast_ref::<sqlx::sqlite::SqliteError>()?;
+    let code: i32 = sqlx::error::DatabaseError::code(database)?.parse().ok()?;
+    Some(code & 0xff)
+}
+
+/// Whether the database cannot be reached or written now, but may be later.
+pub(super) fn is_unavailable(error: &sqlx::Error) -> bool {
+    match error {
+        sqlx::Error::Io(_)
+        | sqlx::Error::Tls(_)
+        | sqlx::Error::PoolTimedOut
+        | sqlx::Error::PoolClosed
+        | sqlx::Error::WorkerCrashed => true,
+        sqlx::Error::Database(_) => match sqlite_code(error) {
+            Some(code) => matches!(
+                code,
+                SQLITE_BUSY | SQLITE_READONLY | SQLITE_IOERR | SQLITE_FULL | SQLITE_CANTOPEN
+            ),
+            // Connection exceptions, lack of resources, and operator intervention, for example a shutdown.
+            None => error
+                .as_database_error()
+                .and_then(|error| error.code())
+                .is_some_and(|code| ["08", "53", "57"].iter().any(|class| code.starts_with(class))),
+        },
+        _ => false,
+    }
 }
 
 fn open_failed(source: sqlx::Error) -> StoreError {

@@ -256,8 +256,15 @@ impl Store {
             .collect()
     }
 
-    /// Claims the oldest job that is queued or whose lease has expired. Errors: `Query`.
-    pub async fn claim(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+    /// Claims the oldest job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds.
+    /// Errors: `Query`.
+    pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.claim_at(owner, now_s, now_s + lease_s).await
+    }
+
+    /// As [`Self::claim`], at a given time. Errors: `Query`.
+    pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
              ORDER BY number LIMIT 1";
@@ -265,8 +272,8 @@ impl Store {
         let Some(row) = rows.first() else { return Ok(None) };
         let number: i64 = row.get("number")?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
-             claimed_checkpoint = checkpoint, stalled_attempts = CASE WHEN state = 'queued' THEN stalled_attempts \
-             WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
+             claimed_checkpoint = checkpoint, stalled_attempts = CASE \
+             WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4) WHERE number = $1 RETURNING *";
         let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
         let row = first_job(&tx.fetch(sql, values).await?)?;
@@ -288,7 +295,13 @@ impl Store {
 
     /// Renews a lease and writes the report. Returns whether the job was asked to stop; if the lease is lost, writes nothing
     /// and returns `None`. Errors: `Query`.
-    pub async fn renew(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+    pub async fn renew(&self, lease: Lease, lease_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.renew_at(lease, now_s + lease_s, report).await
+    }
+
+    /// As [`Self::renew`], until a given time. Errors: `Query`.
+    pub async fn renew_at(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4, \
              checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \
@@ -308,14 +321,21 @@ impl Store {
         Ok(Some(cancelling))
     }
 
+    /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
+    pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
+        let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
+        let values = vec![lease.number.into(), lease.token.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
     /// Writes the outcome of an attempt. If the lease is lost, writes nothing and returns false. Errors: `Query`.
     pub async fn end(&self, lease: Lease, outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
              cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \
              checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
-             stalled_attempts = CASE WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 \
-             ELSE stalled_attempts + $9 END, \
+             stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
+             WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
         let values = vec![
             lease.number.into(),

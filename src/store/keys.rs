@@ -33,6 +33,7 @@ impl KeyRow {
 impl Store {
     /// Adds a key. Errors: `Query`, also if the id exists.
     pub async fn create_key(&self, id: &str, name: &str, hash: &str, created_s: f64) -> Result<(), StoreError> {
+        self.mark_keys_created()?;
         let sql = "INSERT INTO api_keys (id, name, hash, created_s) VALUES ($1, $2, $3, $4)";
         let values = vec![id.into(), name.into(), hash.into(), created_s.into()];
         self.database.execute(sql, values).await.map(drop)
@@ -42,6 +43,10 @@ impl Store {
     pub async fn list_keys(&self) -> Result<Vec<KeyRow>, StoreError> {
         let sql = "SELECT * FROM api_keys ORDER BY created_s, id";
         let rows = self.database.fetch(sql, vec![]).await?;
+        // Also of keys that another machine or an older program created.
+        if !rows.is_empty() {
+            self.mark_keys_created()?;
+        }
         rows.iter().map(KeyRow::of).collect()
     }
 

@@ -19,7 +19,7 @@ macro_rules! names {
 
 /// Sets counters of rare events to 0, so that Prometheus sees the first event as an increase.
 pub(super) fn initialize_counters() {
-    for name in [HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
+    for name in [INFERENCE_PANICS, HTTP_CONNECTIONS_REFUSED, AUTH_REFUSED, SESSIONS_EVICTED, STREAM_DROPPED] {
         counter!(name).increment(0);
     }
 }
@@ -45,6 +45,9 @@ names! {
     describe_gauge PREDICTIONS_WAITING = "foreframe_predictions_waiting" in Count: "Predictions waiting in the queue.";
     describe_counter PREDICTIONS_REFUSED = "foreframe_predictions_refused_total" in Count:
         "Predictions that were not computed, by reason: full, deadline, abandoned or error.";
+
+    describe_counter INFERENCE_PANICS = "foreframe_inference_panics_total" in Count:
+        "Panics of the inference thread; each failed one batch, and the thread was restarted.";
 
     describe_gauge STREAMS = "foreframe_streams_active" in Count: "Open WebSocket streams.";
     describe_gauge SESSIONS = "foreframe_sessions_active" in Count: "Sessions with state on this server.";

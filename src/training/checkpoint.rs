@@ -10,14 +10,20 @@ use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
-use super::observer::TrainingStage;
+use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
+use crate::files::{none_if_missing, is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// Name of the checkpoint file of a run.
 pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
+/// The checkpoint before it. A training resumes from this one if the latest is damaged.
+const PREVIOUS_FILE: &str = "checkpoint.previous.safetensors";
+/// The key of the file's SHA-256 in its metadata. The hash is computed with zeros in its own place.
+const HASH_KEY: &str = "foreframe.sha256";
+/// The length of a SHA-256 in hexadecimal digits.
+const HASH_LENGTH: usize = 64;
 /// Key of the training state in the file's metadata.
 const META_KEY: &str = "foreframe.training";
 /// Name of the file with the hash of the training data.
@@ -113,6 +119,10 @@ impl RunFiles {
     fn checkpoint(&self) -> PathBuf {
         self.run_dir.join(CHECKPOINT_FILE)
     }
+
+    fn previous_checkpoint(&self) -> PathBuf {
+        self.run_dir.join(PREVIOUS_FILE)
+    }
 }
 
 fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> TrainError {
@@ -148,9 +158,53 @@ impl CheckpointPosition {
     /// The position of the checkpoint in these bytes; none if they are not a checkpoint.
     #[must_use]
     pub fn of(checkpoint: &[u8]) -> Option<Self> {
+        if !is_intact(checkpoint) {
+            return None;
+        }
         let (_, header) = SafeTensors::read_metadata(checkpoint).ok()?;
         serde_json::from_str(header.metadata().as_ref()?.get(META_KEY)?).ok()
     }
+}
+
+/// Where the hash of a checkpoint is in its bytes.
+fn hash_range(checkpoint: &[u8]) -> Option<std::ops::Range<usize>> {
+    let length = u64::from_le_bytes(*checkpoint.first_chunk::<8>()?);
+    let header = checkpoint.get(8..usize::try_from(length).ok()?.checked_add(8)?)?;
+    let key = format!("\"{HASH_KEY}\":\"");
+    let start = header.windows(key.len()).position(|part| part == key.as_bytes())? + 8 + key.len();
+    let range = start..start + HASH_LENGTH;
+    checkpoint.get(range.clone()).map(|_| range)
+}
+
+/// The hash of a checkpoint, with zeros in its own place.
+fn hash_of(checkpoint: &[u8], range: &std::ops::Range<usize>) -> String {
+    let mut bytes = checkpoint.to_vec();
+    if let Some(digits) = bytes.get_mut(range.clone()) {
+        digits.fill(b'0');
+    }
+    sha256_hex(&bytes)
+}
+
+/// Whether a checkpoint has the bytes that were written.
+fn is_intact(checkpoint: &[u8]) -> bool {
+    hash_range(checkpoint)
+        .is_some_and(|range| checkpoint.get(range.clone()) == Some(hash_of(checkpoint, &range).as_bytes()))
+}
+
+/// Writes the hash into a checkpoint whose metadata has zeros in its place.
+pub(crate) fn seal(mut checkpoint: Vec<u8>) -> Vec<u8> {
+    if let Some(range) = hash_range(&checkpoint) {
+        let hash = hash_of(&checkpoint, &range);
+        if let Some(digits) = checkpoint.get_mut(range) {
+            digits.copy_from_slice(hash.as_bytes());
+        }
+    }
+    checkpoint
+}
+
+/// The metadata entry that [`seal`] fills.
+pub(crate) fn hash_entry() -> (String, String) {
+    (HASH_KEY.to_owned(), "0".repeat(HASH_LENGTH))
 }
 
 /// A training state that was read from disk.
@@ -184,23 +238,47 @@ impl Checkpoint {
             .chain(prefixed(BEST, state.best.clone()))
             .chain(prefixed(OPTIMIZER, state.optimizer.export()?))
             .collect();
-        let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(META_KEY.to_owned(), text)])))
-            .map_err(|error| failed(error.to_string()))?;
-        write_atomically(&path, &bytes).map_err(io_failed("write", &path))
+        let metadata = HashMap::from([(META_KEY.to_owned(), text), hash_entry()]);
+        let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(error.to_string()))?;
+        let previous = files.previous_checkpoint();
+        // If the process is killed between the two, the previous one is the latest.
+        none_if_missing(fs::rename(&path, &previous)).map_err(io_failed("rename", &path))?;
+        write_atomically(&path, &seal(bytes)).map_err(io_failed("write", &path))
     }
 
-    /// Reads the run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or belongs to another run.
-    pub(super) fn load(files: &RunFiles, spec: &ModelSpec, run: &RunConfig) -> Result<Option<Self>, TrainError> {
-        let path = files.checkpoint();
-        if !path.is_file() {
-            return Ok(None);
+    /// The run's last intact checkpoint, if it has one. Reports damaged ones to the observer.
+    /// Errors: `Checkpoint` if it is of another run, `Io`.
+    pub(super) fn load_latest(
+        files: &RunFiles,
+        (spec, run): (&ModelSpec, &RunConfig),
+        observer: &mut dyn Observer,
+    ) -> Result<Option<Self>, TrainError> {
+        for (path, is_previous) in [(files.checkpoint(), false), (files.previous_checkpoint(), true)] {
+            let Some(bytes) = none_if_missing(fs::read(&path)).map_err(io_failed("read", &path))? else {
+                continue;
+            };
+            if is_intact(&bytes) {
+                return Self::load(files, (&path, &bytes), spec, run).map(Some);
+            }
+            observer.on_event(TrainingEvent::CheckpointDamaged { is_previous });
+            // The next save must not replace the intact one by it.
+            none_if_missing(fs::remove_file(&path)).map_err(io_failed("delete", &path))?;
         }
+        Ok(None)
+    }
+
+    /// The state in an intact checkpoint. Errors: `Checkpoint` if it is of another run.
+    fn load(
+        files: &RunFiles,
+        (path, bytes): (&Path, &[u8]),
+        spec: &ModelSpec,
+        run: &RunConfig,
+    ) -> Result<Self, TrainError> {
         let failed = |reason: String| TrainError::Checkpoint {
-            path: path.clone(),
+            path: path.to_owned(),
             reason,
         };
-        let bytes = fs::read(&path).map_err(io_failed("read", &path))?;
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| failed(error.to_string()))?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| failed(error.to_string()))?;
         let text = header
             .metadata()
             .as_ref()
@@ -210,7 +288,7 @@ impl Checkpoint {
         if meta.fingerprint != files.fingerprint() {
             return Err(failed("it belongs to another run".to_owned()));
         }
-        let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?;
         let group = |prefix: &str| -> BTreeMap<String, Tensor> {
             tensors
                 .iter()
@@ -232,11 +310,33 @@ impl Checkpoint {
             best_loss: meta.best_loss,
             history: meta.history,
         };
-        Ok(Some(Self { state }))
+        Ok(Self { state })
     }
 
     /// The training state.
     pub(super) fn into_state(self) -> TrainState {
         self.state
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_flipped_bit_damages_a_checkpoint() {
+        let tensor = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu).unwrap();
+        let metadata = HashMap::from([
+            (META_KEY.to_owned(), r#"{"stage":"fit","step":7}"#.to_owned()),
+            hash_entry(),
+        ]);
+        let bytes = seal(safetensors::serialize([("a", tensor)], Some(metadata)).unwrap());
+        assert_eq!(CheckpointPosition::of(&bytes).map(|reached| reached.step), Some(7));
+        for index in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[index] ^= 4;
+            assert!(CheckpointPosition::of(&damaged).is_none(), "byte {index}");
+        }
+        assert!(CheckpointPosition::of(&bytes[..bytes.len() - 1]).is_none());
     }
 }

@@ -66,6 +66,11 @@ pub enum TrainingEvent {
         /// Whether this is the lowest error so far, so that these weights are kept.
         is_best: bool,
     },
+    /// A checkpoint is damaged and is not used.
+    CheckpointDamaged {
+        /// Whether it is the one before the latest; then the training starts from the beginning.
+        is_previous: bool,
+    },
     /// A checkpoint was written.
     Checkpointed {
         /// The stage.

@@ -2,6 +2,8 @@
 //! (Baldi & Hornik 1989), and gradient descent from random weights needs many steps to reach them. Training then only has
 //! to adapt to the encoder's tanh.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use candle_core::{Device, Tensor};
 use rand_distr::{Distribution, StandardNormal};
 
@@ -23,14 +25,14 @@ const STD_POWER: f64 = 0.5;
 const MIN_STD: f64 = 1e-4;
 
 /// Sets the frame encoder to the first principal components of `frames` `[N, P]`, scaled by [`FEATURE_STD`] and
-/// [`STD_POWER`], and the frame decoder to the least-squares weights for `targets` `[N, P]`. Errors: `Network` if the shapes
-/// do not match.
+/// [`STD_POWER`], and the frame decoder to the least-squares weights for `targets` `[N, P]`. Returns false, and changes
+/// nothing, if cancelled. Errors: `Network` if the shapes do not match.
 pub(super) fn set_codec(
     parameters: &Parameters,
-    frames: &Tensor,
-    targets: &Tensor,
+    (frames, targets): (&Tensor, &Tensor),
     seed: Seed,
-) -> Result<(), TrainError> {
+    cancelled: &AtomicBool,
+) -> Result<bool, TrainError> {
     let (count, pixels) = frames.dims2()?;
     let features = named(parameters, "frame_encoder.bias")?.elem_count();
     let mean = frames.mean(0)?;
@@ -39,12 +41,19 @@ pub(super) fn set_codec(
     let width = (features + OVERSAMPLING).min(pixels);
     let mut directions = random_directions(pixels, width, seed);
     for _ in 0..ITERATIONS {
-        orthonormalize(&mut directions);
+        if !orthonormalize(&mut directions, cancelled) {
+            return Ok(false);
+        }
         let basis = Tensor::from_vec(directions.concat(), (width, pixels), &Device::Cpu)?;
         let scores = centered.matmul(&basis.t()?)?;
+        if cancelled.load(Ordering::Acquire) {
+            return Ok(false);
+        }
         directions = transposed.matmul(&scores)?.t()?.to_vec2()?;
     }
-    orthonormalize(&mut directions);
+    if !orthonormalize(&mut directions, cancelled) {
+        return Ok(false);
+    }
     directions.truncate(features);
     // If there are fewer pixels than features, the other features stay 0.
     directions.resize(features, vec![0.0; pixels]);
@@ -72,7 +81,7 @@ pub(super) fn set_codec(
     ] {
         named(parameters, name)?.set(&tensor)?;
     }
-    Ok(())
+    Ok(true)
 }
 
 fn named<'a>(parameters: &'a Parameters, name: &str) -> Result<&'a candle_core::Var, NnError> {
@@ -89,11 +98,15 @@ fn random_directions(pixels: usize, width: usize, seed: Seed) -> Vec<Vec<f32>> {
         .collect()
 }
 
-/// Gram–Schmidt, applied twice to each row because of rounding. A row that depends linearly on earlier rows becomes zero.
-fn orthonormalize(rows: &mut [Vec<f32>]) {
+/// Gram–Schmidt, twice over each row as rounding asks for; a row that depends on those before it becomes zero.
+/// Returns false if cancelled.
+fn orthonormalize(rows: &mut [Vec<f32>], cancelled: &AtomicBool) -> bool {
     for index in 0..rows.len() {
         let (before, rest) = rows.split_at_mut(index);
-        let Some(row) = rest.first_mut() else { return };
+        let Some(row) = rest.first_mut() else { return true };
+        if cancelled.load(Ordering::Acquire) {
+            return false;
+        }
         let original = norm(row);
         for _ in 0..2 {
             for other in before.iter() {
@@ -107,6 +120,7 @@ fn orthonormalize(rows: &mut [Vec<f32>]) {
             *value *= scale;
         }
     }
+    true
 }
 
 fn norm(row: &[f32]) -> f32 {
@@ -139,7 +153,10 @@ mod tests {
             })
             .collect();
         let frames = Tensor::from_vec(frames, (200, pixels), &Device::Cpu).unwrap();
-        set_codec(&parameters, &frames, &frames, Seed(4)).unwrap();
+        let go_on = AtomicBool::new(false);
+        assert!(set_codec(&parameters, (&frames, &frames), Seed(4), &go_on).unwrap());
+        let cancelled = AtomicBool::new(true);
+        assert!(!set_codec(&parameters, (&frames, &frames), Seed(4), &cancelled).unwrap());
         let model = Model::new(spec, &parameters).unwrap();
         let back = model.decode_frames(&model.encode_frames(&frames).unwrap()).unwrap();
         let error = (back - &frames)

@@ -163,7 +163,7 @@ async fn wrong_types_are_refused_with_an_explanation() {
     let path = post(&app, "/v1/models/plain/versions/x/activate", &Value::Null).await;
     assert_eq!(
         path.detail(400),
-        "\"x\" in the path is no whole number, or too great a one"
+        "\"x\" in the path is not a whole number, or too large"
     );
 }
 

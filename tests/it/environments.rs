@@ -134,3 +134,25 @@ async fn an_idle_environment_is_deleted() {
         .detail(404);
     assert!(detail.contains("is dropped"), "{detail}");
 }
+
+#[tokio::test]
+async fn at_the_limit_a_new_environment_replaces_the_idlest() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_environments: 2,
+        environment_evict_ms: 0,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let small = json!({"scenario": "crowded", "world": {"frame_width_px": 16, "frame_height_px": 16}});
+    let mut ids = Vec::new();
+    for _ in 0..20 {
+        let created = create(&app, small.clone()).await;
+        assert_eq!(created.status, 201);
+        ids.push(created.json()["id"].as_str().unwrap().to_owned());
+    }
+    step(&app, &ids[17], json!([0, 0])).await.detail(404);
+    for id in &ids[18..] {
+        assert_eq!(step(&app, id, json!([0, 0])).await.status, 200);
+    }
+}

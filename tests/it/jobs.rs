@@ -229,7 +229,7 @@ async fn a_runner_that_lost_its_lease_writes_nothing() {
     let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
     poll_until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
     // Another process claims the job; by its clock the lease has expired.
-    let (row, other_lease) = app.store().claim("another", 1e12, 2e12).await.unwrap().unwrap();
+    let (row, other_lease) = app.store().claim_at("another", 1e12, 2e12).await.unwrap().unwrap();
     assert_eq!((row.number, other_lease.token), (1, 2));
     post(&app, JOBS, &collect("b")).await;
     // The runner starts the next job after it has noticed that it lost the lease.

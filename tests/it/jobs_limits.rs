@@ -25,6 +25,13 @@ fn children(process: u32) -> Vec<u32> {
     ids.flatten().collect()
 }
 
+/// The niceness of a process's first thread: the 19th field of its status, the 17th after its name.
+fn niceness(process: u32) -> i64 {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
+    let (_, rest) = stat.rsplit_once(") ").unwrap();
+    rest.split(' ').nth(16).unwrap().parse().unwrap()
+}
+
 fn kill(process: u32) {
     let killed = std::process::Command::new("kill")
         .args(["-KILL", &process.to_string()])
@@ -49,6 +56,8 @@ fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
     served.ask("POST", JOBS, &collect("seen", 1_000_000));
     let first = child_of(&served, 1);
     let limits = std::fs::read_to_string(format!("/proc/{first}/limits")).unwrap();
+    let low = (niceness(served.program.id()) + 10).min(19);
+    assert_eq!(niceness(first), low);
     for attempt in 1..=3 {
         let child = child_of(&served, attempt);
         kill(child);

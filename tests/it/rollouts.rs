@@ -116,7 +116,7 @@ async fn invalid_candidates_are_refused_with_the_field() {
         (
             with(json!([])),
             422,
-            "candidates is empty; give at least one sequence of future actions",
+            "candidates is empty; give at least one plan",
         ),
         (
             with(json!([[[0, 0]]])),
@@ -136,7 +136,7 @@ async fn invalid_candidates_are_refused_with_the_field() {
         (
             with(json!(candidates(5))),
             413,
-            "the futures would be 1920 bytes of images; this server predicts at most 1536 for a request",
+            "the rollouts would be 1920 bytes of images; this server predicts at most 1536 in a request",
         ),
     ] {
         assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
@@ -165,7 +165,7 @@ async fn session_rollouts_equal_stateless_rollouts() {
         let early = post(&app, &path, &body).await.detail(409);
         assert_eq!(
             early,
-            format!("the session has {seq} frames of the 3 that a prediction takes; send it more")
+            format!("the session has {seq} of the 3 frames that a prediction takes; send more frames")
         );
         client.ask(&numbered_message(seq)).await;
     }

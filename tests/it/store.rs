@@ -100,18 +100,18 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
     for (_dir, store) in stores("way").await {
         let row = enqueued(&store).await;
         assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
-        let (row, lease) = store.claim("me", 2.0, 10.0).await.unwrap().unwrap();
+        let (row, lease) = store.claim_at("me", 2.0, 10.0).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.started_s, row.token),
             ("running", Some(2.0), 1)
         );
-        assert_eq!(store.claim("me", 3.0, 10.0).await.unwrap(), None);
+        assert_eq!(store.claim_at("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
-            assert_eq!(store.renew(lease, 20.0, report(line)).await.unwrap(), Some(false));
+            assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
         assert_eq!(
-            store.renew(lease, 20.0, JobReport::default()).await.unwrap(),
+            store.renew_at(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
         );
         assert!(store.end(lease, outcome("cancelled"), report("five")).await.unwrap());
@@ -142,12 +142,12 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
 async fn an_expired_lease_cannot_write() {
     for (_dir, store) in stores("fence").await {
         enqueued(&store).await;
-        let (_, stale) = store.claim("slow", 0.0, 10.0).await.unwrap().unwrap();
-        assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
-        let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
+        let (_, stale) = store.claim_at("slow", 0.0, 10.0).await.unwrap().unwrap();
+        assert_eq!(store.claim_at("quick", 9.9, 30.0).await.unwrap(), None);
+        let (row, fresh) = store.claim_at("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
         assert_eq!(
-            store.renew(stale, 99.0, report("from an expired lease")).await.unwrap(),
+            store.renew_at(stale, 99.0, report("from an expired lease")).await.unwrap(),
             None
         );
         assert!(
@@ -159,12 +159,12 @@ async fn an_expired_lease_cannot_write() {
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
         assert_eq!(
-            store.renew(fresh, 40.0, JobReport::default()).await.unwrap(),
+            store.renew_at(fresh, 40.0, JobReport::default()).await.unwrap(),
             Some(false)
         );
         assert_eq!(store.release_leases("slow").await.unwrap(), 0);
         assert_eq!(store.release_leases("quick").await.unwrap(), 1);
-        assert_eq!(store.claim("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
+        assert_eq!(store.claim_at("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
     }
 }
 
@@ -207,7 +207,7 @@ async fn concurrent_claims_never_get_the_same_job() {
             tokio::spawn(async move {
                 let mut numbers = Vec::new();
                 while numbers.len() < 20 {
-                    match store.claim(&runner.to_string(), 0.0, 10.0).await.unwrap() {
+                    match store.claim_at(&runner.to_string(), 0.0, 10.0).await.unwrap() {
                         Some((row, _)) => numbers.push(row.number),
                         // A claim skips jobs that others are claiming.
                         None if store.jobs(queued()).await.unwrap().is_empty() => break,
@@ -279,7 +279,7 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
 /// Claims a new job and reserves a version of the model for it.
 async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
     enqueued(store).await;
-    let (_, lease) = store.claim("me", 0.0, 10.0).await.unwrap().unwrap();
+    let (_, lease) = store.claim_at("me", 0.0, 10.0).await.unwrap().unwrap();
     (lease, store.reserve_version(lease, model, 4).await.unwrap().unwrap())
 }
 

@@ -38,13 +38,13 @@ impl CutOut {
     /// Takes the median of every pixel over the first frames of these windows.
     pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Self {
         let frames = evenly(windows, MAX_BACKGROUND_FRAMES);
-        let mut counts = vec![[0u32; 256]; dataset.info().frame_pixels()];
+        let mut counts = vec![[0u16; 256]; dataset.info().frame_pixels()];
         for window in &frames {
             for (counts, &value) in counts.iter_mut().zip(dataset.pixels(window.first_frame)) {
                 counts[usize::from(value)] += 1;
             }
         }
-        let middle = frames.len() as u32 / 2;
+        let middle = frames.len() as u16 / 2;
         Self {
             background: counts.iter().map(|counts| median(counts, middle)).collect(),
             width: dataset.info().frame_width_px as usize,
@@ -223,7 +223,7 @@ fn differing(frame: &[f32], background: &[f32]) -> impl Iterator<Item = bool> {
 }
 
 /// The value that has `middle` others below it.
-fn median(counts: &[u32; 256], middle: u32) -> f32 {
+fn median(counts: &[u16; 256], middle: u16) -> f32 {
     let mut below = 0;
     for (value, count) in counts.iter().enumerate() {
         below += count;

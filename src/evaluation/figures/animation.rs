@@ -1,9 +1,16 @@
 //! Predictions over a whole trial, as an endless GIF.
 
-use super::montage::{MontageRow, Style, montage};
+use super::montage::{MontageRow, Style, enlarged, montage};
 use crate::frame::{Frame, FrameError, codec};
 
-/// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
+/// Frames as an endless GIF, enlarged to at least [`super::montage::CELL_WIDTH_PX`]. Errors: `Size` if a frame gets too
+/// large.
+pub fn enlarged_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
+    let frames = frames.iter().map(enlarged).collect::<Result<Vec<Frame>, FrameError>>()?;
+    codec::encode_gif(&frames, delay_ms)
+}
+
+/// One moment: three frames of the same time, `steps_ahead` after the last frame seen.
 #[derive(Clone, Debug)]
 pub struct AnimationFrame {
     /// The true frame.

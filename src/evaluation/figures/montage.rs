@@ -12,7 +12,7 @@ const LETTER_SCALE: usize = 3;
 pub const CELL_WIDTH_PX: u32 = 256;
 /// Frames in a row at most; longer rows are wrapped.
 const ROW_CELLS: usize = 10;
-/// Errors are drawn so much brighter than they are.
+/// Errors are drawn brighter by this factor.
 const ERROR_GAIN: u8 = 3;
 /// Share of the contrast colour in a grid line.
 const GRID_STRENGTH: f32 = 0.3;
@@ -51,7 +51,7 @@ impl MontageRow {
 /// How a montage looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Style {
-    /// Every pixel becomes a square of so many, or of fewer where the picture would get too large.
+    /// Every pixel becomes a square of this side, or of a smaller one where the picture would get too large.
     pub scale: usize,
     /// Vertical lines over every frame, evenly spaced, by which movement shows (paper, figure 8); 0 for none.
     pub grid_lines: usize,
@@ -329,7 +329,7 @@ mod tests {
         let column: Vec<u8> = (0..sheet.height() as usize)
             .map(|y| sheet.pixels()[y * sheet.width() as usize + left])
             .collect();
-        // Cells alone are tall runs of one value; letters are short ones.
+        // Only cells are tall runs of one value.
         let cells: Vec<(u8, usize)> = column
             .chunk_by(u8::eq)
             .map(|run| (run[0], run.len()))
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_show_and_too_much_are_refused() {
+    fn empty_and_oversized_sheets_are_refused() {
         let style = Style::for_frames_of(64);
         assert!(montage("title", &[], &style).is_err());
         let many: Vec<Frame> = (0..900).map(|_| frame(0)).collect();

@@ -147,7 +147,7 @@ impl Keys {
         }
         *known = KnownKeys {
             valid,
-            exist: !rows.is_empty(),
+            exist: !rows.is_empty() || store.keys_were_created(),
             outdated,
         };
         Ok(())

@@ -85,7 +85,9 @@ where
         }
         let mut body: T = serde_json::from_slice(json.as_deref().unwrap_or(b"{}"))
             .map_err(|error| ApiError::Unprocessable(format!("request: {error}")))?;
-        frames.into_iter().for_each(|frame| body.push_frame(frame));
+        for frame in frames {
+            body.push_frame(frame);
+        }
         Ok(Self(body))
     }
 }

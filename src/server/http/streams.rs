@@ -1,4 +1,4 @@
-//! The number of open streams (WebSockets and event streams), the signal that they shall stop, and a way to wait for
+//! The number of open streams (WebSocket and event streams), the signal that they shall stop, and a way to wait for
 //! their end. An HTTP server's own graceful shutdown does not wait for them.
 
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! The contracts: OpenAPI for the requests, AsyncAPI for the streams.
+//! The contracts: OpenAPI for the requests, `AsyncAPI` for the streams.
 
 use std::sync::Arc;
 

@@ -10,6 +10,7 @@ use utoipa_axum::routes;
 use super::picture::PictureError;
 use crate::dataset::{self, Dataset, DatasetError, DatasetInfo};
 use crate::error_text::with_causes;
+use crate::evaluation::figures::animation::enlarged_gif;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
 use crate::jobs::{JobError, datasets};
@@ -185,7 +186,7 @@ async fn animation(
 ) -> Result<impl IntoResponse, ApiError> {
     let gif = picture(&app, &name, episode, |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
-        codec::encode_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+        enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
     });
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
 }

@@ -25,8 +25,8 @@ async fn livez() -> axum::Json<Health> {
     axum::Json(Health { status: "alive" })
 }
 
-/// Tells whether the server is ready: there is a model, every model has made its first prediction, and the server is not
-/// stopping.
+/// Tells whether the server is ready: there is a model, every model has made its first prediction, the store can be
+/// written, and the server is not stopping.
 #[utoipa::path(
     get, path = "/readyz", tag = "health",
     responses((status = 200, body = Health), (status = 503, description = "Not ready", body = Problem))
@@ -40,6 +40,9 @@ async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> 
     }
     if !app.predictor().is_ready() {
         return Err(ApiError::unavailable("the models are warming up"));
+    }
+    if let Err(error) = app.store().check_writable().await {
+        return Err(ApiError::unavailable(format!("the store cannot be written: {error}")));
     }
     Ok(axum::Json(Health { status: "ready" }))
 }

@@ -323,6 +323,7 @@ impl From<JobError> for ApiError {
             | JobError::Occupied { .. }
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
+            JobError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
             JobError::Record { .. }
             | JobError::Instance(_)
             | JobError::Threads(_)

@@ -191,6 +191,7 @@ impl From<VersionError> for ApiError {
             VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
             VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
+            VersionError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
             VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
                 Self::Internal(with_causes(&error))
             }

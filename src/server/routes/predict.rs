@@ -85,11 +85,11 @@ struct PredictResponse {
 pub(super) enum PredictError {
     #[error(transparent)]
     TooMany(#[from] TooManyError),
-    #[error("the futures would be {found} bytes of images; this server predicts at most {limit} for a request")]
+    #[error("the rollouts would be {found} bytes of images; this server predicts at most {limit} in a request")]
     TooLarge { found: u64, limit: usize },
-    #[error("candidates is empty; give at least one sequence of future actions")]
+    #[error("candidates is empty; give at least one plan")]
     NoCandidates,
-    #[error("the session has {have} frames of the {need} that a prediction takes; send it more")]
+    #[error("the session has {have} of the {need} frames that a prediction takes; send more frames")]
     Buffering { have: usize, need: usize },
     #[error("{field}: {source}")]
     Value { field: String, source: ValueError },
@@ -229,7 +229,8 @@ impl From<ServingError> for ApiError {
                 retry_after_s,
             },
             ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
-            ServingError::Model { .. }
+            ServingError::Panicked
+            | ServingError::Model { .. }
             | ServingError::Frame { .. }
             | ServingError::Tensor(_)
             | ServingError::Thread(_) => Self::Internal(with_causes(&error)),

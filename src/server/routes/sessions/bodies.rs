@@ -127,7 +127,7 @@ impl CreateSession {
         };
         if let Some(name) = self.model.filter(|name| *name != exported.model) {
             return Err(ApiError::Unprocessable(format!(
-                "model is \"{name}\", but the state belongs to \"{}\"; leave model out",
+                "model is \"{name}\", but the state is of \"{}\"; leave model out",
                 exported.model
             )));
         }

@@ -1,4 +1,4 @@
-//! Messages from and to the wire: `foreframe.v1.json` is text, `foreframe.v1.msgpack` binary.
+//! Reads and writes messages: `foreframe.v1.json` is text, `foreframe.v1.msgpack` is binary.
 
 use axum::extract::ws::Message;
 use serde::de::{DeserializeOwned, IgnoredAny};
@@ -9,7 +9,7 @@ pub const JSON: &str = "foreframe.v1.json";
 /// The sub-protocol for robots.
 pub const MSGPACK: &str = "foreframe.v1.msgpack";
 
-/// Levels of nesting in a binary message at most; ours have four.
+/// The maximum depth of nesting in a binary message; our messages have four levels.
 const MAX_DEPTH: usize = 16;
 
 /// A sub-protocol.
@@ -25,7 +25,7 @@ pub enum Codec {
 /// Why a message could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum CodecError {
-    /// Text where binary is spoken, or binary where text is.
+    /// Text in the binary sub-protocol, or binary in the text sub-protocol.
     #[error("{} takes {} messages", .0.name(), if *.0 == Codec::Json { "text" } else { "binary" })]
     Kind(Codec),
     /// Not JSON, or not a message.
@@ -34,7 +34,7 @@ pub enum CodecError {
     /// Not `MessagePack`, or not a message.
     #[error("not a message of {MSGPACK}: {0}")]
     Msgpack(#[from] serde_path_to_error::Error<rmp_serde::decode::Error>),
-    /// More than a message.
+    /// Bytes after the message.
     #[error("not a message of {}: {} follow it", .0.name(), if *.0 == Codec::Json { "letters" } else { "bytes" })]
     Trailing(Codec),
 }
@@ -58,7 +58,7 @@ impl Codec {
         }
     }
 
-    /// A message from the wire. Errors say where it goes wrong.
+    /// Reads a message. Errors name the field.
     pub fn decode<T: DeserializeOwned>(self, message: &Message) -> Result<T, CodecError> {
         match (self, message) {
             (Self::Json, Message::Text(text)) => from_json(text),
@@ -67,10 +67,11 @@ impl Codec {
         }
     }
 
-    /// The message on the wire.
+    /// Writes a message.
     #[must_use]
     #[expect(
         clippy::expect_used,
+        clippy::missing_panics_doc,
         reason = "every message type is valid in both formats; the tests encode each"
     )]
     pub fn encode<T: Serialize>(self, message: &T) -> Message {
@@ -95,11 +96,11 @@ fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, CodecError> {
 }
 
 fn from_msgpack<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
-    // Borrows from the bytes, so that no length they state is allocated before it is there.
+    // Borrows from the bytes, so that a length in the message allocates nothing before its bytes are there.
     let mut deserializer = rmp_serde::Deserializer::from_read_ref(bytes);
     deserializer.set_max_depth(MAX_DEPTH);
     let message = serde_path_to_error::deserialize(&mut deserializer)?;
-    // Whatever follows is more than nothing: a value, or one that is refused, for its depth if for nothing else.
+    // Only the end of the bytes gives this error; any other byte gives a value or another error.
     deserializer.set_max_depth(1);
     match IgnoredAny::deserialize(&mut deserializer) {
         Err(rmp_serde::decode::Error::InvalidMarkerRead(_)) => Ok(message),
@@ -171,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_field_a_half_message_and_one_too_many_are_refused() {
+    fn unknown_fields_half_messages_and_extra_bytes_are_refused() {
         let text = |text: &str| {
             Codec::Json
                 .decode::<ClientMessage>(&Message::Text(text.into()))
