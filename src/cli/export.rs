@@ -11,7 +11,7 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
 use crate::dataset::{Dataset, Episode};
-use crate::evaluation::figures::montage;
+use crate::evaluation::figures::animation::enlarged_gif;
 use crate::frame::{Frame, codec};
 
 /// Write an episode's frames as PNG, its actions and states as JSON, and a GIF to look at.
@@ -82,16 +82,16 @@ fn selected(args: &ExportArgs, episode: &Episode) -> Result<Range<usize>, CliErr
 
 fn write(output: &OutputDirectory, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
     let info = dataset.info();
-    let mut large = Vec::with_capacity(range.len());
+    let mut frames = Vec::with_capacity(range.len());
     for (index, frame) in range.clone().enumerate() {
         let pixels = dataset.pixels(frame).to_vec();
         let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels).map_err(CliError::failed)?;
         let png = codec::encode_png(&frame).map_err(CliError::failed)?;
         output.write(&format!("frame-{index:03}.png"), &png)?;
-        large.push(montage::enlarged(&frame).map_err(CliError::failed)?);
+        frames.push(frame);
     }
     let delay_ms = (info.frame_period_s * 1000.0).round() as u32;
-    let gif = codec::encode_gif(&large, delay_ms).map_err(CliError::failed)?;
+    let gif = enlarged_gif(&frames, delay_ms).map_err(CliError::failed)?;
     output.write("episode.gif", &gif)?;
     let actions: Vec<&[f32]> = range.clone().map(|frame| dataset.action(frame)).collect();
     let states: Vec<&[f32]> = range.map(|frame| dataset.state(frame)).collect();

@@ -12,7 +12,7 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
 use crate::error_text;
-use crate::evaluation::figures::montage;
+use crate::evaluation::figures::{animation, montage};
 use crate::frame::fit::Fit;
 use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
@@ -141,12 +141,11 @@ fn write(output: &OutputDirectory, spec: &ModelSpec, selected: &Selected, predic
         output.write(&format!("predicted-{}.png", index + 1), &png(frame)?)?;
     }
     output.write("contact-sheet.png", &png(&contact_sheet(selected, predicted)?)?)?;
-    let film = selected.seen.iter().chain(predicted).map(montage::enlarged);
-    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
     let delay_ms = (spec.frame_period_s * 1000.0).round() as u32;
+    let film: Vec<Frame> = selected.seen.iter().chain(predicted).cloned().collect();
     output.write(
         "prediction.gif",
-        &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,
+        &animation::enlarged_gif(&film, delay_ms).map_err(CliError::failed)?,
     )
 }
 

@@ -63,7 +63,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
     print_line(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
     let store = app.store().clone();
     server::serve(listener, app, server::shutdown::requested()).await;
-    // From now on, the database file alone is complete.
+    // From now on the database file alone is complete.
     if let Err(error) = store.close().await {
         warn!(%error, "could not close the store");
     }

@@ -155,12 +155,12 @@ impl<'a> TrainingDisplay<'a> {
                 self.progress
                     .line(&format!("step {step}: validation MSE {loss:.6}{remark}"));
             }
-            TrainingEvent::Restored {
-                stage, validation_loss, ..
-            } => self.validated(stage, validation_loss),
             TrainingEvent::CheckpointDamaged { is_previous } => {
                 tracing::warn!(is_previous, "a checkpoint is damaged and is not used");
             }
+            TrainingEvent::Restored {
+                stage, validation_loss, ..
+            } => self.validated(stage, validation_loss),
             TrainingEvent::Checkpointed { .. } => {}
         }
     }
