@@ -1,4 +1,4 @@
-//! Foreframe sees a few moments ahead for robots: from camera frames, actions and state it predicts the frames to come.
+//! Foreframe predicts the next camera frames of a robot from its frames, actions and state.
 //!
 //! A robot's own program needs no server: `foreframe = { version = "0.1", default-features = false }` gives it the models,
 //! the state of a session, the [`Predictor`] for many clients, and frames. Feature `sim` adds the simulated room, `train`
@@ -41,6 +41,7 @@ pub mod types;
 
 pub mod files;
 
+#[cfg(feature = "train")]
 pub mod settings;
 
 pub mod error_text;
