@@ -1,4 +1,4 @@
-//! Divides a data set into training, validation and test parts: by complete trials with a seed, or by time for recordings.
+//! Divides a data set into training, validation and test parts: by complete trials with a seed, and by time for recordings.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,7 +6,7 @@ use std::ops::Range;
 use rand::Rng;
 use rand::seq::index;
 
-use super::{Dataset, DatasetError, Window};
+use super::{Dataset, DatasetError, TrialParameters, Window};
 use crate::types::Seed;
 
 /// A time step longer than this many median periods is a gap. No window crosses a gap.
@@ -85,8 +85,8 @@ struct EpisodeSegment {
 }
 
 /// The episodes and segments of each split. Simulated trials are never divided; their split depends only on split seed and
-/// trial number, so that trials keep their split when a collection grows. Recordings are split by complete episodes if
-/// there are ten or more, otherwise by time.
+/// trial number, so that trials keep their split when a collection grows. Recordings are split by time, in complete episodes
+/// if there are ten or more.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
     episodes: [Vec<usize>; Split::ALL.len()],
@@ -104,21 +104,46 @@ impl Splits {
             segments: Default::default(),
             max_step_s: GAP_PERIODS * median_period_s(dataset),
         };
-        let by_trial = dataset.episodes().iter().all(|episode| episode.trial.is_some());
-        if by_trial || dataset.episodes().len() >= WHOLE_EPISODES {
-            for episode in dataset.episodes() {
-                let split = match &episode.trial {
-                    Some(trial) if trial.has_held_out_pair() => Split::UnseenPairs,
-                    Some(trial) if trial.is_held_out() => Split::UnseenGains,
-                    Some(trial) => split_of(split_seed, trial.trial),
-                    None => split_of(split_seed, episode.index as u64),
-                };
-                splits.add(dataset, split, episode.index, &episode.frames());
+        let trials: Option<Vec<&TrialParameters>> =
+            dataset.episodes().iter().map(|episode| episode.trial.as_ref()).collect();
+        match trials {
+            Some(trials) => {
+                for (episode, trial) in dataset.episodes().iter().zip(trials) {
+                    let split = match trial {
+                        trial if trial.has_held_out_pair() => Split::UnseenPairs,
+                        trial if trial.is_held_out() => Split::UnseenGains,
+                        trial => split_of(split_seed, trial.trial),
+                    };
+                    splits.add(dataset, split, episode.index, &episode.frames());
+                }
             }
-        } else {
-            splits.add_by_time(dataset);
+            None if dataset.episodes().len() >= WHOLE_EPISODES => splits.add_whole_episodes(dataset),
+            None => splits.add_by_time(dataset),
         }
         splits
+    }
+
+    /// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
+    /// them, with at least a tenth, for validation; the others for training.
+    fn add_whole_episodes(&mut self, dataset: &Dataset) {
+        let tenth = dataset.info().frame_count.div_ceil(10);
+        let (mut test, mut validation) = (0, 0);
+        for episode in dataset.episodes().iter().rev() {
+            let split = if test < tenth {
+                test += episode.frame_count;
+                Split::Test
+            } else if validation < tenth {
+                validation += episode.frame_count;
+                Split::Validation
+            } else {
+                Split::Train
+            };
+            self.add(dataset, split, episode.index, &episode.frames());
+        }
+        for split in Split::ALL {
+            self.episodes[split as usize].reverse();
+            self.segments[split as usize].sort_by_key(|segment| segment.frames.start);
+        }
     }
 
     /// Splits all frames by time: the first 80 % for training, the next 10 % for validation, the last 10 % for testing.

@@ -125,6 +125,18 @@ fn recordings_are_split_80_10_10() {
 }
 
 #[test]
+fn recordings_of_unequal_length_are_split_by_time() {
+    let mut lengths = [10; 12];
+    (lengths[3], lengths[11]) = (200, 90);
+    let dataset = recorded(&lengths, &[]);
+    let splits = Splits::new(&dataset, Seed(3));
+    // A tenth of the 390 frames is 39: the last recording tests, the four before it validate.
+    assert_eq!(splits.episodes(Split::Test), [11]);
+    assert_eq!(splits.episodes(Split::Validation), [7, 8, 9, 10]);
+    assert_eq!(splits.episodes(Split::Train), [0, 1, 2, 3, 4, 5, 6]);
+}
+
+#[test]
 fn a_single_recording_is_split_by_time() {
     let dataset = recorded(&[100], &[]);
     let splits = Splits::new(&dataset, Seed(0));
