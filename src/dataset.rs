@@ -32,6 +32,7 @@ pub use preview::{describe, describe_stamp};
 pub use sampler::{Split, Splits, WindowShape};
 
 use crate::files::hex;
+use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
 use crate::types::{Channel, Seed};
 use crate::wording::listed;
@@ -63,6 +64,8 @@ pub struct DatasetInfo {
     pub episode_count: usize,
     /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`].
     pub has_masks: bool,
+    /// How the camera projects; none where that is not known.
+    pub camera: Option<CameraModel>,
 }
 
 impl DatasetInfo {

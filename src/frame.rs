@@ -1,9 +1,10 @@
 //! A gray camera image of checked size, and what is done with one: [`codec`] to and from files, [`preprocess`] to and
-//! from the model's space, [`quality`] to compare two.
+//! from the model's space, [`quality`] to compare two, [`warp`] to move its pixels.
 
 pub mod codec;
 pub mod preprocess;
 pub mod quality;
+pub mod warp;
 
 /// The largest side of a frame that is accepted anywhere, in pixels.
 pub const MAX_SIDE_PX: u32 = 4096;
@@ -44,6 +45,17 @@ pub enum FrameError {
         index: usize,
         /// The value found.
         value: f32,
+    },
+    /// No pinhole camera has that field of view or tilt.
+    #[error(
+        "the camera model has a field of view of {horizontal_fov_rad} rad and a tilt of {tilt_down_rad} rad; the field of \
+         view must be above 0 and below π, the tilt above -π/2 and below π/2"
+    )]
+    Camera {
+        /// Horizontal field of view in radians.
+        horizontal_fov_rad: f32,
+        /// Tilt in radians.
+        tilt_down_rad: f32,
     },
 }
 

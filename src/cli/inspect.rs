@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::{CliError, DATASETS_DIR, say};
-use crate::dataset::{self, Dataset};
+use crate::dataset::{self, Dataset, DatasetInfo};
 use crate::nn::{ChannelScale, ModelSpec, costs};
 use crate::registry::{self, Manifest};
 use crate::wording::{listed, those};
@@ -126,9 +126,23 @@ fn describe_dataset(dir: &Path) -> Result<(), CliError> {
     say(format!("  action      [{}]", listed(&info.action_channels)))?;
     say(format!("  state       [{}]", listed(&info.state_channels)))?;
     say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
+    say(format!("  camera      {}", camera(info)))?;
     say(format!(
         "  scenario    {}",
         info.scenario.as_deref().unwrap_or("none: recorded")
     ))?;
     say(format!("  content     SHA-256 {}", info.content_hash))
+}
+
+fn camera(info: &DatasetInfo) -> String {
+    info.camera.map_or_else(
+        || "not described".to_owned(),
+        |camera| {
+            format!(
+                "pinhole, {:.1}° wide, tilted down {:.1}°",
+                camera.horizontal_fov_rad.to_degrees(),
+                camera.tilt_down_rad.to_degrees()
+            )
+        },
+    )
 }

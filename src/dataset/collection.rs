@@ -13,6 +13,7 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo};
+use crate::frame::warp::CameraModel;
 use crate::files::{is_partial_of, remove_abandoned, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
@@ -251,5 +252,9 @@ fn description(config: &CollectConfig) -> DatasetInfo {
         frame_count: 0,
         episode_count: 0,
         has_masks: true,
+        camera: Some(CameraModel {
+            horizontal_fov_rad: config.world.camera.horizontal_fov_rad as f32,
+            tilt_down_rad: config.world.camera.tilt_down_rad as f32,
+        }),
     }
 }

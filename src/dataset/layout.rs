@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 
 use super::{DatasetError, DatasetInfo};
 use crate::files::sha256_hex;
+use crate::frame::warp::CameraModel;
 use crate::types::{Channel, Seed};
 
 /// LeRobot's description; written last, so a directory without it is unfinished.
@@ -69,6 +70,9 @@ pub(super) struct CollectionStamp {
     pub(super) action_channels: Vec<Channel>,
     pub(super) state_channels: Vec<Channel>,
     pub(super) has_masks: bool,
+    /// Absent in data sets that were collected before it was recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) camera: Option<CameraModel>,
     pub(super) content_hash: String,
     pub(super) episodes_sha256: String,
     pub(super) shards: Vec<ShardEntry>,
@@ -124,6 +128,7 @@ impl CollectionStamp {
             frame_count: self.shards.iter().map(|shard| shard.frames).sum(),
             episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
             has_masks: self.has_masks,
+            camera: self.camera,
         }
     }
 }

@@ -193,6 +193,7 @@ fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -
         action_channels: info.action_channels,
         state_channels: info.state_channels,
         has_masks: info.has_masks,
+        camera: info.camera,
         content_hash: layout::content_hash(&entries),
         episodes_sha256,
         shards: entries,

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use foreframe::dataset::{
     CollectConfig, CollectProgress, CollectionStatus, Dataset, DatasetError, DatasetInfo, collect,
 };
+use foreframe::frame::warp::CameraModel;
 use foreframe::sim::{Scenario, World, WorldConfig};
 use foreframe::types::Seed;
 use proptest::prelude::*;
@@ -92,6 +93,27 @@ fn what_is_read_back_is_what_the_world_showed() {
             }
         }
     }
+}
+
+#[test]
+fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
+    let (_directory, out) = finished();
+    let recorded = Dataset::open(&out).unwrap();
+    let camera = &config(&out).world.camera;
+    let expected = CameraModel::new(camera.horizontal_fov_rad as f32, camera.tilt_down_rad as f32).unwrap();
+    assert_eq!(recorded.info().camera, Some(expected));
+
+    let path = out.join("meta/foreframe.json");
+    let mut stamp: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    stamp.as_object_mut().unwrap().remove("camera");
+    fs::write(&path, stamp.to_string()).unwrap();
+    let older = Dataset::open(&out).unwrap();
+    assert_eq!(older.info().content_hash, recorded.info().content_hash);
+
+    stamp["camera"] = serde_json::json!({"horizontal_fov_rad": 4.0, "tilt_down_rad": 0.0});
+    fs::write(&path, stamp.to_string()).unwrap();
+    let refused = Dataset::open(&out).unwrap_err().to_string();
+    assert!(refused.contains("the camera model has a field of view of 4 rad"), "{refused}");
 }
 
 #[test]

@@ -49,3 +49,4 @@ mod stream;
 mod stream_equal;
 mod stream_slow;
 mod training;
+mod warp;
