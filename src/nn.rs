@@ -7,28 +7,49 @@
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
 //! → [`lstm`] (over time; `recurrence` and `gates` are its
-//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the whole model) → [`loss`]; [`costs`] compares with other networks.
+//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the dense network) → [`loss`]; [`costs`] compares with other networks.
+//!
+//! The second architecture is [`flow`]: `conv`, `modulation`, `sampling` and `compose` are its operations, `rays` and `room`
+//! its geometry, `motion` and `scene` what it knows of the camera and the surroundings. [`model`] is the type that the rest
+//! of the program uses for both.
 
 mod activation;
+mod compose;
 pub mod autoencoder;
 pub mod conditioned;
+mod conv;
 pub mod costs;
 pub mod dense;
+pub mod flow;
+mod flow_inputs;
+pub mod flow_spec;
 mod gates;
+#[cfg(test)]
+mod gradient_check;
 pub mod init;
 pub mod loss;
 pub mod lstm;
 pub mod lstm_cell;
+pub mod model;
+mod modulation;
+mod motion;
 pub mod parameters;
+mod rays;
 mod recurrence;
+mod room;
+mod sampling;
+mod scene;
 pub mod spec;
 pub(crate) mod tensors;
 
-pub use autoencoder::{Feedback, Model};
+pub use autoencoder::Feedback;
 pub use conditioned::ConditioningTensors;
+pub use flow::FlowPrediction;
+pub use flow_spec::FlowLayers;
 pub use loss::Loss;
+pub use model::Model;
 pub use parameters::Parameters;
-pub use spec::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
+pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, Reconstruction};
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]
@@ -67,6 +88,23 @@ pub enum NnError {
         /// Its standard deviation.
         std: f32,
     },
+    /// A side of the frames does not suit the flow network.
+    #[error(
+        "model specification: frames are {width}×{height} px; each side must be a multiple of {least} from {least} to {most}"
+    )]
+    FrameSides {
+        /// Width of a frame in pixels.
+        width: u32,
+        /// Height of a frame in pixels.
+        height: u32,
+        /// Least side, and what sides are multiples of.
+        least: u32,
+        /// Greatest side.
+        most: u32,
+    },
+    /// The camera model is impossible.
+    #[error("model specification: {0}")]
+    Camera(#[source] crate::frame::FrameError),
     /// A name of an enumeration is unknown.
     #[error("unknown {kind} \"{name}\"; there are {known}")]
     UnknownName {

@@ -81,7 +81,7 @@ fn read_config(path: &Path) -> Result<String, CliError> {
 }
 
 fn default_dataset(preset: &str) -> PathBuf {
-    PathBuf::from(if preset == "moving" {
+    PathBuf::from(if preset.starts_with("moving") {
         "moving-observer"
     } else {
         "static-observer"

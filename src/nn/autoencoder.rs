@@ -1,4 +1,4 @@
-//! The whole model: frames to features and back, what has been seen to what will be, and what has been seen again.
+//! The dense network: frames to features and back, what has been seen to what will be, and what has been seen again.
 
 use candle_core::Tensor;
 
@@ -19,7 +19,7 @@ pub enum Feedback<'a> {
 
 /// The network: a frame codec, an LSTM encoder and two LSTM decoders. Holds weights only, so one model serves many.
 #[derive(Clone, Debug)]
-pub struct Model {
+pub(super) struct DenseModel {
     spec: ModelSpec,
     frame_encoder: Dense,
     frame_decoder: Dense,
@@ -30,20 +30,10 @@ pub struct Model {
     reconstructor_output: Dense,
 }
 
-impl Model {
-    /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor.
-    /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
-    pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
-        Self::with_frozen(spec, parameters, &[])
-    }
-
-    /// As [`Model::new`], without any gradients: for prediction.
-    pub fn detached(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
-        Self::with_frozen(spec, parameters, &[""])
-    }
-
-    /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
-    pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+impl DenseModel {
+    /// A network that shares its storage with `parameters`, without gradients for tensors whose name starts with one of the
+    /// `frozen` prefixes. Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
+    pub(super) fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
         spec.validate()?;
         let shapes = spec.tensor_shapes();
         let tensor = |name: String| {
@@ -83,20 +73,14 @@ impl Model {
         })
     }
 
-    /// The model's dimensions and meaning.
-    #[must_use]
-    pub fn spec(&self) -> &ModelSpec {
-        &self.spec
-    }
-
     /// Features `[N, F]` of frames `[N, P]` in the model's space. Errors: `Shape`.
-    pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
         self.frame_encoder.forward(frames)
     }
 
     /// Frames `[N, P]` in the model's space, not clamped, of features `[N, F]`. Errors: `Shape`.
-    pub fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", features, &[None, Some(self.spec.features)])?;
         self.frame_decoder.forward(features)
     }
@@ -104,7 +88,7 @@ impl Model {
     /// Features `[B, horizon, F]` of the frames that follow those with `features` [B, context, F]. The predictor starts
     /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
     /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
-    pub fn predict(
+    pub(super) fn predict(
         &self,
         features: &Tensor,
         condition: &ConditioningTensors,
@@ -138,7 +122,7 @@ impl Model {
     /// Features `[N, horizon, F]` of N futures of B windows with `features` [B, context, F]: future n follows the window
     /// `windows[n]` under the condition's row n. A window is encoded once, however many futures it has.
     /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
-    pub fn predict_futures(
+    pub(super) fn predict_futures(
         &self,
         features: &Tensor,
         windows: &[u32],
@@ -176,7 +160,7 @@ impl Model {
     /// The features [B, context, F] again, from what the encoder kept of them. Approach 1 (sequence): from the encoder's
     /// last state, the first input zeros, then the decoder's own output. Approach 2 (stepwise): after each frame, from
     /// the encoder's output there. Errors: `Shape`.
-    pub fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
         let (outputs, state) = self.encode(features)?;
         match self.spec.reconstruction {
@@ -195,17 +179,6 @@ impl Model {
                 Ok(flat.reshape(features.dims())?)
             }
         }
-    }
-
-    /// Frames `[B, horizon, P]` that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
-    pub fn predict_frames(&self, frames: &Tensor, condition: &ConditioningTensors) -> Result<Tensor, NnError> {
-        let (context, pixels) = (self.spec.context, self.spec.pixels());
-        let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
-        let features = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;
-        let features = features.reshape((batch, context, self.spec.features))?;
-        let predicted = self.predict(&features, condition, Feedback::Prediction)?;
-        let frames = self.decode_frames(&predicted.flatten(0, 1)?)?;
-        Ok(frames.reshape((batch, self.spec.horizon, pixels))?)
     }
 
     /// The encoder's outputs [B, context, H] and its last state.

@@ -221,3 +221,54 @@ impl PixelParts {
         [first, second]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    fn composition(with_room: bool) -> Composition {
+        let size = ImageSize { height: 4, width: 6 };
+        let values = |count: usize, seed| noise(&[count], seed).to_vec1::<f32>().unwrap();
+        Composition {
+            size,
+            frames: values(2 * 24, 1),
+            frame_of: vec![0, 1, 1],
+            room_places: with_room.then(|| values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect()),
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_differences() {
+        for with_room in [false, true] {
+            let inputs = [
+                (noise(&[3, 2, 3, 32], 3) * 0.3).unwrap(),
+                noise(&[3, 2, 3, SCENE_CHANNELS], 4),
+                noise(&[3, 24, 2], 5).affine(1.2, 1.37).unwrap(),
+            ];
+            assert_gradients(&inputs[..2], 1e-4, |tensors| {
+                composition(with_room).compose(&tensors[0], &tensors[1], &inputs[2])
+            });
+            if !with_room {
+                // Of the mask's dependence on the place nothing is passed on; inside the frame there is none.
+                assert_gradients(&inputs[2..], 1e-4, |tensors| {
+                    composition(with_room).compose(&inputs[0], &inputs[1], &tensors[0])
+                });
+            }
+        }
+    }
+
+    #[test]
+    fn without_a_head_the_moved_pixels_prevail() {
+        let composition = composition(false);
+        let places = super::super::rays::own_places(composition.size);
+        let places = Tensor::from_vec(places.repeat(3), (3, 24, 2), &candle_core::Device::Cpu).unwrap();
+        let zeros = |last| Tensor::zeros((3, 2, 3, last), candle_core::DType::F32, places.device()).unwrap();
+        let frames = composition.clone().compose(&zeros(32), &zeros(SCENE_CHANNELS), &places).unwrap();
+        let share = (1.5f32.exp() + 1.0) / (1.5f32.exp() + 2.0);
+        let first = frames.get(0).unwrap().to_vec1::<f32>().unwrap();
+        for (found, value) in first.iter().zip(&composition.frames) {
+            assert!((found - share * value).abs() < 1e-6, "{found} {value}");
+        }
+    }
+}

@@ -350,3 +350,47 @@ impl CustomOp1 for PixelShuffle {
         Ok(Some(inverse.apply(&gradient.detach())?))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    const SHAPES: [ConvShape; 3] = [ConvShape::PLAIN, ConvShape::HALVING, ConvShape::dilated(2)];
+
+    #[test]
+    fn convolution_agrees_with_candle() {
+        for shape in SHAPES {
+            let (x, weight, bias) = (noise(&[2, 6, 5, 3], 1), noise(&[27, 4], 2), noise(&[4], 3));
+            let ours = convolve(&x, &weight, &bias, shape).unwrap();
+            // candle: channels first, weights [O, C, 3, 3].
+            let kernel = weight.reshape((3, 3, 3, 4)).unwrap().permute((3, 2, 0, 1)).unwrap();
+            let image = x.permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
+            let theirs = image
+                .conv2d(&kernel.contiguous().unwrap(), shape.dilation, shape.stride, shape.dilation, 1)
+                .unwrap();
+            let theirs = theirs.permute((0, 2, 3, 1)).unwrap().broadcast_add(&bias).unwrap();
+            assert_eq!(ours.dims(), theirs.dims());
+            let most = (ours - theirs).unwrap().abs().unwrap().max_all().unwrap();
+            assert!(most.to_scalar::<f32>().unwrap() < 1e-5, "{shape:?}: {most}");
+        }
+    }
+
+    #[test]
+    fn convolution_gradients_agree_with_differences() {
+        for shape in SHAPES {
+            let inputs = [noise(&[2, 5, 6, 3], 1), noise(&[27, 4], 2), noise(&[4], 3)];
+            assert_gradients(&inputs, 1e-2, |inputs| convolve(&inputs[0], &inputs[1], &inputs[2], shape));
+        }
+    }
+
+    #[test]
+    fn pixel_shuffle_is_undone_by_its_inverse() {
+        let x = noise(&[2, 3, 2, 8], 4);
+        let fine = pixel_shuffle(&x).unwrap();
+        assert_eq!(fine.dims(), [2, 6, 4, 2]);
+        let back = pixel_unshuffle(&fine).unwrap();
+        assert_eq!(back.flatten_all().unwrap().to_vec1::<f32>().unwrap(), x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        assert_gradients(&[x], 1e-2, |inputs| pixel_shuffle(&inputs[0]));
+    }
+}

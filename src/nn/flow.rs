@@ -53,7 +53,7 @@ impl Convolution3 {
 
 /// Finds a model's layers among its parameters.
 pub(super) trait Layers {
-    /// The tensor of that name.
+    /// The tensor of that name. Errors: `TensorMissing`, `TensorShape`.
     fn tensor(&self, name: &str) -> Result<Tensor, NnError>;
 
     /// The dense layer of that name, without activation.
@@ -171,7 +171,7 @@ impl FlowModel {
         let geometry = self.places(spec, rows, &motion.flatten(0, 1)?, &poses)?;
         let context_of = repeated(&contexts.row_of, horizon);
         let warped = sample_features(&coarse, geometry.coarse, &context_of)?;
-        let moved = sampled_blocks(&contexts.last_frames, &context_of, &geometry.room_or_turned, size)?;
+        let moved = sampled_blocks(&contexts.last_frames, &context_of, &geometry.room_or_turned, size);
         let moved = Tensor::from_vec(moved, (count * horizon, half.height, half.width, 5), &Device::Cpu)?;
         let modulation = self.modulate(spec, rows, &motion)?;
         let features = scene.narrow(3, 0, SCENE_FEATURES)?.contiguous()?;

@@ -166,3 +166,24 @@ fn sizes(x: &[usize], modulation: &[usize]) -> Result<(usize, usize)> {
         _ => bail!("a modulation of shape {modulation:?} does not fit {x:?}"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    #[test]
+    fn gradients_agree_with_differences() {
+        let (x, modulation) = (noise(&[2, 3, 2, 4], 1), noise(&[2, 8], 2));
+        assert_gradients(&[x.clone()], 1e-2, |inputs| silu(&inputs[0]));
+        assert_gradients(&[x, modulation], 1e-2, |inputs| modulated_silu(&inputs[0], &inputs[1]));
+    }
+
+    #[test]
+    fn without_modulation_it_is_silu() {
+        let x = noise(&[2, 3, 2, 4], 1);
+        let none = Tensor::zeros((2, 8), candle_core::DType::F32, x.device()).unwrap();
+        let values = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(values(silu(&x).unwrap()), values(modulated_silu(&x, &none).unwrap()));
+    }
+}

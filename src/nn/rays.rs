@@ -194,3 +194,41 @@ pub(super) fn own_places(size: ImageSize) -> Vec<f32> {
     let rows = (0..size.height).flat_map(|row| (0..size.width).map(move |column| [column as f32, row as f32]));
     rows.flatten().collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::warp::rotation_grid;
+    use crate::nn::gradient_check::assert_gradients;
+
+    const CAMERA: CameraModel = CameraModel {
+        horizontal_fov_rad: 1.0,
+        tilt_down_rad: 0.2,
+    };
+    const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
+
+    #[test]
+    fn turning_agrees_with_the_warp_of_frames() {
+        let viewer = Viewer::new(CAMERA, SIZE);
+        let places = viewer.turned(&viewer.rays(), 0.3);
+        let expected = rotation_grid(CAMERA, SIZE.width, SIZE.height, 0.3);
+        for (place, expected) in places.chunks_exact(2).zip(expected) {
+            assert!((place[0] + 0.5 - expected[0]).abs() < 1e-4 && (place[1] + 0.5 - expected[1]).abs() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn gradients_of_the_yaw_agree_with_differences() {
+        let viewer = Viewer::new(CAMERA, SIZE);
+        let yaw = Tensor::new(&[0.1f32, -0.4, 0.0], &candle_core::Device::Cpu).unwrap();
+        assert_gradients(&[yaw], 1e-3, |inputs| turning_places(viewer, &viewer.rays(), &inputs[0]));
+    }
+
+    #[test]
+    fn a_motion_leads_from_one_pose_to_the_other() {
+        let here = CameraPose { x: 1.0, y: -2.0, heading: 3.0 };
+        let motion = [0.4, 0.3, -0.1];
+        let found = here.motion_to(here.moved(motion));
+        assert!(found.iter().zip(motion).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
+    }
+}

@@ -243,3 +243,55 @@ fn side_gradient(ray: RoomRay, hit: RoomHit, y: &[f32], gradient: &[f32]) -> f32
         * (0.25 * gradient[rest + 9] + 0.1 * distance * gradient[rest + 10] - near * near * gradient[rest + 11]);
     for_time / speed
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::warp::CameraModel;
+    use crate::nn::gradient_check::assert_gradients;
+    use crate::nn::sampling::ImageSize;
+
+    fn views(viewer: Viewer, poses: &[CameraPose]) -> RoomViews {
+        RoomViews {
+            scale: RoomScale {
+                middle: [2.0, 0.5],
+                unit: 0.8,
+            },
+            rays: viewer.rays(),
+            poses: poses.to_vec(),
+        }
+    }
+
+    fn viewer() -> Viewer {
+        let camera = CameraModel {
+            horizontal_fov_rad: 1.0,
+            tilt_down_rad: 0.2,
+        };
+        Viewer::new(camera, ImageSize { height: 4, width: 6 })
+    }
+
+    #[test]
+    fn gradients_of_the_sides_agree_with_differences() {
+        let poses = [0.3, 2.0, -1.2].map(|heading| CameraPose {
+            x: 2.3,
+            y: 0.2,
+            heading,
+        });
+        let parameter = Tensor::new(&[0.02f32, -0.03, 0.01, 0.05, 0.04, -0.02], &candle_core::Device::Cpu).unwrap();
+        assert_gradients(&[parameter], 2e-4, |inputs| {
+            views(viewer(), &poses).describe(&inputs[0])
+        });
+    }
+
+    #[test]
+    fn an_unmoved_camera_saw_every_pixel_where_it_is() {
+        let pose = CameraPose {
+            x: 2.3,
+            y: 0.2,
+            heading: 0.7,
+        };
+        let places = views(viewer(), &[pose]).places_before(RoomSides::learned(&[0.0; 6]), viewer(), &[pose]);
+        let own = crate::nn::rays::own_places(ImageSize { height: 4, width: 6 });
+        assert!(places.iter().zip(own).all(|(a, b)| (a - b).abs() < 1e-3), "{places:?}");
+    }
+}

@@ -191,3 +191,29 @@ impl CustomOp1 for FeatureSampling {
         Ok(Some(Tensor::from_vec(sums, features.dims(), features.device())?))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    #[test]
+    fn a_place_between_pixels_mixes_the_four_around_it() {
+        let size = ImageSize { height: 2, width: 3 };
+        let image = [0.0, 1.0, 2.0, 10.0, 11.0, 12.0];
+        assert_eq!(size.around(1.5, 0.25).sample(&image), 4.0);
+        assert_eq!(size.around(-3.0, 9.0).sample(&image), 10.0);
+        assert_eq!(size.around(1.5, 0.25).slopes(&image), [1.0, 10.0]);
+        assert_eq!(size.around(-3.0, 0.5).slopes(&image), [0.0, 10.0]);
+    }
+
+    #[test]
+    fn sampled_features_pass_their_gradients_on() {
+        let features = noise(&[2, 3, 4, 2], 1);
+        let places: Vec<f32> = noise(&[3 * 12 * 2], 2).to_vec1::<f32>().unwrap();
+        let places: Vec<f32> = places.iter().map(|place| 3.0 * place + 1.0).collect();
+        assert_gradients(&[features], 1e-2, |inputs| {
+            sample_features(&inputs[0], places.clone(), &[0, 1, 1])
+        });
+    }
+}

@@ -195,14 +195,14 @@ const MEMORY: FieldNames = FieldNames {
 };
 
 fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), MemoryError> {
-    if features.len() != spec.features {
+    if features.len() != spec.code_len() {
         return Err(MemoryError::FeatureCount {
             index,
             found: features.len(),
-            expected: spec.features,
+            expected: spec.code_len(),
         });
     }
-    // They come out of a hyperbolic tangent; NaN is in no range.
+    // They come out of a hyperbolic tangent, or are a frame's pixels; NaN is in no range.
     match features
         .iter()
         .enumerate()

@@ -7,7 +7,8 @@ use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
 use crate::nn::loss::Loss;
-use crate::nn::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
+use crate::frame::warp::CameraModel;
+use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, Reconstruction};
 use crate::types::{Channel, Seed};
 
 /// The most steps of one stage.
@@ -39,20 +40,48 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
+    /// The kind of network.
+    #[serde(default = "dense")]
+    pub architecture: Architecture,
     /// Frames that the encoder reads.
     pub context: usize,
     /// Frames that the predictor writes.
     pub horizon: usize,
     /// Units of the dense codec.
+    #[serde(default = "default_features")]
     pub features: usize,
     /// Units of each recurrent layer.
+    #[serde(default = "default_hidden")]
     pub hidden: usize,
     /// Which of the paper's two ways to reconstruct.
+    #[serde(default = "default_reconstruction")]
     pub reconstruction: Reconstruction,
     /// What the predictor is told.
     pub conditioning: Conditioning,
     /// How frames enter the model's space.
     pub preprocess: Preprocess,
+    /// Sizes of the flow network.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flow: Option<FlowLayers>,
+    /// The camera, where the data set does not describe it or is to be overruled. Only the flow network uses it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<CameraModel>,
+}
+
+fn dense() -> Architecture {
+    Architecture::Dense
+}
+
+fn default_features() -> usize {
+    ModelSpec::default().features
+}
+
+fn default_hidden() -> usize {
+    ModelSpec::default().hidden
+}
+
+fn default_reconstruction() -> Reconstruction {
+    ModelSpec::default().reconstruction
 }
 
 /// The windows that are trained on.
@@ -129,6 +158,12 @@ pub struct FitConfig {
     pub feedback: TrainingFeedback,
     /// Weight of the reconstruction's loss beside the prediction's; 0 leaves the reconstruction decoder untrained.
     pub reconstruction_weight: f64,
+    /// Weight of the scene's own loss (flow network): how far the surroundings alone are from the true frames.
+    #[serde(default)]
+    pub scene_weight: f64,
+    /// Weight of the loss of the camera's motion (flow network) against the poses measured later, where there are any.
+    #[serde(default)]
+    pub motion_weight: f64,
 }
 
 /// Which frames the decoder learns to write, in both stages.
@@ -223,6 +258,8 @@ impl TrainConfig {
             ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
             ("fit.learning_rate", fit.learning_rate, 1.0),
             ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
+            ("fit.scene_weight", fit.scene_weight, 100.0),
+            ("fit.motion_weight", fit.motion_weight, 100.0),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
             ("run.clip_norm", run.clip_norm, 1e6),
         ];
@@ -267,7 +304,9 @@ impl TrainConfig {
         let (info, model) = (dataset.info(), &self.model);
         let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
         let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
+        let is_flow = model.architecture == Architecture::Flow;
         ModelSpec {
+            architecture: model.architecture,
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,
             frame_period_s: info.frame_period_s,
@@ -280,6 +319,8 @@ impl TrainConfig {
             conditioning: model.conditioning,
             actions,
             states,
+            flow: is_flow.then(|| model.flow.unwrap_or_default()),
+            camera: model.camera.or(info.camera).filter(|_| is_flow),
         }
     }
 }

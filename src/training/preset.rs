@@ -6,10 +6,12 @@ use super::TrainError;
 use super::config::TrainConfig;
 
 /// Name and text of each preset.
-const PRESETS: [(&str, &str); 3] = [
+const PRESETS: [(&str, &str); 5] = [
     ("paper", include_str!("presets/paper.toml")),
     ("static", include_str!("presets/static.toml")),
     ("moving", include_str!("presets/moving.toml")),
+    ("static-flow", include_str!("presets/static-flow.toml")),
+    ("moving-flow", include_str!("presets/moving-flow.toml")),
 ];
 
 impl TrainConfig {
@@ -123,7 +125,7 @@ mod tests {
     #[test]
     fn an_unknown_preset_is_answered_with_the_names_there_are() {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
-        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving");
+        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow");
     }
 
     #[test]
