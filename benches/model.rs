@@ -67,7 +67,7 @@ fn training(c: &mut Criterion) {
             let predicted = frozen
                 .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
                 .unwrap();
-            let again = frozen.reconstruct(&seen).unwrap();
+            let again = frozen.reconstruct(&seen).unwrap().unwrap();
             let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
             update(&(loss + Loss::Mse.between(&again, &seen).unwrap()).unwrap())
         });

@@ -135,6 +135,14 @@ pub enum NnError {
         /// The shape needed.
         expected: String,
     },
+    /// The weights are another network's.
+    #[error("the weights are those of a \"{found}\" network; the model's architecture is \"{expected}\"")]
+    OtherArchitecture {
+        /// The network that the weights belong to.
+        found: Architecture,
+        /// The model's.
+        expected: Architecture,
+    },
     /// A weight is absent.
     #[error("tensor \"{name}\" is missing from the weights; the model needs it with shape {expected:?}")]
     TensorMissing {

@@ -76,6 +76,18 @@ named_enum!(
     }
 );
 
+impl Architecture {
+    /// The architecture that these tensors belong to, as far as their names tell.
+    pub(super) fn of_tensors(tensors: &BTreeMap<String, Tensor>) -> Option<Self> {
+        let has = |prefix: &str| tensors.keys().any(|name| name.starts_with(prefix));
+        match (has("flow."), has("frame_encoder.")) {
+            (true, false) => Some(Self::Flow),
+            (false, true) => Some(Self::Dense),
+            _ => None,
+        }
+    }
+}
+
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
 fn is_dense(architecture: &Architecture) -> bool {
     *architecture == Architecture::Dense

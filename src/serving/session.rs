@@ -219,10 +219,10 @@ mod tests {
 
     use super::*;
     use crate::serving::compute;
-    use crate::serving::{PredictionInput, predict, test_model};
+    use crate::serving::{PredictionInput, predict, test_flow_model, test_model};
 
-    fn frame(seed: u8) -> Frame {
-        Frame::new(6, 4, (0..24).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
+    fn frame(seed: u8, width: u32) -> Frame {
+        Frame::new(width, 4, (0..4 * width as u8).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
     }
 
     fn action(value: f32) -> Action {
@@ -238,19 +238,25 @@ mod tests {
 
     #[test]
     fn steps_predict_what_whole_windows_do_and_forget_what_is_older() {
-        let model = test_model();
+        for model in [test_model(), test_flow_model()] {
+            check_steps(&model);
+        }
+    }
+
+    fn check_steps(model: &crate::registry::LoadedModel) {
+        let width = model.model.spec().frame_width_px;
         let spec = model.model.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
-            let task = state.step(frame(seq), Some(premise(f32::from(seq))), spec);
-            let computed = compute::run(&model, &[&task]).unwrap().remove(0);
+            let task = state.step(frame(seq, width), Some(premise(f32::from(seq))), spec);
+            let computed = compute::run(model, &[&task]).unwrap().remove(0);
             state.advance(
                 u64::from(seq),
                 computed.features[0].clone(),
                 premise(f32::from(seq)),
                 spec,
             );
-            seen.push(frame(seq));
+            seen.push(frame(seq, width));
             let Some(start) = seen.len().checked_sub(3) else {
                 assert!(computed.futures.is_empty());
                 continue;
@@ -261,9 +267,9 @@ mod tests {
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
                 future_actions: None,
             };
-            assert_eq!(computed.futures, predict(&model, &[&input]).unwrap());
+            assert_eq!(computed.futures, predict(model, &[&input]).unwrap());
             let again = state.again(spec).unwrap();
-            assert_eq!(compute::run(&model, &[&again]).unwrap()[0].futures, computed.futures);
+            assert_eq!(compute::run(model, &[&again]).unwrap()[0].futures, computed.futures);
         }
         assert_eq!((state.next_seq(), state.have()), (8, 3));
     }

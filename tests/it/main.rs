@@ -27,6 +27,7 @@ mod metrics;
 mod neighbour;
 mod nn_cell;
 mod nn_common;
+mod nn_flow;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;
