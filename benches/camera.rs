@@ -1,4 +1,4 @@
-//! Frames of the camera a second, and what a whole step and a new trial cost, on one core.
+//! Time of a camera frame, of a whole simulation step and of a new trial, on one core.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use std::hint::black_box;
@@ -14,13 +14,13 @@ fn camera(criterion: &mut Criterion) {
     for scenario in Scenario::ALL {
         let world = World::new(scenario, &config, Seed(1), 0).unwrap();
         group.bench_function(format!("picture 64×64 {scenario}"), |bencher| {
-            bencher.iter(|| black_box(world.photograph().unwrap()));
+            bencher.iter(|| black_box(world.render().unwrap()));
         });
     }
     group.finish();
 }
 
-/// Physics, driver and a picture from another place each time.
+/// Physics, policy and a frame from a new position in every step.
 fn step(criterion: &mut Criterion) {
     let config = WorldConfig {
         max_duration_s: 3600.0,

@@ -1,4 +1,4 @@
-//! Collecting trials of `static-observer` at 64×64 px on both cores, and reading them back.
+//! Time to collect trials of `static-observer` at 64×64 px on all cores, and to open the data set.
 
 #![allow(clippy::unwrap_used, missing_docs)]
 

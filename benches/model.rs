@@ -1,4 +1,5 @@
-//! Times of prediction and of training steps with the default model: 64×64 px, 128 features, 256 hidden units, 5 → 5.
+//! Time of predictions and of training steps with the default model: 64×64 px, 128 features, 256 hidden units, 5 frames of
+//! context, 5 predicted frames.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use candle_core::{Device, Tensor};
@@ -12,7 +13,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 const WINDOWS: usize = 64;
 
-/// Smooth values 0…1 of that shape.
+/// Smooth values from 0 to 1 in a tensor of this shape.
 fn values(shape: (usize, usize, usize)) -> Tensor {
     let count = shape.0 * shape.1 * shape.2;
     let values: Vec<f32> = (0..count).map(|i| 0.5 + 0.5 * (i as f32 * 0.37).sin()).collect();
@@ -31,7 +32,7 @@ fn prediction(c: &mut Criterion) {
     }
 }
 
-/// Forward, backward and Adam from pixels to pixels, or with the codec frozen from features to features.
+/// Forward pass, backward pass and Adam: from pixels to pixels, or with a frozen codec from features to features.
 fn training(c: &mut Criterion) {
     let spec = ModelSpec::default();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();

@@ -4,9 +4,9 @@
     foreframe export --dataset moving-observer --episode 3 --out look
     python examples/stream.py --frames look --actions look/actions.json --out seen
 
-The actions file is JSON, {"actions": [[linear, angular], ...], "states": [[...], ...]}, one entry a frame; a model that is
-told nothing needs none. After the frame of number N, the prediction of the k-th frame to come is OUT/after-N-k.png.
-A server that asks for a key is shown --key, or better STREAM_KEY, which other users of the machine do not see.
+The actions file is JSON, {"actions": [[linear, angular], ...], "states": [[...], ...]}, with one entry for each frame. A model
+that takes neither actions nor state needs no such file. The k-th frame predicted after frame N is OUT/after-N-k.png.
+If the server asks for an API key, pass --key or, so that other users of the machine cannot see it, set STREAM_KEY.
 """
 
 import argparse
@@ -17,14 +17,17 @@ import pathlib
 import urllib.error
 import urllib.request
 
-from websockets.exceptions import ConnectionClosedError
-from websockets.sync.client import connect
+try:
+    from websockets.exceptions import ConnectionClosedError, WebSocketException
+    from websockets.sync.client import connect
+except ImportError:
+    raise SystemExit("this example needs the package websockets: pip install websockets") from None
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--server", default="http://127.0.0.1:8642", help="where Foreframe listens (default: %(default)s)")
 parser.add_argument("--model", default="moving", help="a model's name (default: %(default)s)")
 parser.add_argument("--frames", required=True, type=pathlib.Path, help="a directory of PNG or JPEG frames")
-parser.add_argument("--actions", type=pathlib.Path, help="what the robot did and said of itself, as JSON")
+parser.add_argument("--actions", type=pathlib.Path, help="the robot's actions and states, as JSON")
 parser.add_argument("--out", required=True, type=pathlib.Path, help="the directory to write into")
 parser.add_argument("--key", default=os.environ.get("STREAM_KEY"), help="an API key (default: $STREAM_KEY)")
 args = parser.parse_args()
@@ -49,7 +52,7 @@ def frame_message(seq, period_s):
     return json.dumps(message)
 
 
-def keep(answer):
+def save(answer):
     if answer["type"] == "error":
         raise SystemExit(f"frame {answer['next_seq']}: {answer['detail']}")
     if answer["type"] == "prediction":
@@ -66,9 +69,11 @@ try:
         session = json.load(answer)
 except urllib.error.HTTPError as refused:
     raise SystemExit(json.load(refused)["detail"]) from None
+except urllib.error.URLError as error:
+    raise SystemExit(f"no server answers at {args.server} ({error.reason}); start one with: foreframe serve") from None
 url = f"{args.server.replace('http', 'ws', 1)}{session['stream']}?token={session['token']}"
 
-# A session outlives its socket: where the connection breaks, connect again and go on with the frame that is next.
+# A session outlives its connection: after a break, connect again and continue with the next frame.
 seq = 0
 while seq < len(frames):
     try:
@@ -77,8 +82,10 @@ while seq < len(frames):
             print(f"model {ready['model']} version {ready['version']}: {ready['spec']['context']} frames, then predictions")
             for seq in range(ready["next_seq"], len(frames)):
                 socket.send(frame_message(seq, ready["spec"]["frame_period_s"]))
-                keep(json.loads(socket.recv()))
+                save(json.loads(socket.recv()))
             seq = len(frames)
             socket.send(json.dumps({"type": "close"}))
     except ConnectionClosedError:
-        print("the connection broke; going on")
+        print("the connection broke; connecting again")
+    except (OSError, WebSocketException) as error:
+        raise SystemExit(f"the stream at {args.server} ended: {error}") from None

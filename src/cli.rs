@@ -1,4 +1,5 @@
-//! The command line: one file a subcommand. Exit code 2 for what was asked wrongly, 1 for what went wrong.
+//! The command line, one file for each subcommand. Exit code 2: the command cannot be carried out as it was given. Exit
+//! code 1: it failed. Exit code 130: it was interrupted.
 
 mod collect;
 mod config;
@@ -6,36 +7,40 @@ mod error;
 mod evaluate;
 mod export;
 mod healthcheck;
+mod import;
 mod inspect;
 mod interrupt;
 mod keys;
+mod models;
+mod output;
 mod predict;
 mod progress;
+mod publish;
+mod run_job;
 mod serve;
 mod settings;
 mod train;
 mod worker;
+mod workspace;
 
 use std::fmt::Display;
 use std::io::Write;
-use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
 use self::error::CliError;
-use crate::dataset::{self, Dataset};
-use crate::registry::{self, LoadedModel};
-use crate::telemetry::{self, LogFormat};
 
-/// Where data sets are kept: also the server's jobs find them there.
-const DATASETS_DIR: &str = "data/datasets";
-
-/// Sees a few moments ahead for robots: predicts the camera frames to come from frames, actions and state.
+/// Predicts the next camera frames of a robot from its frames, its state and its actions.
 ///
-/// Without a command it serves the models in ./models.
+/// Without a command, it serves the models in ./models, like `foreframe serve`.
 #[derive(Parser)]
 #[command(name = "foreframe", version, arg_required_else_help = false)]
+#[command(after_help = "Examples:
+  foreframe serve                                # serve the shipped models at http://127.0.0.1:8642
+  foreframe collect --trials 200                 # simulate a small data set
+  foreframe train --preset static                # train a model on it
+  foreframe predict --help                       # how to predict from image files")]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -43,71 +48,78 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Simulate trials and store their frames, actions and states
+    /// Simulate trials and store their frames, actions and states as a data set
     Collect(collect::CollectArgs),
+    /// Turn a recording of a real robot into a data set
+    Import(import::ImportArgs),
     /// Train a model on a data set
     Train(train::TrainArgs),
-    /// Measure a model on held-out trials: report, figures, GIF
+    /// Measure a model on trials that it was not trained on
     Evaluate(evaluate::EvaluateArgs),
-    /// Predict the frames that follow those in a directory
+    /// Predict the frames that follow the images in a directory
     Predict(predict::PredictArgs),
-    /// Serve models over HTTP and WebSocket (the default)
+    /// Serve models over HTTP and WebSocket (the default command)
     Serve(serve::ServeArgs),
-    /// Make, list and revoke API keys
+    /// Give a trained model to the server, as the next version of its name
+    Publish(publish::PublishArgs),
+    /// List, activate and remove versions of models
+    Models(models::ModelsArgs),
+    /// Create, list and revoke API keys
     Keys(keys::KeysArgs),
-    /// Print every setting with where it comes from
+    /// Print every setting with its meaning and where its value comes from
     Config(config::ConfigArgs),
     /// Ask a running server whether it is ready
     Healthcheck(healthcheck::HealthcheckArgs),
-    /// Work on jobs without serving
+    /// Run jobs without serving
     Worker(worker::WorkerArgs),
+    /// Run one job for a server or worker, which starts this command
+    #[command(hide = true)]
+    RunJob,
     /// Describe a model or a data set
     Inspect(inspect::InspectArgs),
-    /// Write an episode's frames as PNG, its actions as JSON and a GIF to look at
+    /// Write an episode's frames as PNG, its actions as JSON, and a GIF
     Export(export::ExportArgs),
 }
 
-/// Runs the program with the process's arguments and says how it ended.
+/// Runs the program with the arguments of the process and returns its exit code.
 #[must_use]
 pub fn main() -> ExitCode {
     let Err(error) = run(Cli::parse().command) else {
         return ExitCode::SUCCESS;
     };
-    let (sentence, code) = error.told();
-    // Nothing is left to do if even standard error is closed.
+    let (sentence, code) = error.report();
+    // If standard error is closed, there is nowhere left to report to.
     let _ = writeln!(std::io::stderr(), "{sentence}");
     code
 }
 
 fn run(command: Option<Command>) -> Result<(), CliError> {
-    let command = command.unwrap_or_else(|| Command::Serve(serve::ServeArgs::default()));
-    // The logs of those that run long have settings.
-    let _telemetry = match &command {
-        Command::Serve(_) | Command::Worker(_) => None,
-        _ => Some(telemetry::init(LogFormat::Text, None)?),
-    };
-    match command {
-        Command::Collect(args) => collect::run(args),
+    match command.unwrap_or_else(|| Command::Serve(serve::ServeArgs::default())) {
+        Command::Collect(args) => collect::run(&args),
+        Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Predict(args) => predict::run(&args),
         Command::Serve(args) => serve::run(&args),
+        Command::Publish(args) => publish::run(&args),
+        Command::Models(args) => models::run(&args),
         Command::Worker(args) => worker::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::RunJob => run_job::run(),
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }
 }
 
-/// Writes a line of the command's answer to standard output.
-fn say(line: impl Display) -> Result<(), CliError> {
+/// Writes a line to standard output.
+fn print_line(line: impl Display) -> Result<(), CliError> {
     writeln!(std::io::stdout(), "{line}")
-        .map_err(|error| CliError::Failed(format!("could not write the answer: {error}")))
+        .map_err(|error| CliError::Failed(format!("could not write to standard output: {error}")))
 }
 
-/// The command line as it was given, for stamps.
+/// The command line as it was given; reports and manifests record it.
 fn command_line() -> String {
     std::env::args()
         .enumerate()
@@ -120,16 +132,68 @@ fn command_line() -> String {
         .join(" ")
 }
 
-/// Loads a model by the directory it stands in, or by its name in the models' directory.
-fn load_model(model: &str, models_dir: &Path) -> Result<(PathBuf, LoadedModel), CliError> {
-    let dir = registry::locate(models_dir, model)?;
-    let loaded = registry::load(&dir)?;
-    Ok((dir, loaded))
-}
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
 
-/// Reads a data set by the directory it stands in, or by its name in [`DATASETS_DIR`].
-fn open_dataset(dataset: &Path) -> Result<(PathBuf, Dataset), CliError> {
-    let dir = dataset::find(Path::new(DATASETS_DIR), dataset)?;
-    let dataset = Dataset::open(&dir)?;
-    Ok((dir, dataset))
+    use super::*;
+
+    /// Every command's help, as users read it.
+    fn help_texts(command: &mut clap::Command) -> Vec<(String, String)> {
+        let mut texts = vec![(command.get_name().to_owned(), command.render_long_help().to_string())];
+        let subcommands = command
+            .get_subcommands_mut()
+            .filter(|command| command.get_name() != "help");
+        texts.extend(subcommands.flat_map(help_texts));
+        texts
+    }
+
+    #[test]
+    fn every_example_in_the_help_is_understood() {
+        let mut command = Cli::command();
+        command.build();
+        for (name, text) in help_texts(&mut command) {
+            // A setting of the environment may stand before the command, and a comment or a redirection behind it.
+            if name == "run-job" {
+                // Only servers and workers start it.
+                continue;
+            }
+            let start = |line: &str| {
+                line.trim_start()
+                    .trim_start_matches("FOREFRAME_MAX_STREAMS=8 ")
+                    .to_owned()
+            };
+            let examples: Vec<String> = text
+                .lines()
+                .map(start)
+                .filter(|line| line.starts_with("foreframe "))
+                .collect();
+            assert!(!examples.is_empty(), "the help of {name} has no example");
+            for example in examples {
+                let words = example.split([' ', '#', '>']).take_while(|word| !word.is_empty());
+                let parsed = Cli::try_parse_from(words.clone());
+                if let Err(error) = parsed
+                    && error.kind() != clap::error::ErrorKind::DisplayHelp
+                {
+                    panic!("{name}: {example}: {error}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_flag_has_the_name_of_its_setting() {
+        let settings = crate::config::LoadedConfig::from_layers([]).unwrap().to_toml();
+        let mut command = Cli::command();
+        command.build();
+        let serve = command.find_subcommand("serve").unwrap();
+        let flags = serve.get_arguments().filter_map(clap::Arg::get_long);
+        for flag in flags.filter(|flag| !["config", "set", "help", "version"].contains(flag)) {
+            let key = flag.replace('-', "_");
+            let is_listed = settings
+                .lines()
+                .any(|line| line.starts_with(&format!("{key} = ")) || line == format!("# {key} is not set"));
+            assert!(is_listed, "--{flag} has no setting {key}");
+        }
+    }
 }

@@ -1,72 +1,42 @@
-//! The configuration of the long-running commands: defaults < TOML file < environment < flags, each value with where it
-//! came from. Keys are flat: `max_streams` in the file, `FOREFRAME_MAX_STREAMS` in the environment, `--set max_streams=64`.
+//! The configuration of the server and of the commands that use its directories: defaults < TOML file < environment <
+//! flags. Keys are flat: `max_streams` in the file, `FOREFRAME_MAX_STREAMS` in the environment, `--set max_streams=64`.
 
-mod layer;
+mod bind;
 mod print;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
-use figment::Figment;
-use figment::value::Dict;
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::server::ServerConfig;
+use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 use crate::telemetry::LogFormat;
 
-pub use layer::ConfigLayer;
-
-/// The file that is read where none is named and it is there.
+/// The file that is read if it exists and no other is named.
 pub const DEFAULT_FILE: &str = "foreframe.toml";
+
+/// The port to listen on by default.
+pub const DEFAULT_PORT: u16 = 8642;
+
+/// The command that lists all settings.
+const LISTING: &str = "foreframe config";
+
+const PREFIX: &str = "FOREFRAME_";
+/// Variables that tell the tests where a database and an object store are. They are not settings.
+const TEST_PREFIX: &str = "FOREFRAME_TEST_";
 
 /// Why there is no configuration.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ConfigError {
-    /// The file cannot be read.
-    #[error("could not read the configuration {}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        #[source]
-        source: std::io::Error,
-    },
-    /// The file is no TOML.
-    #[error("{} is not TOML: {message}", path.display())]
-    Toml {
-        /// The file.
-        path: PathBuf,
-        /// Where and why.
-        message: String,
-    },
-    /// `--set` without a key and a value.
-    #[error("--set {0} is not KEY=VALUE, as in --set max_streams=64")]
-    Setting(String),
-    /// There is no such field.
-    #[error("{field} ({origin}) is no field of the configuration; foreframe config prints all of them")]
-    Unknown {
-        /// The name given.
-        field: String,
-        /// Where it was given.
-        origin: String,
-    },
-    /// The value has not the field's type.
-    #[error("{field} is {found} ({origin}); it must be {right}")]
-    Type {
-        /// The field.
-        field: String,
-        /// Where it was given.
-        origin: String,
-        /// Its value.
-        found: String,
-        /// What would be right.
-        right: String,
-    },
+    /// A file, a key or a value cannot be used.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
     /// The value is out of range.
     #[error("{field} is {value} ({origin}); it must be {least} to {most}")]
     Range {
-        /// The field.
+        /// The setting.
         field: &'static str,
         /// Where it was given.
         origin: String,
@@ -77,10 +47,10 @@ pub enum ConfigError {
         /// The most it may be.
         most: u64,
     },
-    /// The directory is not there, or is none.
-    #[error("{field} is \"{}\" ({origin}), {wrong}; {right}", path.display())]
+    /// The directory does not exist, or it is a file.
+    #[error("{field} is \"{}\" ({origin}), which {wrong}; {right}", path.display())]
     Directory {
-        /// The field.
+        /// The setting.
         field: &'static str,
         /// Where it was given.
         origin: String,
@@ -97,17 +67,21 @@ pub enum ConfigError {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default)]
 pub struct Config {
-    /// Where to listen.
+    /// The address and port to listen on: HOST:PORT, or HOST alone for port 8642. HOST is an IP address or a name such as
+    /// localhost. Port 0 takes any free port.
     #[schema(value_type = String)]
+    #[serde(deserialize_with = "bind::deserialize")]
     pub bind: SocketAddr,
-    /// Listen on other than a loopback address although nobody needs a key.
+    /// The port to listen on; replaces the port of `bind`.
+    pub port: Option<u16>,
+    /// Whether to accept requests from other machines although no API key exists.
     pub insecure: bool,
-    /// `text` or `json`.
+    /// The format of log lines: `text` or `json`.
     #[schema(value_type = String)]
     pub log_format: LogFormat,
-    /// Where traces go, for example `http://127.0.0.1:4318`; needs the feature `otlp`.
+    /// Where traces are sent, for example `http://127.0.0.1:4318`; needs the Cargo feature `otlp`.
     pub otlp_endpoint: Option<String>,
-    /// The server's limits, and its data directory.
+    /// The server's limits and directories.
     #[serde(skip)]
     pub server: ServerConfig,
 }
@@ -115,7 +89,8 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            bind: SocketAddr::from((Ipv4Addr::LOCALHOST, 8642)),
+            bind: SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT)),
+            port: None,
             insecure: false,
             log_format: LogFormat::Text,
             otlp_endpoint: None,
@@ -132,50 +107,41 @@ impl Config {
     }
 }
 
-/// A configuration and where each of its values came from.
+/// A configuration and the origin of each of its values.
 #[derive(Debug)]
 pub struct LoadedConfig {
     /// The settings.
     pub config: Config,
-    values: Figment,
+    values: LayeredSettings,
 }
 
 impl LoadedConfig {
-    /// Reads the file (`file`, else [`DEFAULT_FILE`] if it is there) and the environment, and puts the flags over them.
-    /// Errors: every [`ConfigError`].
-    pub fn read(file: Option<&Path>, flags: Vec<ConfigLayer>) -> Result<Self, ConfigError> {
+    /// Reads the file (`file`, or [`DEFAULT_FILE`] if it exists) and the environment, and puts the flags over them.
+    /// Errors: every [`ConfigError`] but `Directory`.
+    pub fn read(file: Option<&Path>, flags: Vec<SettingsLayer>) -> Result<Self, ConfigError> {
         let default = Path::new(DEFAULT_FILE);
         let file = file.or_else(|| default.is_file().then_some(default));
-        let file = file.map(ConfigLayer::file).transpose()?;
-        // A variable that is no text is none of ours.
+        let file = file.map(SettingsLayer::file).transpose()?;
+        // A variable that is not Unicode cannot be a setting.
         let variables = std::env::vars_os();
         let texts = variables.filter_map(|(name, text)| Some((name.into_string().ok()?, text.into_string().ok()?)));
-        Self::from_layers(file.into_iter().chain(ConfigLayer::environment(texts)).chain(flags))
+        Self::from_layers(file.into_iter().chain(environment_layers(texts)).chain(flags))
     }
 
-    /// The defaults under the layers, later ones over earlier ones. Errors: `Unknown`, `Type`, `Range`.
-    pub fn from_layers(layers: impl IntoIterator<Item = ConfigLayer>) -> Result<Self, ConfigError> {
-        let defaults = ConfigLayer::defaults();
-        let known: Vec<String> = defaults.keys().cloned().collect();
-        let values = layers.into_iter().fold(Figment::from(defaults), Figment::merge);
-        let given: Dict = extract(&values)?;
-        if let Some(field) = given.keys().find(|field| !known.contains(field)) {
-            return Err(ConfigError::Unknown {
-                field: field.clone(),
-                origin: origin(&values, field),
-            });
-        }
-        let mut server: ServerConfig = extract(&values)?;
+    /// The defaults under the layers, later ones over earlier ones. Errors: `Settings`, `Range`.
+    pub fn from_layers(layers: impl IntoIterator<Item = SettingsLayer>) -> Result<Self, ConfigError> {
+        let values = LayeredSettings::merge(defaults(), layers, LISTING)?;
+        let mut server: ServerConfig = values.extract(expected)?;
         if let Some((field, value, range)) = server.out_of_bounds() {
             return Err(ConfigError::Range {
                 field,
-                origin: origin(&values, field),
+                origin: values.origin(field),
                 value,
                 least: *range.start(),
                 most: *range.end(),
             });
         }
-        let mut config: Config = extract(&values)?;
+        let mut config: Config = values.extract(expected)?;
         for url in [
             &mut server.database_url,
             &mut server.objects_url,
@@ -183,62 +149,75 @@ impl LoadedConfig {
         ] {
             url.take_if(|url| url.is_empty());
         }
+        if let Some(port) = config.port {
+            config.bind.set_port(port);
+        }
         config.server = server;
         Ok(Self { config, values })
     }
 
-    /// Looks at the directories: a data directory is made where it is not there, and so may the default one of models not
-    /// be, but one that was asked for must. Errors: `Directory`.
+    /// Checks the directories. The data directory is created later if it does not exist. The models directory may be
+    /// missing only if it is the default. Errors: `Directory`.
     pub fn check_directories(&self) -> Result<(), ConfigError> {
         let ServerConfig {
             data_dir, models_dir, ..
         } = &self.config.server;
-        let is_asked_for = origin(&self.values, "models_dir") != ConfigLayer::DEFAULT;
+        let is_default = self.values.origin("models_dir") == SettingsLayer::DEFAULT;
         let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
-            let right = "name a directory, which is made if it is not there";
+            let right = "name a directory; it is created if it does not exist";
             ("data_dir", data_dir, right)
-        } else if !models_dir.is_dir() && (is_asked_for || models_dir.exists()) {
-            let right = "name a directory that holds models, or none to serve those in ./models";
+        } else if !models_dir.is_dir() && (!is_default || models_dir.exists()) {
+            let right = "name a directory that holds models, or leave the setting out to serve those in ./models";
             ("models_dir", models_dir, right)
         } else {
             return Ok(());
         };
         Err(ConfigError::Directory {
             field,
-            origin: origin(&self.values, field),
+            origin: self.values.origin(field),
             path: path.clone(),
-            wrong: if path.exists() {
-                "which is a file"
-            } else {
-                "which is not there"
-            },
+            wrong: if path.exists() { "is a file" } else { "does not exist" },
             right,
         })
     }
 
-    /// The settings as a TOML text, each with what it means and where it came from; passwords in URLs are not shown.
+    /// The settings as TOML, each with its meaning and origin; passwords in URLs are hidden.
     #[must_use]
     pub fn to_toml(&self) -> String {
-        let (fields, meanings) = (ConfigLayer::defaults(), print::meanings());
+        let (fields, meanings) = (defaults(), print::meanings());
         let entry = |field| print::entry(&self.values, field, &meanings);
         fields.keys().map(|field| entry(field)).collect::<Vec<_>>().join("\n")
     }
 }
 
-fn extract<T: DeserializeOwned>(values: &Figment) -> Result<T, ConfigError> {
-    values.extract().map_err(|error| {
-        let field = error.path.first().cloned().unwrap_or_default();
-        ConfigError::Type {
-            origin: origin(values, &field),
-            found: print::shown(values, &field),
-            right: print::right(&field, &error.kind),
-            field,
-        }
+/// Every setting with its default.
+fn defaults() -> SettingsLayer {
+    let origin = SettingsLayer::DEFAULT;
+    SettingsLayer::serialized(origin, &Config::default())
+        .with(SettingsLayer::serialized(origin, &ServerConfig::default()))
+}
+
+/// The variables whose names start with `FOREFRAME_`, each as a layer of its own.
+pub fn environment_layers(variables: impl Iterator<Item = (String, String)>) -> impl Iterator<Item = SettingsLayer> {
+    variables.filter_map(|(name, text)| {
+        let field = name.strip_prefix(PREFIX)?.to_ascii_lowercase();
+        let is_setting = !name.starts_with(TEST_PREFIX);
+        is_setting.then(|| SettingsLayer::text(format!("environment {name}"), &field, &text))
     })
 }
 
-/// Where a value came from.
-fn origin(values: &Figment, field: &str) -> String {
-    let metadata = values.find_metadata(field);
-    metadata.map_or_else(String::new, |metadata| metadata.name.to_string())
+/// What a setting must be, where its type does not say it well.
+fn expected(field: &str) -> Option<String> {
+    match field {
+        "bind" => Some("HOST:PORT, as in 127.0.0.1:8642 or localhost:8642".to_owned()),
+        "port" => Some("0 to 65535".to_owned()),
+        _ => range(field),
+    }
+}
+
+/// The range of a number.
+fn range(field: &str) -> Option<String> {
+    let bounds = ServerConfig::default().bounds();
+    let (_, _, range) = bounds.iter().find(|(name, _, _)| *name == field)?;
+    Some(format!("{} to {}", range.start(), range.end()))
 }

@@ -1,7 +1,7 @@
-//! Recorded and simulated episodes, on disk and in memory.
+//! Data sets of recorded and simulated episodes, on disk and in memory.
 //!
-//! A [`Dataset`] lies in memory as a whole, its frames as bytes in one buffer. [`sampler`] says which [`Window`]s of it
-//! train, validate and test; [`collect()`] simulates one into a directory in LeRobot's v3.0 layout.
+//! A [`Dataset`] is completely in memory, with all frames as bytes in one buffer. [`sampler`] divides its [`Window`]s into
+//! training, validation and test parts. [`collect()`] simulates a data set and writes it in LeRobot's v3.0 layout.
 
 mod catalog;
 mod check;
@@ -9,6 +9,7 @@ pub mod collect;
 mod collection;
 mod error;
 mod files;
+pub mod import;
 mod layout;
 mod preview;
 pub mod sampler;
@@ -17,6 +18,7 @@ mod shard_reader;
 mod stats;
 mod store;
 mod tables;
+mod unfinished;
 
 use std::ops::Range;
 
@@ -27,17 +29,18 @@ use check::{check_description, check_episode};
 pub use collect::{CollectConfig, CollectProgress, collect};
 pub use collection::CollectionStatus;
 pub use error::DatasetError;
-pub use layout::{INFO, STAMP};
-pub use preview::{describe, describe_stamp};
+pub use layout::{INFO, METADATA};
+pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 
+use crate::error_text::comma_separated;
 use crate::files::hex;
 use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
+use crate::sim::WorldConfig;
 use crate::types::{Channel, Seed};
-use crate::wording::listed;
 
-/// What a data set is: sizes, rates, meanings and the hash of its content.
+/// Description of a data set: frame size, frame period, channels, origin and the hash of its content.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DatasetInfo {
     /// Its name, for reports.
@@ -48,24 +51,26 @@ pub struct DatasetInfo {
     pub frame_height_px: u32,
     /// Seconds from one frame to the next.
     pub frame_period_s: f64,
-    /// Components of an action; action t acts between frame t and t + 1.
+    /// Components of an action. Action t acts from frame t to frame t + 1.
     pub action_channels: Vec<Channel>,
     /// Components of a state.
     pub state_channels: Vec<Channel>,
-    /// Hex sha256 of what is in it; [`Dataset::from_episodes`] computes one where this is empty.
+    /// SHA-256 of the content, in hexadecimal. [`Dataset::from_episodes`] computes it if this is empty.
     pub content_hash: String,
     /// The simulated scenario; none for recordings.
     pub scenario: Option<String>,
     /// The seed it was simulated from; none for recordings.
     pub seed: Option<Seed>,
-    /// Frames of all episodes; filled in by [`Dataset::from_episodes`].
+    /// Number of frames of all episodes; filled in by [`Dataset::from_episodes`].
     pub frame_count: usize,
-    /// Episodes; filled in by [`Dataset::from_episodes`].
+    /// Number of episodes; filled in by [`Dataset::from_episodes`].
     pub episode_count: usize,
     /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`].
     pub has_masks: bool,
     /// How the camera projects; none where that is not known.
     pub camera: Option<CameraModel>,
+    /// How the simulated world was run and seen; none for recordings.
+    pub world: Option<WorldConfig>,
 }
 
 impl DatasetInfo {
@@ -76,7 +81,7 @@ impl DatasetInfo {
     }
 }
 
-/// One trial or recording: its place among all frames.
+/// One trial or recording, and which frames of the data set belong to it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Episode {
     /// Its position among the episodes.
@@ -85,7 +90,7 @@ pub struct Episode {
     pub first_frame: usize,
     /// Its number of frames.
     pub frame_count: usize,
-    /// What was drawn for it, where it was simulated.
+    /// Parameters of the trial; none for recordings.
     pub trial: Option<TrialParameters>,
 }
 
@@ -97,33 +102,33 @@ impl Episode {
     }
 }
 
-/// What one episode holds, part by part; every part holds one item for each timestamp, one after another.
+/// The data of one episode. Each field holds one item per frame, one after another.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EpisodeData {
-    /// Seconds from the episode's start, growing.
+    /// Seconds since the start of the episode, increasing.
     pub timestamps_s: Vec<f64>,
     /// Intensities, frame by frame, row by row.
     pub pixels: Vec<u8>,
-    /// Ids of who is seen at each pixel (0 = scene, 1 = the other robot, …), laid out as `pixels`.
+    /// Segmentation masks (0 = scene, 1 = Tb2, 2… = other robots), in the layout of `pixels`.
     pub masks: Option<Vec<u8>>,
     /// Actions, frame by frame.
     pub actions: Vec<f32>,
     /// States, frame by frame.
     pub states: Vec<f32>,
-    /// What was drawn for it, where it was simulated.
+    /// Parameters of the trial; none for recordings.
     pub trial: Option<TrialParameters>,
 }
 
-/// The frames seen and those to come after them: `context + horizon` consecutive frames of one episode.
+/// `context + horizon` consecutive frames of one episode: the context, then the frames to predict.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Window {
     /// Position in [`Dataset::episodes`].
     pub episode: usize,
-    /// The first frame seen, counted over the whole data set.
+    /// The first context frame, counted over the whole data set.
     pub first_frame: usize,
 }
 
-/// A whole data set in memory.
+/// A complete data set in memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
     info: DatasetInfo,
@@ -136,8 +141,8 @@ pub struct Dataset {
 }
 
 impl Dataset {
-    /// A data set of these episodes; the counts in `info` are filled in, and its hash where that is empty.
-    /// Errors: parts that don't fit together, numbers that aren't finite, time that doesn't grow, no frames.
+    /// A data set of these episodes. Fills in the counts in `info`, and the hash if it is empty. Errors: `Description`,
+    /// `PartLength`, `NotFinite`, `TimeOrder`, `MixedMasks`, `Empty`.
     pub fn from_episodes(info: DatasetInfo, episodes: Vec<EpisodeData>) -> Result<Self, DatasetError> {
         check_description(&info)?;
         let has_masks = episodes.first().is_some_and(|episode| episode.masks.is_some());
@@ -205,7 +210,7 @@ impl Dataset {
         hex(&hasher.finalize())
     }
 
-    /// What the data set is.
+    /// The description of the data set.
     #[must_use]
     pub fn info(&self) -> &DatasetInfo {
         &self.info
@@ -223,32 +228,32 @@ impl Dataset {
         item(&self.pixels, frame, self.info.frame_pixels())
     }
 
-    /// The ids of who is seen at each pixel of a frame, where there are masks. Panics if there is no such frame.
+    /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame.
     #[must_use]
     pub fn mask(&self, frame: usize) -> Option<&[u8]> {
         let masks = self.masks.as_deref()?;
         Some(item(masks, frame, self.info.frame_pixels()))
     }
 
-    /// What acts between that frame and the next. Panics if there is no such frame.
+    /// The action from this frame to the next. Panics if there is no such frame.
     #[must_use]
     pub fn action(&self, frame: usize) -> &[f32] {
         item(&self.actions, frame, self.info.action_channels.len())
     }
 
-    /// What the robot said of itself at that frame. Panics if there is no such frame.
+    /// The state at this frame. Panics if there is no such frame.
     #[must_use]
     pub fn state(&self, frame: usize) -> &[f32] {
         item(&self.states, frame, self.info.state_channels.len())
     }
 
-    /// Seconds from the start of the frame's episode. Panics if there is no such frame.
+    /// Time of the frame in seconds since the start of its episode. Panics if there is no such frame.
     #[must_use]
     pub fn timestamp_s(&self, frame: usize) -> f64 {
         self.timestamps_s[frame]
     }
 
-    /// Errors: `FrameSize` unless frames are of that size.
+    /// Errors: `FrameSize` unless the frames have this size.
     pub fn require_frame_size(&self, width_px: u32, height_px: u32) -> Result<(), DatasetError> {
         let info = &self.info;
         if (info.frame_width_px, info.frame_height_px) == (width_px, height_px) {
@@ -263,12 +268,12 @@ impl Dataset {
         })
     }
 
-    /// Errors: `Channels` unless actions have that many components.
+    /// Errors: `Channels` unless actions have this number of components.
     pub fn require_action_count(&self, wanted: usize) -> Result<(), DatasetError> {
         self.require_channels("action", &self.info.action_channels, wanted)
     }
 
-    /// Errors: `Channels` unless states have that many components.
+    /// Errors: `Channels` unless states have this number of components.
     pub fn require_state_count(&self, wanted: usize) -> Result<(), DatasetError> {
         self.require_channels("state", &self.info.state_channels, wanted)
     }
@@ -281,7 +286,7 @@ impl Dataset {
             name: self.info.name.clone(),
             kind,
             found: channels.len(),
-            names: listed(channels),
+            names: comma_separated(channels),
             wanted,
         })
     }

@@ -1,5 +1,5 @@
-//! From a model and a data set to a report that can be trusted: [`run`] scores the model against trivial [`baselines`] on
-//! trials it never saw, [`write()`] leaves report, figures and animation in a directory.
+//! From a model and a data set to a report that can be trusted: [`run`] scores the model against simple [`baselines`] on
+//! trials that training never saw, [`write()`] writes report, figures and animation into a directory.
 //!
 //! Frames are compared as the camera saw them: intensities 0…1, neither inverted nor smoothed.
 
@@ -14,6 +14,7 @@ mod markdown;
 pub mod metrics;
 pub mod motion;
 mod output;
+pub mod plans;
 pub mod report;
 mod samples;
 pub mod score;
@@ -22,26 +23,54 @@ pub mod skill;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use serde::{Deserialize, Serialize};
+
 pub use self::error::EvaluationError;
 pub use self::output::{prepare, write};
 pub use self::report::EvaluationReport;
 pub use self::samples::figure_inputs;
 
+use self::baselines::Baselines;
 use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
+use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
+
+/// What a model is scored on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Purpose {
+    /// To choose between models and settings: the validation split.
+    Validation,
+    /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
+    #[default]
+    Test,
+}
+
+impl Purpose {
+    /// The splits that are scored, in the order of the report.
+    #[must_use]
+    pub fn splits(self) -> &'static [Split] {
+        match self {
+            Self::Validation => &[Split::Validation],
+            Self::Test => &[Split::Test, Split::UnseenPairs, Split::UnseenGains],
+        }
+    }
+}
 
 /// What to test on, and how closely.
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
-    /// Seed of the split into trials; that of the model's training where none is given.
+    /// Validation or test.
+    pub purpose: Purpose,
+    /// Seed of the split; that of the model's training if none is given.
     pub split_seed: Option<Seed>,
     /// Frames from the start of one window to that of the next.
     pub stride: usize,
-    /// Windows of each test set at most, evenly spread over its trials.
+    /// Windows of each set at most, evenly spread over its trials.
     pub max_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,
@@ -49,24 +78,25 @@ pub struct EvaluateConfig<'a> {
     pub seed: Seed,
     /// Windows that go through the model at once.
     pub batch: usize,
-    /// A model without conditioning, trained with the same budget, for the action table.
-    pub twin: Option<&'a LoadedModel>,
+    /// Models trained with the same budget without the action, without the state or without both, for the action table.
+    pub twins: Vec<&'a LoadedModel>,
     /// The command line, for the stamp.
     pub command: String,
-    /// Where it is looked whether to stop.
+    /// Set by another thread to stop the evaluation.
     pub cancelled: Option<&'a AtomicBool>,
 }
 
 impl Default for EvaluateConfig<'_> {
     fn default() -> Self {
         Self {
+            purpose: Purpose::default(),
             split_seed: None,
             stride: 1,
             max_windows: 2000,
             bootstrap_samples: 1000,
             seed: Seed(0),
             batch: 64,
-            twin: None,
+            twins: Vec::new(),
             command: String::new(),
             cancelled: None,
         }
@@ -97,12 +127,26 @@ pub enum EvaluationStage {
     Scores,
     /// The action table.
     Actions,
+    /// Plan identification.
+    Plans,
 }
 
-/// How far the evaluation is.
+impl EvaluationStage {
+    /// The stage in a word.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Scores => "scores",
+            Self::Actions => "actions",
+            Self::Plans => "plans",
+        }
+    }
+}
+
+/// Progress of the evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluationProgress {
-    /// The test set.
+    /// The set.
     pub split: Split,
     /// What is being computed.
     pub stage: EvaluationStage,
@@ -112,7 +156,7 @@ pub struct EvaluationProgress {
     pub total: usize,
 }
 
-/// What every pass over a test set needs besides its windows.
+/// What every pass over a set needs besides its windows.
 pub struct EvaluationContext<'a> {
     split: Split,
     batch: usize,
@@ -122,8 +166,8 @@ pub struct EvaluationContext<'a> {
 }
 
 impl EvaluationContext<'_> {
-    /// Errors: `Cancelled` if it is to stop.
-    fn tell(&self, stage: EvaluationStage, done: usize, total: usize) -> Result<(), EvaluationError> {
+    /// Reports progress. Errors: `Cancelled` if the evaluation is to stop.
+    fn report(&self, stage: EvaluationStage, done: usize, total: usize) -> Result<(), EvaluationError> {
         (self.on_progress)(EvaluationProgress {
             split: self.split,
             stage,
@@ -137,8 +181,8 @@ impl EvaluationContext<'_> {
     }
 }
 
-/// Scores the model on both held-out parts of the data set: trials never seen, and start/goal pairs and gains never seen.
-/// Errors: model and data set that don't fit together, settings out of range, nothing held out, `Cancelled`, those of the
+/// Scores the model on the splits that [`EvaluateConfig::purpose`] names: the validation split, or the three test sets
+/// (trials, start/goal pairs and gains that training never saw). Errors: model and data set that don't fit together, settings out of range, nothing held out, `Cancelled`, those of the
 /// network.
 pub fn run(
     loaded: &LoadedModel,
@@ -150,22 +194,22 @@ pub fn run(
     config.validate()?;
     compatible::check(loaded, dataset)?;
     let split_seed = compatible::split_seed(loaded, dataset, config.split_seed)?;
-    if let Some(twin) = config.twin {
-        compatible::check_twin(loaded, twin)?;
+    for twin in &config.twins {
+        actions::twin_variant(loaded, twin)?;
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
     let splits = Splits::new(dataset, split_seed);
-    let tests = [Split::Test, Split::TestUnseen];
+    let tests = config.purpose.splits();
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {
             dataset: dataset.info().name.clone(),
             split_seed: split_seed.0,
         });
     }
-    let training_mean = score::training_mean(dataset, &splits)?;
+    let baselines = Baselines::fit(dataset, &splits, window_shape(loaded.model.spec()))?;
     let mut sets = Vec::new();
-    for split in tests {
+    for &split in tests {
         let watched = EvaluationContext {
             split,
             batch: config.batch,
@@ -176,7 +220,7 @@ pub fn run(
             on_progress,
             cancelled: config.cancelled,
         };
-        let outcome = score_split(loaded, (dataset, &splits), config, &training_mean, &watched)?;
+        let outcome = score_split(loaded, (dataset, &splits), config, &baselines, &watched)?;
         sets.push(SetReport {
             split: split.name().to_owned(),
             outcome,
@@ -190,37 +234,42 @@ pub fn run(
     })
 }
 
+/// The windows that a model of that specification takes.
+fn window_shape(spec: &ModelSpec) -> WindowShape {
+    WindowShape {
+        context: spec.context,
+        horizon: spec.horizon,
+    }
+}
+
 fn score_split(
     loaded: &LoadedModel,
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
-    training_mean: &[f32],
+    baselines: &Baselines,
     watched: &EvaluationContext,
 ) -> Result<SetOutcome, EvaluationError> {
     let spec = loaded.model.spec();
-    let shape = WindowShape {
-        context: spec.context,
-        horizon: spec.horizon,
-    };
-    let available = splits.windows(dataset, watched.split, shape, config.stride)?;
+    let available = splits.windows(dataset, watched.split, window_shape(spec), config.stride)?;
     if available.is_empty() {
         let reason = match watched.split {
-            Split::TestUnseen => "the data set holds no trials of start/goal pairs or gains kept apart",
-            _ => "the split leaves it without trials; collect more",
+            Split::UnseenPairs => "the data set has no trials with held-out start/goal pairs",
+            Split::UnseenGains => "the data set has no trials with held-out gains",
+            _ => "the split has no trials; collect more",
         };
         return Ok(SetOutcome::Skipped {
             reason: reason.to_owned(),
         });
     }
     let windows = score::evenly(&available, config.max_windows);
-    let scores = score::score(loaded, dataset, &windows, training_mean, watched)?;
-    let actions = if spec.action_inputs().is_some() {
-        let errors = actions::compare(loaded, config.twin, dataset, &windows, watched)?;
+    let scores = score::score(loaded, dataset, &windows, baselines, watched)?;
+    let mut scores = SetScores::new(baselines.methods(), &scores, &watched.bootstrap);
+    scores.windows_available = available.len();
+    if spec.action_inputs().is_some() {
+        let errors = actions::compare(loaded, &config.twins, dataset, &windows, watched)?;
         let trial_of: Vec<usize> = windows.iter().map(|window: &Window| window.episode).collect();
-        Some(actions::table(&errors, &trial_of, &watched.bootstrap))
-    } else {
-        None
-    };
-    let scores = SetScores::new(&scores, available.len(), actions, &watched.bootstrap);
+        scores.actions = Some(actions::table(&errors, &trial_of, &watched.bootstrap));
+        scores.plans = Some(plans::identify(loaded, dataset, &windows, watched)?);
+    }
     Ok(SetOutcome::Scored(Box::new(scores)))
 }

@@ -1,4 +1,4 @@
-//! Files that are whole or absent, and their hashes.
+//! Writes files so that a reader sees either the complete file or none, deletes directories, and computes hashes.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -9,21 +9,22 @@ use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
-/// The ending of a file that is being written.
+/// Extension of a file that is being written.
 const PARTIAL: &str = "partial";
-/// The beginning of a directory's name while it is deleted.
+/// Prefix of a directory's name while it is being deleted.
 const DELETING: &str = ".deleting-";
-/// After so long nobody writes a partial file any more.
-const ABANDONED_AFTER: Duration = Duration::from_hours(1);
+/// A partial file older than this has no writer any more.
+const STALE_AFTER: Duration = Duration::from_hours(1);
 
-/// Writes the bytes so that the path holds all of them or what it held before: temporary file beside it, fsync, rename.
+/// Writes the file atomically: the path holds either all the bytes or its old content. Writes a temporary file in the
+/// same directory, calls fsync and renames it.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let partial = partial_path(path)?;
     let written = File::create(&partial)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| std::fs::rename(&partial, path));
     if written.is_err() {
-        // The first error is the one to tell; what is left behind is named as partial.
+        // Return the first error. If this fails too, the file's name still marks it as partial.
         let _ = std::fs::remove_file(&partial);
     }
     written?;
@@ -33,9 +34,21 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     }
 }
 
-/// Where a file is written before it takes its name: another place each time, since several may write it at once.
+/// Opens a lock file and leaves its content. A symbolic link is refused, because another file would be locked.
+pub(crate) fn open_lock(path: &Path) -> io::Result<File> {
+    if path.symlink_metadata().is_ok_and(|found| found.is_symlink()) {
+        return Err(io::Error::other("the lock file is a symbolic link; delete it"));
+    }
+    let mut options = File::options();
+    options.read(true).write(true).create(true).truncate(false).open(path)
+}
+
+/// The temporary path of a file. It is different in each call, because several writers can write the same file at once.
 fn partial_path(path: &Path) -> io::Result<PathBuf> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
+    let name = path.file_name();
+    let mut name = name
+        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path does not end with a file name"))?
+        .to_owned();
     name.push(format!(
         ".{:016x}.{PARTIAL}",
         getrandom::u64().map_err(io::Error::other)?
@@ -43,26 +56,26 @@ fn partial_path(path: &Path) -> io::Result<PathBuf> {
     Ok(path.with_file_name(name))
 }
 
-/// Whether something is no more than what was written of the file when its writer was killed.
+/// Whether `found` is a partial copy of the file `path`, left by a writer that was killed.
 pub(crate) fn is_partial_of(path: &Path, found: &Path) -> bool {
     let name = |path: &Path| path.file_name().unwrap_or_default().as_encoded_bytes().to_owned();
     found.parent() == path.parent() && is_partial(found) && name(found).starts_with(&[&name(path)[..], b"."].concat())
 }
 
-/// Whether a file is one that is being written, or was when its writer was killed.
+/// Whether the file is being written, or was being written when its writer was killed.
 pub(crate) fn is_partial(path: &Path) -> bool {
-    path.extension().is_some_and(|ending| ending == PARTIAL)
+    path.extension().is_some_and(|extension| extension == PARTIAL)
 }
 
-/// Deletes the partial files below a directory whose writers are gone. What cannot be deleted is in nobody's way.
-pub(crate) fn remove_abandoned(root: &Path) {
+/// Deletes old partial files below a directory. Files that cannot be deleted are ignored: they do no harm.
+pub(crate) fn remove_stale_partials(root: &Path) {
     let age = |path: &Path| {
         SystemTime::now()
             .duration_since(std::fs::metadata(path)?.modified()?)
             .map_err(io::Error::other)
     };
     for path in files_below(root).unwrap_or_default() {
-        if is_partial(&path) && age(&path).is_ok_and(|age| age > ABANDONED_AFTER) {
+        if is_partial(&path) && age(&path).is_ok_and(|age| age > STALE_AFTER) {
             let _ = std::fs::remove_file(path);
         }
     }
@@ -85,16 +98,16 @@ pub(crate) fn files_below(root: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Deletes a directory, whose name is free at once; one that is not there is deleted already. What deletions that were
-/// killed left beside it goes too.
+/// Deletes a directory. It is renamed first, so its name is free at once. A missing directory is not an error. Also
+/// deletes what earlier, killed deletions left in the same parent directory.
 pub(crate) fn remove_dir(dir: &Path) -> io::Result<()> {
     let mut name = OsString::from(DELETING);
     name.push(format!("{:016x}", getrandom::u64().map_err(io::Error::other)?));
-    let doomed = dir.with_file_name(name);
-    if_there(std::fs::rename(dir, &doomed))?;
-    // Another deletion may be at it too.
-    if_there(std::fs::remove_dir_all(&doomed))?;
-    for left in if_there(std::fs::read_dir(dir.parent().unwrap_or(dir)))?
+    let renamed = dir.with_file_name(name);
+    none_if_missing(std::fs::rename(dir, &renamed))?;
+    // Another call can delete the same directory at the same time.
+    none_if_missing(std::fs::remove_dir_all(&renamed))?;
+    for left in none_if_missing(std::fs::read_dir(dir.parent().unwrap_or(dir)))?
         .into_iter()
         .flatten()
     {
@@ -106,8 +119,8 @@ pub(crate) fn remove_dir(dir: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// What was found, or none where nothing is there.
-pub(crate) fn if_there<T>(found: io::Result<T>) -> io::Result<Option<T>> {
+/// Turns the error `NotFound` into `None`.
+pub(crate) fn none_if_missing<T>(found: io::Result<T>) -> io::Result<Option<T>> {
     match found {
         Ok(found) => Ok(Some(found)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -135,13 +148,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_hash_of_abc_is_the_standards() {
+    fn the_hash_of_abc_matches_the_standard() {
         let expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
         assert_eq!(sha256_hex(b"abc"), expected);
     }
 
     #[test]
-    fn a_write_that_fails_leaves_the_old_content() {
+    fn a_failed_write_keeps_the_old_content() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("taken");
         std::fs::create_dir(&path).unwrap();
@@ -152,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn many_that_write_a_file_at_once_all_succeed_and_leave_one_content_whole() {
+    fn concurrent_writers_leave_one_complete_file() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("file");
         let contents: Vec<Vec<u8>> = (0..8).map(|byte| vec![byte; 1 << 16]).collect();
@@ -170,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_is_deleted_with_what_killed_deletions_left() {
+    fn deleting_also_removes_leftovers_of_killed_deletions() {
         let root = tempfile::tempdir().unwrap();
         for name in ["a", "b", ".deleting-1"] {
             std::fs::create_dir_all(root.path().join(name).join("deep")).unwrap();
@@ -186,10 +199,10 @@ mod tests {
     }
 
     #[test]
-    fn only_partial_files_of_long_ago_are_removed() {
+    fn only_old_partial_files_are_removed() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("file");
-        let long_ago = SystemTime::now() - 2 * ABANDONED_AFTER;
+        let long_ago = SystemTime::now() - 2 * STALE_AFTER;
         let make = |path: &Path, modified: SystemTime| File::create(path).unwrap().set_modified(modified).unwrap();
         let (old, new) = (partial_path(&path).unwrap(), partial_path(&path).unwrap());
         assert!(is_partial_of(&path, &old) && is_partial_of(&path, &dir.path().join("file.partial")));
@@ -197,7 +210,7 @@ mod tests {
         make(&path, long_ago);
         make(&old, long_ago);
         make(&new, SystemTime::now());
-        remove_abandoned(dir.path());
+        remove_stale_partials(dir.path());
         assert!(path.exists() && new.exists() && !old.exists());
     }
 }

@@ -1,16 +1,18 @@
-//! A gray camera image of checked size, and what is done with one: [`codec`] to and from files, [`preprocess`] to and
-//! from the model's space, [`quality`] to compare two, [`warp`] to move its pixels.
+//! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
+//! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels.
 
 pub mod codec;
+pub mod fit;
 pub mod preprocess;
 pub mod quality;
 pub mod warp;
 
-/// The largest side of a frame that is accepted anywhere, in pixels.
+/// The largest accepted width and height of a frame, in pixels.
 pub const MAX_SIDE_PX: u32 = 4096;
 
 /// Why a frame was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum FrameError {
     /// A side is zero or over [`MAX_SIDE_PX`].
     #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]
@@ -20,8 +22,8 @@ pub enum FrameError {
         /// Height in pixels.
         height: u32,
     },
-    /// The pixels don't fill the stated size.
-    #[error("{found} pixels given for a frame of {width}×{height} px, which takes {expected}")]
+    /// The number of pixels does not match the size.
+    #[error("{found} pixels given for a frame of {width}×{height} px; it needs {expected}")]
     PixelCount {
         /// Width in pixels.
         width: u32,
@@ -32,7 +34,7 @@ pub enum FrameError {
         /// Pixels needed.
         expected: usize,
     },
-    /// The bytes are no image that is understood.
+    /// The bytes are not a PNG or JPEG image.
     #[error("not a readable PNG or JPEG image")]
     Decode(#[source] image::ImageError),
     /// An image could not be written.
@@ -59,7 +61,7 @@ pub enum FrameError {
     },
 }
 
-/// A gray image, 8 bits a pixel, row by row from the top left.
+/// A gray image with 8 bits per pixel, row by row from the top left.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Frame {
     width: u32,
@@ -68,7 +70,8 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A frame of that size. Errors: `Size` if a side is out of range, `PixelCount` if the pixels don't fill it.
+    /// A frame of the given size. Errors: `Size` if a side is out of range, `PixelCount` if the number of pixels is not
+    /// width × height.
     pub fn new(width: u32, height: u32, pixels: Vec<u8>) -> Result<Self, FrameError> {
         if !(1..=MAX_SIDE_PX).contains(&width) || !(1..=MAX_SIDE_PX).contains(&height) {
             return Err(FrameError::Size { width, height });
@@ -109,16 +112,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_frame_that_its_pixels_do_not_fill_is_refused() {
+    fn too_few_pixels_are_refused() {
         let error = Frame::new(4, 4, vec![0; 15]).unwrap_err();
-        assert_eq!(
-            error.to_string(),
-            "15 pixels given for a frame of 4×4 px, which takes 16"
-        );
+        assert_eq!(error.to_string(), "15 pixels given for a frame of 4×4 px; it needs 16");
     }
 
     #[test]
-    fn a_frame_without_width_is_refused() {
+    fn a_frame_of_width_zero_is_refused() {
         assert!(Frame::new(0, 4, vec![]).is_err());
     }
 }

@@ -1,16 +1,19 @@
-//! Collection, training and evaluation in the background. [`state`] says which transitions are legal, [`spec`] checks what
-//! is asked for, [`queue`] is the handle that enqueues and tells, `runner` takes jobs up one after another and writes of
-//! them what `notes` gathered, [`pipeline`] does the work. The jobs themselves lie in the store, so that they outlast the
-//! process and several processes can share them.
+//! Collection, training and evaluation in the background. [`state`] defines the legal transitions, [`spec`] checks
+//! submitted jobs, [`queue`] is the handle for callers, `runner` claims jobs one after another and writes their reports,
+//! `progress` buffers the reports, [`pipeline`] does the work. The store holds the jobs, so that they survive the process
+//! and several processes can share them.
 
 mod checkpoints;
+pub mod child;
 pub mod datasets;
 mod instance;
 pub mod job;
-mod notes;
+pub mod memory;
 pub mod pipeline;
 mod priority;
+mod progress;
 pub mod queue;
+mod report;
 mod runner;
 pub mod spec;
 pub mod state;
@@ -20,38 +23,40 @@ use crate::store::{StoreError, unix_s};
 use crate::versions::VersionError;
 
 pub use job::{Job, JobFilter};
-pub use notes::{JobProgress, Losses};
+pub use progress::{JobProgress, Losses};
 pub use queue::{JobLimits, Jobs};
-pub use runner::{JobExecutor, JobFailure, JobReporter, JobResult};
+pub use report::JobReporter;
+pub use runner::{JobExecutor, JobFailure, JobResult};
 pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
 pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum JobError {
     /// No job has that id.
-    #[error("there is no job \"{id}\"; of those that ended only the latest are remembered")]
+    #[error("there is no job \"{id}\"; only the latest ended jobs are kept")]
     Unknown {
-        /// The id asked for.
+        /// The requested id.
         id: String,
     },
-    /// The job's state does not allow it.
-    #[error("job {id} has {state}; only one that {} can {event}", event.whose())]
+    /// The job's state does not allow the transition.
+    #[error("job {id} is {state}; only a {} job can {event}", event.allowed_states())]
     IllegalTransition {
         /// The job.
         id: String,
         /// Its state.
         state: JobState,
-        /// What was asked of it.
+        /// The requested transition.
         event: JobTransition,
     },
-    /// As many jobs wait as may.
-    #[error("{limit} jobs wait already; cancel one or try again later")]
+    /// The queue is full.
+    #[error("the job queue is full ({limit} jobs are waiting); cancel one or try again later")]
     QueueFull {
-        /// How many may wait.
+        /// How many jobs can wait.
         limit: usize,
     },
-    /// A field of the job does not say what can be done.
+    /// A field of the job is not valid.
     #[error("{field}: {reason}")]
     Invalid {
         /// The field's name.
@@ -59,38 +64,38 @@ pub enum JobError {
         /// What is wrong with it, and what would be right.
         reason: String,
     },
-    /// What the job starts from is not there.
-    #[error("{field}: there is no {kind} \"{name}\"; there are: {}", list(.known))]
+    /// An input of the job does not exist.
+    #[error("{field}: there is no {kind} \"{name}\"; there are: {}", list(.available))]
     NotFound {
         /// The field's name.
         field: &'static str,
         /// `data set`, …
         kind: &'static str,
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The names there are.
-        known: Vec<String>,
+        /// The existing names.
+        available: Vec<String>,
     },
-    /// What the job would make is there, or another job makes it.
+    /// The job's output exists already, or another job is making it.
     #[error("name: {kind} \"{name}\" {why}; choose another name")]
     Taken {
         /// `data set`, …
         kind: &'static str,
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// Who has it.
+        /// Why it is not free.
         why: &'static str,
     },
-    /// The directory holds what an earlier job left, which this one cannot go on with.
+    /// The output directory holds files that this job cannot continue.
     #[error("name: data set \"{name}\" {why}, or choose another name")]
     Occupied {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// What is there, and what would help.
+        /// What is in the directory, and how to free it.
         why: String,
     },
-    /// A job that has not ended needs it.
-    #[error("{kind} \"{name}\" is in use by {job}; wait for its end or cancel it")]
+    /// A queued or running job needs it.
+    #[error("{kind} \"{name}\" is in use by {job}; wait until that job has ended, or cancel it")]
     InUse {
         /// `data set`, …
         kind: &'static str,
@@ -100,26 +105,26 @@ pub enum JobError {
         job: String,
     },
     /// The server is stopping.
-    #[error("the server is stopping and takes no more jobs")]
+    #[error("the server is stopping and accepts no more jobs")]
     Stopping,
-    /// What the store holds of a job cannot be read by this program.
+    /// This program cannot read the job's row in the store.
     #[error("the store's record of job {id} cannot be read: {reason}")]
     Record {
         /// The job.
         id: String,
-        /// Where it went wrong.
+        /// What is wrong with it.
         reason: String,
     },
-    /// No identity could be had in the data directory.
-    #[error("could not register in the data directory: {0}")]
+    /// The process could not get a runner's id in the data directory.
+    #[error("could not register as a runner in the data directory: {0}")]
     Instance(#[source] std::io::Error),
-    /// The runner's threads could not be started.
+    /// The threads for jobs could not be started.
     #[error("could not start the threads for jobs: {0}")]
     Threads(#[source] rayon::ThreadPoolBuildError),
-    /// The data sets could not be looked at.
+    /// The data sets could not be read.
     #[error(transparent)]
     Dataset(Box<DatasetError>),
-    /// The models could not be looked at.
+    /// The models could not be read.
     #[error(transparent)]
     Versions(Box<VersionError>),
     /// The store failed.

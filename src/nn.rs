@@ -1,21 +1,21 @@
-//! The network of the paper on candle: a dense codec of single frames, a peephole LSTM that encodes what has been seen,
-//! and two LSTM decoders, one that predicts the frames to come and one that reconstructs those seen.
+//! The network of the paper, written with candle: a dense codec for single frames, a peephole LSTM that encodes the context,
+//! and two LSTM decoders. One decoder predicts the next frames, the other reconstructs the context.
 //!
-//! Legend of shapes: B windows of a batch, N frames, T time, P pixels of a frame, F features of a frame, D inputs of a
-//! layer, H hidden units of an LSTM, A components of an action, S components of a state. All tensors are f32, row-major,
-//! on the CPU. Frames are in the model's space ([`crate::frame::preprocess`]).
+//! Symbols in shapes: B windows of a batch, N frames, T time steps, P pixels of a frame, F features of a frame, D inputs of
+//! a layer, H hidden units of an LSTM, A components of an action, S components of a state. All tensors are f32, row-major,
+//! on the CPU. Frames are in the model's value range ([`crate::frame::preprocess`]).
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
-//! → [`lstm`] (over time; `recurrence` and `gates` are its
-//! fast f32 form) → [`conditioned`] (actions and state) → [`autoencoder`] (the dense network) → [`loss`]; [`costs`] compares with other networks.
+//! → [`lstm`] (sequences; `recurrence` and `gates` are its fast f32 implementation) → [`conditioned`] (actions and state)
+//! → [`autoencoder`] (the dense network) → [`loss`]. [`costs`] compares the model's cost with other networks.
 //!
 //! The second architecture is [`flow`]: `conv`, `modulation`, `sampling` and `compose` are its operations, `rays` and `room`
-//! its geometry, `motion` and `scene` what it knows of the camera and the surroundings. [`model`] is the type that the rest
-//! of the program uses for both.
+//! its geometry, `motion` and `scene` compute the camera's motion and the look of the surroundings. [`model`] is the type
+//! that the rest of the program uses for both architectures.
 
 mod activation;
-mod compose;
 pub mod autoencoder;
+mod compose;
 pub mod conditioned;
 mod conv;
 pub mod costs;
@@ -53,20 +53,21 @@ pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, Reconstructi
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum NnError {
-    /// A number of the specification is outside its bounds.
+    /// A number of the specification is out of range.
     #[error("model specification: {field} is {value}; it must be {min} to {max}")]
     OutOfRange {
         /// The field's name.
         field: &'static str,
         /// The value given.
         value: f64,
-        /// Least value accepted.
+        /// Smallest accepted value.
         min: f64,
-        /// Greatest value accepted.
+        /// Largest accepted value.
         max: f64,
     },
-    /// The conditioning needs channels that the specification doesn't describe.
+    /// The conditioning needs channels, but the specification has none.
     #[error("model specification: conditioning \"{conditioning}\" needs at least one {kind} channel; {kind}s is empty")]
     NoChannels {
         /// The conditioning.
@@ -74,7 +75,7 @@ pub enum NnError {
         /// `action` or `state`.
         kind: &'static str,
     },
-    /// A channel's scale is not a finite number, or negative.
+    /// The mean or standard deviation of a channel is not finite, or the standard deviation is negative.
     #[error(
         "model specification: {kind} channel \"{name}\" has mean {mean} and std {std}; both must be finite and std not negative"
     )]
@@ -90,29 +91,29 @@ pub enum NnError {
     },
     /// A side of the frames does not suit the flow network.
     #[error(
-        "model specification: frames are {width}×{height} px; each side must be a multiple of {least} from {least} to {most}"
+        "model specification: frames are {width}×{height} px; each side must be a multiple of {min} from {min} to {max}"
     )]
     FrameSides {
         /// Width of a frame in pixels.
         width: u32,
         /// Height of a frame in pixels.
         height: u32,
-        /// Least side, and what sides are multiples of.
-        least: u32,
-        /// Greatest side.
-        most: u32,
+        /// Smallest side; sides are multiples of it.
+        min: u32,
+        /// Largest side.
+        max: u32,
     },
-    /// The camera model is impossible.
+    /// No camera has this field of view or tilt.
     #[error("model specification: {0}")]
     Camera(#[source] crate::frame::FrameError),
-    /// A name of an enumeration is unknown.
+    /// The name of an enumeration value is unknown.
     #[error("unknown {kind} \"{name}\"; there are {known}")]
     UnknownName {
-        /// What was named.
+        /// The enumeration.
         kind: &'static str,
         /// The name given.
         name: String,
-        /// The names there are.
+        /// The known names.
         known: &'static str,
     },
     /// An input has the wrong shape.
@@ -120,55 +121,55 @@ pub enum NnError {
     Shape {
         /// The input.
         what: &'static str,
-        /// The shape given.
+        /// The given shape.
         found: Vec<usize>,
-        /// The shape needed.
+        /// The expected shape.
         expected: String,
     },
-    /// The model is conditioned on something that wasn't given.
+    /// The model needs a conditioning input that is missing.
     #[error("no {what} given; this model's conditioning is \"{conditioning}\", which takes {expected}")]
     Missing {
         /// `actions` or `state`.
         what: &'static str,
         /// The model's conditioning.
         conditioning: Conditioning,
-        /// The shape needed.
+        /// The expected shape.
         expected: String,
     },
-    /// The weights are another network's.
+    /// The weights belong to another kind of network.
     #[error("the weights are those of a \"{found}\" network; the model's architecture is \"{expected}\"")]
     OtherArchitecture {
-        /// The network that the weights belong to.
+        /// The architecture that the weights belong to.
         found: Architecture,
-        /// The model's.
+        /// The model's architecture.
         expected: Architecture,
     },
-    /// A weight is absent.
+    /// A tensor of the model is missing from the weights.
     #[error("tensor \"{name}\" is missing from the weights; the model needs it with shape {expected:?}")]
     TensorMissing {
         /// The tensor's name.
         name: String,
-        /// The shape needed.
+        /// The expected shape.
         expected: Vec<usize>,
     },
-    /// A weight is not part of the model.
-    #[error("the weights hold tensor \"{name}\", which this model doesn't have")]
+    /// The weights contain a tensor that the model does not have.
+    #[error("the weights contain tensor \"{name}\", which this model does not have")]
     TensorUnknown {
         /// The tensor's name.
         name: String,
     },
-    /// A weight has the wrong shape.
+    /// A tensor of the weights has the wrong shape.
     #[error("tensor \"{name}\" has shape {found:?}; the model needs {expected:?}")]
     TensorShape {
         /// The tensor's name.
         name: String,
-        /// The shape found.
+        /// The shape in the weights.
         found: Vec<usize>,
-        /// The shape needed.
+        /// The expected shape.
         expected: Vec<usize>,
     },
-    /// A weight holds NaN or an infinity.
-    #[error("tensor \"{name}\" holds a value that is not a finite number")]
+    /// A tensor of the weights contains NaN or an infinity.
+    #[error("tensor \"{name}\" contains a value that is not a finite number")]
     TensorNotFinite {
         /// The tensor's name.
         name: String,
@@ -179,7 +180,7 @@ pub enum NnError {
 }
 
 impl NnError {
-    /// An input's shape against what was needed.
+    /// The error for an input with an unexpected shape.
     fn shape(what: &'static str, found: &candle_core::Tensor, expected: impl Into<String>) -> Self {
         Self::Shape {
             what,

@@ -1,41 +1,42 @@
-//! Trained models on disk, one directory each: `NAME/model.safetensors` (weights, f16) and `NAME/manifest.json` (what they
-//! are and how they were made). [`manifest`] describes one, [`loader`] verifies and builds it; here they are listed, found
-//! and published.
+//! Trained models on disk. Each model has a directory with `model.safetensors` (weights, f16) and `manifest.json`
+//! (description and origin). In a directory of models, the name of a model's directory is its name, whatever the manifest
+//! says. [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds and publishes models.
 
 pub mod loader;
 pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
-pub use self::loader::{LoadedModel, load};
+pub use self::loader::{LoadedModel, load, load_as};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
+use crate::error_text::existing;
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
-use crate::wording::those;
 
-/// The weights' file in a model's directory.
+/// Name of the weights file in a model's directory.
 pub const WEIGHTS_FILE: &str = "model.safetensors";
-/// The manifest's file in a model's directory.
+/// Name of the manifest file in a model's directory.
 pub const MANIFEST_FILE: &str = "manifest.json";
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum RegistryError {
-    /// There is no model of that name.
-    #[error("there is no model {name:?} in {}; there {}", dir.display(), those(known))]
+    /// No model has this name.
+    #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]
     Unknown {
         /// The name asked for.
         name: String,
-        /// Where it was looked for.
+        /// The directory that was searched.
         dir: PathBuf,
-        /// The names there are.
+        /// The names of the existing models.
         known: Vec<String>,
     },
-    /// A name that could leave the directory or confuse a shell.
-    #[error("{0:?} is no model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
+    /// The name is not safe as a directory name or in a URL.
+    #[error("{0:?} is not a valid model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
     Name(String),
-    /// The path leads to no model.
-    #[error("{} holds no model ({MANIFEST_FILE} is missing); name one that `foreframe train` made", .0.display())]
+    /// The directory contains no model.
+    #[error("{} holds no model ({MANIFEST_FILE} is missing); give a directory that `foreframe train` wrote", .0.display())]
     NotAModel(PathBuf),
     /// A file could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
@@ -47,43 +48,43 @@ pub enum RegistryError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The manifest isn't one.
-    #[error("{} is no model manifest: {source}", path.display())]
+    /// The manifest cannot be parsed.
+    #[error("{} is not a valid model manifest: {source}", path.display())]
     Manifest {
         /// The file.
         path: PathBuf,
-        /// Where it went wrong.
+        /// The parser's error.
         source: serde_json::Error,
     },
-    /// The weights are not those that the manifest names.
-    #[error("{} has SHA-256 {found}, its manifest says {expected}: fetch the model again or train it anew", path.display())]
+    /// The weights file has another hash than the manifest states.
+    #[error("{} has SHA-256 {found}, but its manifest states {expected}; download the model or train it again", path.display())]
     Hash {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// As computed.
+        /// Hash of the file.
         found: String,
-        /// As the manifest says.
+        /// Hash in the manifest.
         expected: String,
     },
-    /// The weights don't fit the manifest's spec.
-    #[error("the weights of {} do not fit their manifest: {source}", path.display())]
+    /// The weights do not match the model specification in the manifest.
+    #[error("the weights of {} do not match their manifest: {source}", path.display())]
     Weights {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// What does not fit.
+        /// What does not match.
         source: crate::nn::NnError,
     },
-    /// The weights' file is damaged.
-    #[error("{} is no safetensors file: {source}", path.display())]
+    /// The weights file is damaged.
+    #[error("{} is not a valid safetensors file: {source}", path.display())]
     Safetensors {
-        /// The weights' file.
+        /// The weights file.
         path: PathBuf,
-        /// Where it went wrong.
+        /// The reader's error.
         source: candle_core::Error,
     },
 }
 
-/// Whether the name is safe as a directory's and in an address: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
+/// Whether the name is safe as a directory name and in a URL: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
 #[must_use]
 pub fn is_valid_name(name: &str) -> bool {
     let bytes = name.as_bytes();
@@ -92,29 +93,46 @@ pub fn is_valid_name(name: &str) -> bool {
         && bytes.iter().all(|b| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'-'))
 }
 
-/// The models in a directory, by name, sorted. An absent directory holds none. Errors: `Io` if it can't be listed.
+/// Names and directories of the models in a directory, sorted by name. A missing directory contains none. Errors: `Io` if
+/// the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
-    if !models_dir.exists() {
-        return Ok(Vec::new());
-    }
-    let unlisted = |source| RegistryError::Io {
-        action: "list",
-        path: models_dir.to_owned(),
-        source,
-    };
-    let mut models = Vec::new();
-    for entry in std::fs::read_dir(models_dir).map_err(unlisted)? {
-        let path = entry.map_err(unlisted)?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if is_valid_name(&name) && path.join(MANIFEST_FILE).is_file() {
-            models.push((name, path));
-        }
-    }
+    let named = directories(models_dir)?.into_iter().map(|path| (directory_name(&path), path));
+    let mut models: Vec<_> = named
+        .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
+        .collect();
     models.sort();
     Ok(models)
 }
 
-/// The directory of the model of that name. Errors: `Name`, `Unknown` with the names there are.
+/// The directories that hold a model but have no valid name, sorted: [`list`] leaves them out. Errors: `Io`.
+pub fn misnamed(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    let mut paths = directories(models_dir)?;
+    paths.retain(|path| !is_valid_name(&directory_name(path)) && path.join(MANIFEST_FILE).is_file());
+    paths.sort();
+    Ok(paths)
+}
+
+/// Everything in a directory; an absent one holds nothing. Errors: `Io`.
+fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    if !models_dir.exists() {
+        return Ok(Vec::new());
+    }
+    let entries = std::fs::read_dir(models_dir).and_then(|entries| {
+        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+        paths.collect::<Result<Vec<_>, _>>()
+    });
+    entries.map_err(|source| RegistryError::Io {
+        action: "list",
+        path: models_dir.to_owned(),
+        source,
+    })
+}
+
+fn directory_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The directory of the model with this name. Errors: `Name`, `Unknown` with the existing names.
 pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     if !is_valid_name(name) {
         return Err(RegistryError::Name(name.to_owned()));
@@ -131,20 +149,21 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     })
 }
 
-/// The directory of the model called `what`: a path that leads to one, or else a name below `models_dir`.
-/// Errors: those of [`find`], `NotAModel`.
-pub fn locate(models_dir: &Path, what: &str) -> Result<PathBuf, RegistryError> {
-    let given = Path::new(what);
-    if given.join(MANIFEST_FILE).is_file() {
-        return Ok(given.to_owned());
+/// The directory of a model that the user gave as a path; none if the text can only be a name. Errors: `NotAModel` for a
+/// path without a model.
+pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
+    let path = Path::new(model);
+    if path.join(MANIFEST_FILE).is_file() {
+        return Ok(Some(path.to_owned()));
     }
-    if !is_valid_name(what) && (what.contains('/') || given.exists()) {
-        return Err(RegistryError::NotAModel(given.to_owned()));
+    if !is_valid_name(model) && (model.contains('/') || path.exists()) {
+        return Err(RegistryError::NotAModel(path.to_owned()));
     }
-    find(models_dir, what)
+    Ok(None)
 }
 
-/// Writes weights (as f16) and manifest into `model_dir`, the manifest last and with the weights' hash filled in.
+/// Writes the weights (as f16) and then the manifest into `model_dir`. Fills in the weights' hash and returns the manifest.
+/// Errors: `Weights`, `Manifest`, `Io`.
 pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -> Result<Manifest, RegistryError> {
     let weights_path = model_dir.join(WEIGHTS_FILE);
     let failed = |path: &Path| {
@@ -169,11 +188,30 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
     Ok(manifest)
 }
 
-/// Replaces the metrics of a model's manifest, for example by those that an evaluation measured.
+/// Writes metrics into a model's manifest, for example the results of an evaluation. Other metrics stay; a metric given as
+/// null is removed (JSON merge patch, RFC 7396). Errors: `Manifest`, `Io`.
 pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
     let mut manifest = manifest::read(model_dir)?;
-    manifest.metrics = metrics;
+    merge(&mut manifest.metrics, metrics);
     write_manifest(model_dir, &manifest)
+}
+
+fn merge(target: &mut serde_json::Value, patch: serde_json::Value) {
+    let serde_json::Value::Object(patch) = patch else {
+        *target = patch;
+        return;
+    };
+    if !target.is_object() {
+        *target = serde_json::json!({});
+    }
+    let Some(target) = target.as_object_mut() else { return };
+    for (key, value) in patch {
+        if value.is_null() {
+            target.remove(&key);
+        } else {
+            merge(target.entry(key).or_insert(serde_json::Value::Null), value);
+        }
+    }
 }
 
 /// Writes the manifest into a model's directory. Errors: `Manifest`, `Io`.
@@ -196,6 +234,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn recording_test_scores_keeps_the_validation_score() {
+        let mut metrics = serde_json::json!({"validation": {"mse": 1, "step": 7}, "test": {"mse": 2}, "old": 3});
+        merge(
+            &mut metrics,
+            serde_json::json!({"test": {"mse": 4}, "validation": {"mse": 5}, "old": null}),
+        );
+        let expected = serde_json::json!({"validation": {"mse": 5, "step": 7}, "test": {"mse": 4}});
+        assert_eq!(metrics, expected);
+    }
+
+    #[test]
     fn a_name_that_leaves_the_directory_is_refused() {
         for name in ["../paper", "", "-x", "Paper", "a/b", "a b", "ä"] {
             assert!(!is_valid_name(name), "{name:?} was accepted");
@@ -204,7 +253,19 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_model_is_answered_with_the_names_there_are() {
+    fn a_directory_with_an_invalid_name_is_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["my_model", "paper"] {
+            std::fs::create_dir(dir.path().join(name)).unwrap();
+            std::fs::write(dir.path().join(name).join(MANIFEST_FILE), "{}").unwrap();
+        }
+        std::fs::create_dir(dir.path().join("Pictures")).unwrap();
+        assert_eq!(misnamed(dir.path()).unwrap(), [dir.path().join("my_model")]);
+        assert_eq!(list(dir.path()).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn the_error_for_an_unknown_model_lists_the_existing_ones() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("paper")).unwrap();
         std::fs::write(dir.path().join("paper").join(MANIFEST_FILE), "{}").unwrap();

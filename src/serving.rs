@@ -1,10 +1,11 @@
-//! Predictions for many clients from one thread that alone computes with the models: [`Predictor`] is the cheap handle,
-//! [`batch`] says which waiting tasks are computed together, [`predict`] is the computation itself, and [`session`] what
-//! a stream of frames remembers from one to the next.
+//! Predictions for many clients. One thread owns the models and computes in batches. [`Predictor`] is the handle to it,
+//! [`batch`] chooses which waiting tasks are computed together, [`predict`] is the computation, and [`session`] is the
+//! state that a stream of frames keeps between frames.
 
 mod catalog;
 mod compute;
 mod input;
+mod local;
 mod meter;
 mod queue;
 mod task;
@@ -30,42 +31,46 @@ pub use input::{InputError, PredictionInput};
 use queue::{ModelLoad, Queue, QueuedTask};
 pub use session::{SessionMemory, SessionState};
 pub use task::{ConditioningInput, Task};
-pub(crate) use task::{RawConditioning, STEP};
+pub(crate) use task::{RawConditioning, STEP_FIELDS};
 
-/// A task of many futures takes that share of a batch, so that those who come meanwhile wait for less than a whole one.
+/// A task with many rollouts gets one part in this many of a batch at a time, so that other requests wait less.
 const PARTS_IN_A_BATCH: usize = 4;
 
-/// Why no prediction came.
+/// Why a prediction failed.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ServingError {
     /// No model of that name is loaded.
-    #[error("no model is named \"{name}\"; there are: {}", .known.join(", "))]
+    #[error("there is no model \"{name}\"; there are: {}", .available.join(", "))]
     UnknownModel {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The names there are.
-        known: Vec<String>,
+        /// The names of the loaded models.
+        available: Vec<String>,
     },
     /// The input does not fit the model.
     #[error(transparent)]
     Input(#[from] InputError),
-    /// As many requests wait as may.
-    #[error("{capacity} predictions wait already; try again in {retry_after_s} s")]
+    /// The queue is full.
+    #[error("{capacity} predictions are waiting already; try again in {retry_after_s} s")]
     QueueFull {
-        /// How many may wait.
+        /// How many predictions can wait.
         capacity: usize,
-        /// When to try again.
+        /// When to try again, in seconds.
         retry_after_s: u64,
     },
-    /// The request waited longer than it may.
+    /// The request waited longer than its limit.
     #[error("no prediction within {limit_ms} ms; the server is overloaded")]
     Deadline {
-        /// How long a request may take.
+        /// The time limit of a request, in milliseconds.
         limit_ms: u128,
     },
-    /// The predictor was told to stop, or its thread ended.
+    /// The predictor is stopping, or its thread has ended.
     #[error("the predictor has stopped")]
     Stopped,
+    /// The computation panicked. The thread was restarted.
+    #[error("the computation of the prediction panicked; the server's log says where")]
+    Panicked,
     /// The model's computation failed.
     #[error("model \"{model}\" could not be computed")]
     Model {
@@ -75,8 +80,8 @@ pub enum ServingError {
         #[source]
         source: Arc<NnError>,
     },
-    /// The model predicted what is no image.
-    #[error("model \"{model}\" predicted no image")]
+    /// The model's output is not an image.
+    #[error("the output of model \"{model}\" is not an image")]
     Frame {
         /// The model's name.
         model: String,
@@ -92,14 +97,15 @@ pub enum ServingError {
     Thread(#[source] std::io::Error),
 }
 
-/// The predictor's bounds.
+/// The predictor's limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PredictorConfig {
-    /// Requests that may wait, at least 1.
+    /// How many requests can wait, at least 1.
     pub queue_capacity: usize,
-    /// Futures predicted together at most, at least 1.
+    /// How many rollouts are predicted together at most, at least 1.
     pub batch_limit: usize,
-    /// How long a request may take from its arrival to its answer.
+    /// Time limit of a request, from its arrival to its answer.
     pub deadline: Duration,
 }
 
@@ -115,6 +121,7 @@ impl Default for PredictorConfig {
 
 /// Predicted frames and how long they took.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Prediction {
     /// The model's name.
     pub model: String,
@@ -128,13 +135,14 @@ pub struct Prediction {
     pub compute_us: u64,
 }
 
-/// What came of a [`Task`] and how long it took.
+/// The output of a [`Task`] and how long it took.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct TaskOutput {
-    /// Of the task's frames, in order.
+    /// The features of the task's frames, in order.
     pub features: Vec<Features>,
-    /// One for each of the task's premises, in order.
-    pub futures: Vec<Vec<Frame>>,
+    /// The predicted frames, one sequence for each conditioning input of the task, in order.
+    pub predictions: Vec<Vec<Frame>>,
     /// Microseconds in the queue.
     pub queue_us: u64,
     /// Microseconds of computation, of whole batches.
@@ -142,16 +150,16 @@ pub struct TaskOutput {
 }
 
 impl TaskOutput {
-    /// Adds what came of the next part.
+    /// Adds the output of the next part.
     fn append(&mut self, mut part: Self) {
         self.features.append(&mut part.features);
-        self.futures.append(&mut part.futures);
+        self.predictions.append(&mut part.predictions);
         self.queue_us += part.queue_us;
         self.compute_us += part.compute_us;
     }
 }
 
-/// The handle to the thread that owns the models; clones share it. The thread ends with the last of them.
+/// The handle to the thread that owns the models. Clones share the thread; it ends when the last clone is dropped.
 #[derive(Clone)]
 pub struct Predictor {
     shared: Arc<PredictorInner>,
@@ -172,11 +180,11 @@ impl Drop for PredictorInner {
 }
 
 impl Predictor {
-    /// Starts the thread, which first predicts once with every model so that no client waits for a cold one; meanwhile
-    /// requests queue. Errors: `Thread`.
+    /// Starts the thread. It first predicts once with every model, so that the first request does not pay for the warm-up;
+    /// requests wait in the queue until then. Errors: `Thread`.
     pub fn start(models: Vec<LoadedModel>, config: PredictorConfig) -> Result<Self, ServingError> {
         let queue = Arc::new(Queue::new(config.queue_capacity, config.batch_limit));
-        let catalog = Arc::new(Catalog::of(models));
+        let catalog = Arc::new(Catalog::new(models));
         let worker = worker::spawn(Arc::clone(&queue), Arc::clone(&catalog))?;
         Ok(Self {
             shared: Arc::new(PredictorInner {
@@ -189,7 +197,7 @@ impl Predictor {
         })
     }
 
-    /// Whether every model has made its first prediction.
+    /// Whether every model has made its first prediction and the last computations did not panic.
     #[must_use]
     pub fn is_ready(&self) -> bool {
         self.shared.catalog.is_ready()
@@ -202,24 +210,24 @@ impl Predictor {
         models.map(|model| Arc::clone(&model.manifest)).collect()
     }
 
-    /// The manifest of one model. Errors: `UnknownModel`, which names those there are.
+    /// The manifest of one model. Errors: `UnknownModel`.
     pub fn model(&self, name: &str) -> Result<Arc<Manifest>, ServingError> {
         Ok(Arc::clone(&self.active(name)?.manifest))
     }
 
-    /// The version that now has that name; whoever holds it can go on computing with it when another has taken its place.
-    /// Errors: `UnknownModel`, which names those there are.
+    /// The active version of a model. It stays usable for its holder after another version becomes active.
+    /// Errors: `UnknownModel`.
     pub fn active(&self, name: &str) -> Result<Arc<LoadedModel>, ServingError> {
         self.shared.catalog.find(name)
     }
 
-    /// Predicts the frames that follow. Dropping the future withdraws the request. Errors: `UnknownModel`, `Input`,
-    /// `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
+    /// Predicts the frames that follow the context. Dropping the returned future cancels the request.
+    /// Errors: `UnknownModel`, `Input`, `QueueFull`, `Deadline`, `Stopped`, and the errors of the computation.
     pub async fn predict(&self, model: &str, input: PredictionInput) -> Result<Prediction, ServingError> {
         self.predict_by(&self.active(model)?, input).await
     }
 
-    /// As [`Predictor::predict`], by that version of a model.
+    /// As [`Predictor::predict`], with this version of a model.
     pub async fn predict_by(
         &self,
         model: &Arc<LoadedModel>,
@@ -231,15 +239,15 @@ impl Predictor {
         Ok(Prediction {
             model: manifest.name.clone(),
             version: manifest.version,
-            frames: computed.futures.into_iter().next().unwrap_or_default(),
+            frames: computed.predictions.into_iter().next().unwrap_or_default(),
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
         })
     }
 
-    /// Computes a task, which is a step of that session if there is one: of a session, one step is in a batch. Many futures
-    /// are computed in parts, between which others have their turn. Dropping the future withdraws it.
-    /// Errors: `QueueFull`, `Deadline`, `Stopped`, and what the computation itself fails with.
+    /// Computes a task. If it is a step of a session, a batch holds at most one step of that session. Many rollouts are
+    /// computed in several parts, so that other requests run between them. Dropping the returned future cancels the task.
+    /// Errors: `QueueFull`, `Deadline`, `Stopped`, and the errors of the computation.
     pub async fn compute(
         &self,
         model: &Arc<LoadedModel>,
@@ -251,9 +259,9 @@ impl Predictor {
         loop {
             let part = task.next_part(self.shared.part_limit);
             let computed = self.compute_part(model, part, session, deadline).await?;
-            task.known.extend(computed.features.iter().cloned());
+            task.past_features.extend(computed.features.iter().cloned());
             whole.append(computed);
-            if task.premises.is_empty() {
+            if task.conditioning_inputs.is_empty() {
                 return Ok(whole);
             }
         }
@@ -278,27 +286,28 @@ impl Predictor {
         })?;
         match tokio::time::timeout_at(deadline.into(), answer).await {
             Ok(Ok(answer)) => answer,
-            Ok(Err(_)) => Err(ServingError::Stopped),
+            Ok(Err(_)) if self.shared.queue.is_closed() => Err(ServingError::Stopped),
+            Ok(Err(_)) => Err(ServingError::Panicked),
             Err(_) => Err(ServingError::Deadline {
                 limit_ms: self.shared.deadline.as_millis(),
             }),
         }
     }
 
-    /// Adds a model, or replaces the one of that name, once it has made its first prediction; blocks until then.
-    /// Errors: `Stopped`, or what that prediction fails with, and then the old one goes on serving.
+    /// Adds a model, or replaces the one of the same name, after it has made its first prediction. Blocks until then.
+    /// Errors: `Stopped`, or the error of that prediction; the old model then stays active.
     pub fn load(&self, model: LoadedModel) -> Result<(), ServingError> {
         let (reply, answer) = std::sync::mpsc::sync_channel(1);
         self.shared.queue.load(ModelLoad { model, reply })?;
         answer.recv().map_err(|_| ServingError::Stopped)?
     }
 
-    /// Takes no more requests, answers those that wait, and returns when the thread has ended; blocks.
+    /// Refuses new requests, answers the waiting ones, and returns when the thread has ended. Blocks.
     pub fn stop(&self) {
         self.shared.queue.close();
         let worker = self.shared.worker.lock().unwrap_or_else(PoisonError::into_inner).take();
         if let Some(worker) = worker {
-            // A panic of the worker has already been printed; there is nothing left to stop.
+            // A panic of the thread has already been logged.
             let _ = worker.join();
         }
     }

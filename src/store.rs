@@ -1,53 +1,73 @@
-//! Where state lives that outlasts the process: rows in a database ([`jobs`] with their [`accounts`], [`models`], [`keys`]),
-//! whole files in [`objects`]. `database` alone knows that there are two kinds of database; SQL is written nowhere but here.
+//! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`]) and files in [`objects`].
+//! Only `database` knows that there are two kinds of database. SQL is only in this module.
 
-pub mod accounts;
 mod database;
 pub mod jobs;
 pub mod keys;
 pub mod models;
 pub mod objects;
+pub mod reports;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
-pub use self::accounts::{JobUpdate, LogRow, LossRow};
+use serde::{Deserialize, Serialize};
+use tokio::sync::Mutex;
+
 use self::database::Database;
 pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
 pub use self::keys::KeyRow;
-pub use self::models::VersionRow;
+pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
+pub use self::reports::{JobReport, LogRow, LossRow};
 
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
+/// The time limit of a write check.
+const WRITE_CHECK_LIMIT: Duration = Duration::from_secs(2);
+/// How long a successful write check is valid.
+const WRITE_CHECK_INTERVAL: Duration = Duration::from_secs(1);
+/// The file in the data directory that says that API keys were created.
+const KEYS_MARKER: &str = "api-keys-created";
 
-/// Why state could not be read or written.
+/// Why the store could not be read or written.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum StoreError {
-    /// A URL of a kind that is not known. It is told without what may be secret in it.
-    #[error("{flag} starts with \"{scheme}\"; use {known}")]
+    /// A URL with an unknown scheme. The error shows only the scheme, because the rest can hold a password.
+    #[error("{flag} starts with \"{scheme}\"; use {expected}")]
     Url {
         /// `database` or `objects`.
         flag: &'static str,
-        /// What it starts with, up to the colon.
+        /// The scheme, up to the colon.
         scheme: String,
-        /// What it may be.
-        known: &'static str,
+        /// The supported forms.
+        expected: &'static str,
     },
     /// The database could not be reached or opened.
     #[error("could not open the {database} database: {source}")]
     Open {
         /// `SQLite` or `PostgreSQL`.
         database: &'static str,
-        /// Its reason.
+        /// The database's error.
         source: sqlx::Error,
     },
-    /// TLS is asked for and cannot be had.
+    /// The URL asks for TLS, but the program was built without it.
     #[error(
-        "database_url asks for TLS by its sslmode, which this program was built without; build it with --features cloud"
+        "the sslmode in database_url needs TLS, but this program was built without it; build it with --features cloud"
     )]
     NoTls,
-    /// The tables could not be brought to this program's form.
-    #[error("could not bring the database's tables to this version: {0}")]
+    /// The database file is damaged.
+    #[error("the database {} is damaged ({reason}); restore it from a backup", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What SQLite found.
+        reason: String,
+    },
+    /// The tables could not be migrated to this version of the program.
+    #[error("could not migrate the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
     /// A statement failed.
     #[error("the database failed: {0}")]
@@ -75,6 +95,17 @@ pub enum StoreError {
 }
 
 impl StoreError {
+    /// Whether the store cannot be reached or written now, for example because the disk is full, but may be later.
+    #[must_use]
+    pub fn is_unavailable(&self) -> bool {
+        match self {
+            Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
+            Self::Io { source, .. } => source.kind() == std::io::ErrorKind::StorageFull,
+            Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
+            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Migrate(_) => false,
+        }
+    }
+
     fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
@@ -82,37 +113,102 @@ impl StoreError {
 }
 
 /// Where state is kept.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StoreConfig {
-    /// The directory that holds the database's file and the objects, unless they are elsewhere.
+    /// The data directory. It holds the database file and the objects, unless they are configured elsewhere.
     pub data_dir: PathBuf,
-    /// `sqlite:FILE` or `postgres://…`; a file in the data directory where it is not given.
+    /// `sqlite:FILE` or `postgres://…`; a file in the data directory by default.
     pub database: Option<String>,
-    /// A directory or `s3://BUCKET/PREFIX`; the data directory where it is not given.
+    /// A directory or `s3://BUCKET/PREFIX`; the data directory by default.
     pub objects: Option<String>,
 }
 
-/// The open store; clones share its connections.
+impl StoreConfig {
+    /// Whether there is a store to open: one in the data directory, or one that is named.
+    #[must_use]
+    pub fn exists(&self) -> bool {
+        self.database.is_some() || self.data_dir.join(DATABASE_FILE).is_file()
+    }
+}
+
+/// The open store. Clones share its connections.
 #[derive(Clone)]
 pub struct Store {
     database: Database,
     objects: Objects,
+    /// When the database was written last by a check.
+    last_write_check: Arc<Mutex<Option<Instant>>>,
 }
 
 impl Store {
-    /// Opens it, makes what is not there yet, and brings the tables to this program's form. Must be called, and the store
-    /// used, within a tokio runtime. Errors: `Url`, `NoTls`, `Open`, `Migrate`, `Io`, `Object`.
+    /// Opens the store, creates what is missing, and migrates the tables. Needs a tokio runtime, now and later.
+    /// Errors: `Url`, `NoTls`, `Open`, `Damaged`, `Migrate`, `Io`, `Object`.
     pub async fn open(config: &StoreConfig) -> Result<Self, StoreError> {
+        Self::open_with(config, true).await
+    }
+
+    /// Opens a store that this program has opened before, without the check of its integrity. Errors: as [`Store::open`].
+    pub async fn open_existing(config: &StoreConfig) -> Result<Self, StoreError> {
+        Self::open_with(config, false).await
+    }
+
+    async fn open_with(config: &StoreConfig, is_first: bool) -> Result<Self, StoreError> {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;
         let database = match &config.database {
-            Some(url) => Database::open(url).await?,
-            None => Database::open_file(&data_dir.join(DATABASE_FILE)).await?,
+            Some(url) => Database::open(url, is_first).await?,
+            None => Database::open_file(&data_dir.join(DATABASE_FILE), is_first).await?,
         };
         Ok(Self {
             database,
             objects: Objects::open(data_dir, config.objects.as_deref())?,
+            last_write_check: Arc::default(),
         })
+    }
+
+    /// Checks that the database can be written, by a write at most once a second. Errors: `Query`.
+    pub async fn check_writable(&self) -> Result<(), StoreError> {
+        let mut last = self.last_write_check.lock().await;
+        if last.is_some_and(|last| last.elapsed() < WRITE_CHECK_INTERVAL) {
+            return Ok(());
+        }
+        let checked = tokio::time::timeout(WRITE_CHECK_LIMIT, self.write_nothing()).await;
+        checked.unwrap_or(Err(StoreError::Query(sqlx::Error::PoolTimedOut)))?;
+        *last = Some(Instant::now());
+        Ok(())
+    }
+
+    async fn write_nothing(&self) -> Result<(), StoreError> {
+        let mut tx = self.database.begin().await?;
+        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
+            .await?;
+        tx.commit().await
+    }
+
+    /// Closes all connections. With SQLite, `foreframe.db` alone is then complete. Errors: `Query`.
+    pub async fn close(&self) -> Result<(), StoreError> {
+        self.database.close().await
+    }
+
+    /// Whether API keys were ever created for this data directory. A marker file outside the database says so, so that a lost
+    /// or replaced database does not switch authentication off.
+    #[must_use]
+    pub fn keys_were_created(&self) -> bool {
+        self.keys_marker().exists()
+    }
+
+    fn keys_marker(&self) -> PathBuf {
+        self.objects.data_dir().join(KEYS_MARKER)
+    }
+
+    /// Writes the marker. Errors: `Io`.
+    fn mark_keys_created(&self) -> Result<(), StoreError> {
+        let marker = self.keys_marker();
+        if marker.exists() {
+            return Ok(());
+        }
+        let text = "API keys were created, so requests need one. To switch authentication off, delete this file and all keys.\n";
+        crate::files::write_atomically(&marker, text.as_bytes()).map_err(StoreError::io("write", &marker))
     }
 
     /// The files.
@@ -121,13 +217,13 @@ impl Store {
         &self.objects
     }
 
-    /// Answers when the database does. Errors: `Query`.
+    /// Checks that the database answers. Errors: `Query`.
     pub async fn ping(&self) -> Result<(), StoreError> {
         self.database.fetch("SELECT 1", vec![]).await.map(drop)
     }
 }
 
-/// The time as the store keeps it: seconds since 1970.
+/// The time in the store's unit: seconds since 1970.
 #[must_use]
 pub fn unix_s() -> f64 {
     let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);

@@ -1,55 +1,61 @@
-//! What the program says of itself: logs to standard error, `info` and above unless `RUST_LOG` says otherwise; metrics by
-//! [`names`], recorded from [`record`] on and given to Prometheus by [`render`]; with the feature `otlp`, traces.
+//! Logs, metrics and traces. Logs go to standard error, at level `info` and above unless `RUST_LOG` sets another level.
+//! Metrics have the [`names`] listed there; [`install_recorder`] starts to record them and [`render`] writes them for
+//! Prometheus. With the feature `otlp`, spans are sent as traces.
 
 pub mod names;
 
 #[cfg(feature = "otlp")]
 mod otlp;
+#[cfg(feature = "server")]
 mod prometheus;
 
-use std::io::IsTerminal as _;
-
 use serde::{Deserialize, Serialize};
-use tracing_subscriber::layer::SubscriberExt as _;
-use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{EnvFilter, Layer as _, fmt};
 
-pub use prometheus::{fold, record, render};
+#[cfg(feature = "server")]
+pub use prometheus::{install_recorder, render, run_upkeep};
 
-/// How log lines look.
+/// Format of log lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// For people.
+    /// Text for people.
     #[default]
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
 /// Why traces cannot be sent.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TelemetryError {
-    /// The program cannot send traces.
-    #[error("otlp_endpoint is set, and this program was built without the feature otlp; build it with --features otlp")]
+    /// The program was built without the feature `otlp`.
+    #[error("otlp_endpoint is set, but this program was built without the feature otlp; build it with --features otlp")]
     NoOtlp,
-    /// The exporter could not be made.
-    #[error("otlp_endpoint: {0}")]
+    /// The exporter could not be created.
+    #[error("could not create the exporter for otlp_endpoint: {0}")]
     Otlp(String),
 }
 
-/// Sends the traces that wait when it is dropped.
+/// When it is dropped, it sends the traces that are still in memory.
 #[must_use]
 pub struct Telemetry {
     #[cfg(feature = "otlp")]
     _traces: Option<otlp::Traces>,
 }
 
-/// Installs the subscriber for the process; a second call changes nothing. Spans go to `otlp_endpoint`, for example
-/// `http://127.0.0.1:4318`, if one is given. Errors: `NoOtlp`, `Otlp`.
+/// Installs the log subscriber of the process; a second call changes nothing. If `otlp_endpoint` is given, for example
+/// `http://127.0.0.1:4318`, spans are sent there. Errors: `NoOtlp`, `Otlp`.
+#[cfg(feature = "server")]
 pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry, TelemetryError> {
+    use std::io::IsTerminal as _;
+
+    use tracing_subscriber::layer::SubscriberExt as _;
+    use tracing_subscriber::util::SubscriberInitExt as _;
+    use tracing_subscriber::{EnvFilter, Layer as _, fmt};
+
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    // Colours are for people, not for files.
+    // Use colours only in a terminal, not in files.
     let lines = fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
@@ -60,8 +66,8 @@ pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry,
     let registry = tracing_subscriber::registry().with(lines).with(filter);
     #[cfg(feature = "otlp")]
     {
-        let traces = otlp_endpoint.map(otlp::Traces::to).transpose()?;
-        // Only fails if one is installed already, as in tests.
+        let traces = otlp_endpoint.map(otlp::Traces::new).transpose()?;
+        // This fails only if a subscriber is already installed, as in tests.
         let _ = registry.with(traces.as_ref().map(otlp::Traces::layer)).try_init();
         Ok(Telemetry { _traces: traces })
     }

@@ -1,6 +1,6 @@
-//! From windows to weights. [`run`] goes through two stages — `pretrain` teaches the dense codec single frames, `fit`
-//! the recurrent network their order — each a loop of `stage`; `checkpoint` lets either be stopped at any step and gone
-//! on with to the same bits.
+//! Training. [`run`] has two stages: `pretrain` trains the dense codec on single frames, `fit` trains the recurrent network
+//! on windows. Both use the loop in `stage`. With `checkpoint`, a training can be stopped at any step and resumed; the
+//! result has the same bits as an uninterrupted training.
 
 mod batches;
 mod checkpoint;
@@ -10,7 +10,7 @@ pub mod observer;
 pub mod optimizer;
 mod preset;
 mod pretrain;
-mod principal;
+mod principal_components;
 mod stage;
 
 use std::path::{Path, PathBuf};
@@ -18,6 +18,8 @@ use std::sync::atomic::AtomicBool;
 
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
+#[cfg(test)]
+pub(crate) use self::checkpoint::{hash_entry, seal};
 use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
@@ -30,28 +32,29 @@ use crate::frame::FrameError;
 use crate::nn::{ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError};
 
-/// Frames that the principal components are taken from, at most.
+/// Largest number of frames from which the principal components are computed.
 const MAX_PRINCIPAL_FRAMES: usize = 8192;
 
-/// Why a training did not start or stopped.
+/// Why a training could not start or stopped.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum TrainError {
-    /// There is no preset of that name.
+    /// No preset has this name.
     #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]
     UnknownPreset(String),
-    /// A setting is misspelt or out of range.
+    /// A setting is unknown or out of range.
     #[error("{0}")]
     Config(String),
-    /// The directory holds something else.
-    #[error("{dir} exists and holds no training run; name a new directory", dir = .0.display())]
+    /// The directory contains something else.
+    #[error("{dir} exists and holds no training run; use a new directory", dir = .0.display())]
     NotARun(PathBuf),
-    /// Another training writes there.
-    #[error("another training is running in {}; wait for it or name another directory", .0.display())]
+    /// Another training is writing to the directory.
+    #[error("another training is running in {}; wait until it ends or use another directory", .0.display())]
     Busy(PathBuf),
-    /// The directory holds a run with other settings or data.
+    /// The directory holds a run with another configuration or data set.
     #[error(
-        "{} holds a run with another {what}; go on with that one's ({}/config.toml), or name a new directory",
-        run_dir.display(), run_dir.display()
+        "{} holds a run with another {what}; use the {what} of that run to resume it, or use a new directory",
+        run_dir.display()
     )]
     OtherRun {
         /// The run's directory.
@@ -59,26 +62,33 @@ pub enum TrainError {
         /// `configuration` or `data set`.
         what: &'static str,
     },
-    /// No window is left to choose the best weights by.
-    #[error("the validation split holds no window of {frames} frames; collect more trials, 40 or more")]
-    NoValidation {
+    /// The training split or the validation split has no window.
+    #[error(
+        "the data set has {train} training windows and {validation} validation windows of {frames} frames; training needs \
+         at least 1 of each: collect 40 trials or more"
+    )]
+    NoWindows {
+        /// Windows of the training split.
+        train: usize,
+        /// Windows of the validation split.
+        validation: usize,
         /// Frames of a window.
         frames: usize,
     },
-    /// The loss or a gradient became NaN or infinite, or the loss absurdly large.
+    /// The loss or a gradient became NaN or infinite, or the loss became very large.
     #[error(
-        "training diverged in {stage} at step {step}: {what}; the checkpoint of step {kept} is kept; \
-         try a lower learning rate"
+        "training diverged in {stage} at step {step}: {what}; the last checkpoint is from step {checkpoint_step}; \
+         use a lower learning rate"
     )]
     Diverged {
-        /// Where.
+        /// The stage.
         stage: TrainingStage,
-        /// The update that would have been made.
+        /// The update that failed.
         step: usize,
-        /// What the loss or the gradient is.
+        /// The value of the loss or the gradient.
         what: String,
-        /// The step of the last good checkpoint.
-        kept: usize,
+        /// The step of the last checkpoint.
+        checkpoint_step: usize,
     },
     /// A file of the run could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
@@ -91,17 +101,17 @@ pub enum TrainError {
         source: std::io::Error,
     },
     /// The checkpoint is damaged.
-    #[error("the checkpoint {} cannot be gone on from ({reason}); delete it to start anew", path.display())]
+    #[error("cannot resume from the checkpoint {}: {reason}; delete it to start again", path.display())]
     Checkpoint {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
-    /// The data set does not serve.
+    /// The data set cannot be used.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// A frame does not serve.
+    /// A frame is invalid.
     #[error(transparent)]
     Frame(#[from] FrameError),
     /// The network refused its input.
@@ -124,36 +134,36 @@ impl From<candle_core::Error> for TrainError {
 /// How a training ended.
 #[derive(Debug)]
 pub enum TrainingOutcome {
-    /// The model stands in `model_dir`.
+    /// The training is complete and the model is published in `model_dir`.
     Finished {
-        /// Where.
+        /// The model's directory.
         model_dir: PathBuf,
-        /// What it says of itself.
+        /// The model's manifest.
         manifest: Box<Manifest>,
     },
-    /// It was asked to stop; the same call goes on from there.
+    /// The training was cancelled. The same call resumes it.
     Interrupted {
-        /// Where it stopped.
+        /// The stage in which it stopped.
         stage: TrainingStage,
         /// Updates made in that stage.
         step: usize,
     },
 }
 
-/// What is trained, on what, and where the run is kept.
+/// The inputs of a training.
 pub struct Training<'a> {
-    /// All settings.
+    /// The configuration.
     pub config: &'a TrainConfig,
-    /// The data.
+    /// The data set.
     pub dataset: &'a Dataset,
-    /// Holds `config.toml`, `checkpoint.safetensors`, `history.json` and at the end `model/`.
+    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, and at the end `history.json` and `model/`.
     pub run_dir: &'a Path,
-    /// The command line that the manifest tells.
+    /// The command line, for the manifest.
     pub command: &'a str,
 }
 
-/// Trains, or goes on where the run in `run_dir` was stopped, until done or cancelled. A run that was stopped and gone on
-/// with ends in the same bits as one that never was. Errors: any of [`TrainError`]; what was checkpointed stays.
+/// Starts a training, or resumes the run in `run_dir`, until it is complete or cancelled. A resumed run ends with the same
+/// bits as an uninterrupted one. Errors: any of [`TrainError`]; the last checkpoint stays on disk.
 pub fn run(
     training: &Training<'_>,
     observer: &mut dyn Observer,
@@ -162,20 +172,28 @@ pub fn run(
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
     let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
-    // Before the directory is made, so that what is refused here leaves nothing in the way of the next try.
+    // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
-    let _lock = files.claim()?;
+    let _lock = files.lock()?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(TrainingOutcome::Finished { model_dir, manifest });
     }
-    let mut state = match Checkpoint::load(&files, &plan.spec, &config.run)? {
+    let mut state = match Checkpoint::load_latest(&files, (&plan.spec, &config.run), observer)? {
         Some(checkpoint) => checkpoint.into_state(),
-        None => TrainState::new(initial_parameters(&plan, config)?, &config.run)?,
+        None => match initial_parameters(&plan, config, cancelled)? {
+            Some(parameters) => TrainState::new(parameters, &config.run)?,
+            None => {
+                return Ok(TrainingOutcome::Interrupted {
+                    stage: TrainingStage::Pretrain,
+                    step: 0,
+                });
+            }
+        },
     };
     for point in &state.history {
-        observer.on_event(TrainingEvent::Recalled {
+        observer.on_event(TrainingEvent::Restored {
             stage: point.stage,
             step: point.step,
             train_loss: point.train_loss,
@@ -200,7 +218,7 @@ pub fn run(
                 step: state.step,
             });
         }
-        state.enter(TrainingStage::Fit, &config.run)?;
+        state.start_stage(TrainingStage::Fit, &config.run)?;
         runner.save(&state, observer)?;
     }
     let sequence = fit::SequenceObjective::new(&plan, config);
@@ -217,22 +235,30 @@ pub fn run(
     Ok(TrainingOutcome::Finished { model_dir, manifest })
 }
 
-fn initial_parameters(plan: &TrainingPlan<'_>, config: &TrainConfig) -> Result<Parameters, TrainError> {
+/// The weights to start from; `None` if cancelled.
+fn initial_parameters(
+    plan: &TrainingPlan<'_>,
+    config: &TrainConfig,
+    cancelled: &AtomicBool,
+) -> Result<Option<Parameters>, TrainError> {
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if config.pretrain.start == CodecStart::Principal {
         let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
         let stride = frames.len().div_ceil(MAX_PRINCIPAL_FRAMES).max(1);
         let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
-        let (read, written) = (plan.source.frames(&frames)?, plan.source.targets(&frames)?);
-        principal::set_codec(&parameters, &read, &written, config.seed.derive("principal", 0))?;
+        let (inputs, targets) = (plan.source.inputs(&frames)?, plan.source.targets(&frames)?);
+        let seed = config.seed.derive("principal", 0);
+        if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
+            return Ok(None);
+        }
     }
-    Ok(parameters)
+    Ok(Some(parameters))
 }
 
 fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
     let path = files.history();
     let text = serde_json::to_vec(&state.history)
-        .map_err(|error| TrainError::Config(format!("the history is not writable as JSON: {error}")))?;
+        .map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
     write_atomically(&path, &text).map_err(|source| TrainError::Io {
         action: "write",
         path,
@@ -240,7 +266,7 @@ fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError>
     })
 }
 
-/// What is decided before the first step: the windows and the model's description.
+/// What is fixed before the first step: the windows and the model specification.
 struct TrainingPlan<'a> {
     source: FrameSource<'a>,
     spec: ModelSpec,
@@ -252,16 +278,21 @@ impl<'a> TrainingPlan<'a> {
     fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
         let shape = config.window_shape();
         let splits = Splits::new(dataset, config.data.split_seed);
+        let available = splits.windows(dataset, Split::Train, shape, 1)?;
+        let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
+        if available.is_empty() || validation.is_empty() {
+            return Err(TrainError::NoWindows {
+                train: available.len(),
+                validation: validation.len(),
+                frames: shape.frames(),
+            });
+        }
         let train = match config.data.windows {
             WindowBudget::Count(count) => {
                 splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
             }
-            WindowBudget::All(_) => splits.windows(dataset, Split::Train, shape, 1)?,
+            WindowBudget::All(_) => available,
         };
-        let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
-        if validation.is_empty() {
-            return Err(TrainError::NoValidation { frames: shape.frames() });
-        }
         let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
         let validation = validation.into_iter().step_by(stride).collect();
         let frames = window_frames(&train, shape.context + shape.horizon);
@@ -303,7 +334,7 @@ impl<'a> TrainingPlan<'a> {
     }
 }
 
-/// The distinct frames that windows of `length` frames cover, in order.
+/// The distinct frames of windows of `length` frames, in increasing order.
 fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
     let mut frames: Vec<usize> = windows
         .iter()

@@ -1,4 +1,4 @@
-//! Values that every module speaks of: seeds, horizons, actions and states, validated once when they are made.
+//! Values that every module uses: seeds, actions, states and channels. They are validated once, when they are made.
 
 use std::fmt;
 
@@ -6,8 +6,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Why a value of this module was refused.
+/// Why a value was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[non_exhaustive]
 pub enum ValueError {
     /// An action or state held NaN, an infinity, or a number beyond [`MAX_MAGNITUDE`].
     #[error("{kind} component {index} is {value}; every component must be a number from -1e30 to 1e30")]
@@ -21,18 +22,18 @@ pub enum ValueError {
     },
 }
 
-/// The greatest magnitude of a component of an action or a state: scaled to a network's range and weighted, it stays
-/// finite, so that no value brings a prediction to NaN.
+/// The greatest magnitude of a component of an action or a state. It stays finite when it is scaled and weighted in a
+/// network, so that no accepted value makes a prediction NaN.
 pub const MAX_MAGNITUDE: f32 = 1e30;
 
-/// The origin of all randomness in one run: the same seed gives the same bytes on the same machine.
+/// The start of all random numbers of one run: the same seed gives the same bytes on the same machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Seed(pub u64);
 
 impl Seed {
-    /// A seed of its own for item `index` of the named stream, so that no two uses share random numbers
-    /// and an item can be made without making those before it.
+    /// A separate seed for item `index` of the named stream. So no two uses share random numbers, and an item can be
+    /// made without the items before it.
     #[must_use]
     pub fn derive(self, stream: &str, index: u64) -> Self {
         let named = stream
@@ -48,7 +49,7 @@ impl Seed {
     }
 }
 
-/// SplitMix64's output function (Steele, Lea & Flood 2014): every input bit reaches every output bit.
+/// SplitMix64's output function (Steele, Lea & Flood 2014): every input bit changes every output bit.
 fn mix(value: u64) -> u64 {
     let z = value.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -64,7 +65,7 @@ macro_rules! finite_vector {
         pub struct $name(Vec<f32>);
 
         impl $name {
-            /// The components in the order that the model's or the data set's description names.
+            /// The components, in the order of the channels of the model or the data set.
             #[must_use]
             pub fn as_slice(&self) -> &[f32] {
                 &self.0
@@ -75,9 +76,9 @@ macro_rules! finite_vector {
             type Error = ValueError;
 
             fn try_from(values: Vec<f32>) -> Result<Self, ValueError> {
-                // NaN is in no range.
-                let is_sound = |value: &f32| (-MAX_MAGNITUDE..=MAX_MAGNITUDE).contains(value);
-                match values.iter().position(|value| !is_sound(value)) {
+                // A range never contains NaN.
+                let is_in_range = |value: &f32| (-MAX_MAGNITUDE..=MAX_MAGNITUDE).contains(value);
+                match values.iter().position(|value| !is_in_range(value)) {
                     Some(index) => Err(ValueError::OutOfRange { kind: $kind, index, value: values[index] }),
                     None => Ok(Self(values)),
                 }
@@ -93,18 +94,21 @@ macro_rules! finite_vector {
 }
 
 finite_vector!(
-    /// What the robot was told to do from one frame to the next: numbers up to [`MAX_MAGNITUDE`], in the order and units of [`Channel`]s.
+    /// The command that acts from one frame to the next: numbers up to [`MAX_MAGNITUDE`], in the order and units of the
+    /// [`Channel`]s.
     Action,
     "action"
 );
 finite_vector!(
-    /// What the robot says of itself when a frame is taken: numbers up to [`MAX_MAGNITUDE`], in the order and units of [`Channel`]s.
+    /// What the robot measures about itself when a frame is taken: numbers up to [`MAX_MAGNITUDE`], in the order and
+    /// units of the [`Channel`]s.
     RobotState,
     "state"
 );
 
 /// Name and unit of one component of an action or a state.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Channel {
     /// What the component is, for example `linear`.
@@ -114,7 +118,7 @@ pub struct Channel {
 }
 
 impl Channel {
-    /// A channel of that name and unit.
+    /// A channel with this name and unit.
     #[must_use]
     pub fn new(name: &str, unit: &str) -> Self {
         Self {
@@ -136,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn derived_seeds_differ_by_stream_and_by_index() {
+    fn derived_seeds_differ_by_stream_and_index() {
         let seed = Seed(7);
         assert_ne!(seed.derive("trial", 0), seed.derive("trial", 1));
         assert_ne!(seed.derive("trial", 0), seed.derive("noise", 0));
@@ -144,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn an_action_with_nan_is_refused_with_its_place() {
+    fn an_action_with_nan_is_refused_with_its_position() {
         let error = Action::try_from(vec![0.0, f32::NAN]).unwrap_err();
         assert!(error.to_string().starts_with("action component 1 is NaN"));
         assert!(Action::try_from(vec![f32::MAX]).is_err() && Action::try_from(vec![-1e30]).is_ok());

@@ -1,5 +1,7 @@
-//! The versions of the models: those shipped in a directory of their own, and those that trainings published, below
-//! `models/NAME/VERSION` of the data directory. The store says which were published and which one serves.
+//! The versions of the models: shipped ones in the models' directory, and those that trainings published, in
+//! `models/NAME/VERSION` below the data directory. The store knows which versions are published and which are active.
+
+mod publish;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -9,27 +11,31 @@ use metrics::counter;
 use tokio::sync::Mutex;
 use tracing::{info, warn};
 
+use crate::error_text;
 use crate::files::write_atomically;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
 use crate::store::{Lease, Store, StoreError, unix_s};
 use crate::telemetry::names;
-use crate::wording;
 
-/// Why a version could not be loaded, published, chosen or deleted.
+/// Why a version could not be loaded, published, activated or deleted.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum VersionError {
     /// There is no such model or version.
-    #[error("there is no version {version} of model \"{model}\"; there are: {}", numbers(known))]
+    #[error(
+        "there is no version {version} of model \"{model}\"; there are: {}",
+        numbers(available)
+    )]
     Unknown {
         /// The model's name.
         model: String,
-        /// The version asked for.
+        /// The requested version.
         version: u32,
-        /// The versions there are.
-        known: Vec<u32>,
+        /// The existing versions.
+        available: Vec<u32>,
     },
-    /// It serves.
+    /// It is active.
     #[error("version {version} of model \"{model}\" is active; activate another before deleting it")]
     Active {
         /// The model's name.
@@ -37,15 +43,17 @@ pub enum VersionError {
         /// The version.
         version: u32,
     },
-    /// It belongs to the models that came with the program.
-    #[error("version {version} of model \"{model}\" was shipped, not published by a job; it is not deleted from here")]
+    /// It is a shipped version.
+    #[error(
+        "version {version} of model \"{model}\" was not published: it lies in the models directory; delete its directory there"
+    )]
     Shipped {
         /// The model's name.
         model: String,
         /// The version.
         version: u32,
     },
-    /// Its files are not what they should be; what served before goes on.
+    /// Its files are not valid. The active version stays active.
     #[error("version {version} of model \"{model}\" is refused: {reason}")]
     Refused {
         /// The model's name.
@@ -76,16 +84,16 @@ pub enum VersionError {
     Serving(ServingError),
 }
 
-fn numbers(known: &[u32]) -> String {
-    let known: Vec<String> = known.iter().map(u32::to_string).collect();
-    if known.is_empty() {
+fn numbers(available: &[u32]) -> String {
+    let available: Vec<String> = available.iter().map(u32::to_string).collect();
+    if available.is_empty() {
         "none".to_owned()
     } else {
-        known.join(", ")
+        available.join(", ")
     }
 }
 
-/// The versions that there are; clones share them.
+/// All versions of all models. Clones share their state.
 #[derive(Clone)]
 pub struct Versions {
     store: Store,
@@ -95,7 +103,7 @@ pub struct Versions {
 }
 
 impl Versions {
-    /// Those of the store, beside the models shipped in a directory.
+    /// The versions in the store and the models shipped in a directory.
     #[must_use]
     pub fn new(store: Store, shipped_dir: &Path) -> Self {
         Self {
@@ -105,14 +113,14 @@ impl Versions {
         }
     }
 
-    /// The shipped version of a model, if it was shipped.
+    /// The shipped version of a model, if there is one.
     #[must_use]
     pub fn shipped(&self, model: &str) -> Option<u32> {
         let dir = registry::find(&self.shipped_dir, model).ok()?;
         registry::manifest::read(&dir).ok().map(|manifest| manifest.version)
     }
 
-    /// Every version by model, in rising order. Errors: `Registry`, `Store`.
+    /// All versions by model, in rising order. Errors: `Registry`, `Store`.
     pub async fn all(&self) -> Result<BTreeMap<String, Vec<u32>>, VersionError> {
         let mut all = BTreeMap::<String, BTreeSet<u32>>::new();
         for (model, _) in registry::list(&self.shipped_dir)? {
@@ -130,21 +138,36 @@ impl Versions {
         Ok(self.all().await?.remove(model).unwrap_or_default())
     }
 
-    /// Every model that is to serve, loaded: the version chosen, or else the best there is. One that is refused is logged.
-    /// Errors: `Registry`, `Store`.
-    pub async fn serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
+    /// The metrics of a model: the latest that an evaluation job measured with these weights, else those of the manifest.
+    /// Errors: `Store`.
+    pub async fn metrics(&self, manifest: &Manifest) -> Result<serde_json::Value, VersionError> {
+        let measured = self.store.model_metrics().await?.into_iter().find(|measured| {
+            (measured.model.as_str(), measured.version) == (manifest.name.as_str(), manifest.version)
+                && measured.weights_sha256 == manifest.weights_sha256
+        });
+        let parsed = measured.and_then(|measured| serde_json::from_str(&measured.metrics).ok());
+        Ok(parsed.unwrap_or_else(|| manifest.metrics.clone()))
+    }
+
+    /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions
+    /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
+    pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
         let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
+        for path in registry::misnamed(&self.shipped_dir)? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            warn!(directory = %path.display(), error = %RegistryError::Name(name), "a model is not loaded");
+        }
         let mut serving = Vec::new();
         for (model, mut versions) in self.all().await? {
-            // The newest first, but before them the shipped one, and before all the one that was chosen.
             if versions.is_empty() {
-                warn!(model, "its manifest cannot be read");
+                warn!(model, "the model's manifest cannot be read");
             }
+            // The active one, then the shipped one, then the newest.
             versions.reverse();
             let shipped = self.shipped(&model);
             versions.sort_by_key(|&version| (active.get(&model) != Some(&version), shipped != Some(version)));
             for version in versions {
-                match counted(self.load(&model, version).await) {
+                match count_load(self.load(&model, version).await) {
                     Ok(loaded) => {
                         serving.push(loaded);
                         break;
@@ -156,21 +179,13 @@ impl Versions {
         Ok(serving)
     }
 
-    /// Loads the version that serves, or else the one that would. Errors: `Unknown`, `Refused`, `Store`.
+    /// Loads the active version, else the shipped one, else the newest. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn load_active(&self, model: &str) -> Result<LoadedModel, VersionError> {
-        let active = self.store.active_versions().await?;
-        let chosen = active
-            .into_iter()
-            .find(|(name, _)| name == model)
-            .map(|(_, version)| version);
-        let version = match chosen.or_else(|| self.shipped(model)) {
-            Some(version) => version,
-            None => self.of(model).await?.last().copied().unwrap_or_default(),
-        };
+        let version = self.active(model).await?.unwrap_or_default();
         self.load(model, version).await
     }
 
-    /// Loads a version, fetched into the data directory if need be, after checking hash and shapes.
+    /// Loads a version after checking its hash and shapes. Fetches it into the data directory if necessary.
     /// Errors: `Unknown`, `Refused`, `Store`.
     pub async fn load(&self, model: &str, version: u32) -> Result<LoadedModel, VersionError> {
         let dir = self.directory(model, version).await?;
@@ -179,28 +194,31 @@ impl Versions {
             version,
             reason,
         };
-        let loaded = tokio::task::spawn_blocking(move || registry::load(&dir)).await;
+        let name = model.to_owned();
+        let is_shipped = self.shipped(model) == Some(version);
+        // The name of a shipped model is that of its directory.
+        let load = move || if is_shipped { registry::load_as(&dir, &name) } else { registry::load(&dir) };
+        let loaded = tokio::task::spawn_blocking(load).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
-            .map_err(|error| refused(wording::sentence(&error)))?;
+            .map_err(|error| refused(error_text::with_causes(&error)))?;
         let Manifest {
             name, version: found, ..
         } = &*loaded.manifest;
         if (name.as_str(), *found) != (model, version) {
-            return Err(refused(format!(
-                "its manifest says that it is version {found} of \"{name}\""
-            )));
+            return Err(refused(format!("its manifest is of version {found} of \"{name}\"")));
         }
         Ok(loaded)
     }
 
-    async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
-        let known = self.of(model).await?;
-        if !known.contains(&version) {
+    /// The directory of a version, fetched into the data directory if it is not there. Errors: `Unknown`, `Store`.
+    pub async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
+        let available = self.of(model).await?;
+        if !available.contains(&version) {
             return Err(VersionError::Unknown {
                 model: model.to_owned(),
                 version,
-                known,
+                available,
             });
         }
         if self.shipped(model) == Some(version) {
@@ -214,9 +232,8 @@ impl Versions {
         Ok(dir)
     }
 
-    /// Writes a trained model as the version of its name that is its job's, and returns the version and whether it is the
-    /// first of its name; it counts once the job's end is written. `None` if the lease is lost.
-    /// Errors: `Registry`, `Io`, `Store`.
+    /// Writes a trained model as its job's version. Returns the version and whether the model was not shipped. The version is
+    /// published when the job's outcome is written. `None` if the lease is lost. Errors: `Registry`, `Io`, `Store`.
     pub async fn write(
         &self,
         lease: Lease,
@@ -226,6 +243,23 @@ impl Versions {
         let shipped = self.shipped(model);
         let reserved = self.store.reserve_version(lease, model, shipped.unwrap_or(0)).await?;
         let Some(version) = reserved else { return Ok(None) };
+        self.write_files(model, version, trained_dir).await?;
+        Ok(Some((version, shipped.is_none())))
+    }
+
+    /// The version that serves, or else the one that would: the chosen one, the shipped one, the newest.
+    /// Errors: `Registry`, `Store`.
+    pub async fn active(&self, model: &str) -> Result<Option<u32>, VersionError> {
+        let active = self.store.active_versions().await?;
+        let chosen = active.into_iter().find(|(name, _)| name == model);
+        match chosen.map(|(_, version)| version).or_else(|| self.shipped(model)) {
+            Some(version) => Ok(Some(version)),
+            None => Ok(self.of(model).await?.last().copied()),
+        }
+    }
+
+    /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Io`, `Store`.
+    async fn write_files(&self, model: &str, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
         let objects = self.store.objects();
         let dir = objects.data_dir().join(key(model, version));
         let failed = |action, path: &Path| {
@@ -246,16 +280,15 @@ impl Versions {
         };
         registry::write_manifest(&dir, &manifest)?;
         registry::load(&dir)?;
-        objects.push(&key(model, version), registry::MANIFEST_FILE).await?;
-        Ok(Some((version, shipped.is_none())))
+        Ok(objects.push(&key(model, version), registry::MANIFEST_FILE).await?)
     }
 
-    /// Has a version serve, here at once and on other servers of the store soon, and after a restart. Streams that run keep
-    /// theirs. One that is refused changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
+    /// Makes a version active: here at once, on other servers of the store soon, and after a restart. Open streams keep
+    /// their version. A refused version changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
     pub async fn activate(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         let before = predictor.model(model).map(|manifest| manifest.version);
-        counted(self.load_model(predictor, model, version).await)?;
+        count_load(self.load_model(predictor, model, version).await)?;
         if let Err(error) = self.store.set_active(model, version, unix_s()).await {
             if let Ok(before) = before {
                 self.load_model(predictor, model, before).await?;
@@ -269,13 +302,13 @@ impl Versions {
     /// Deletes a published version. Errors: `Unknown`, `Active`, `Shipped`, `Store`.
     pub async fn delete(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
-        let (model_name, known) = (model.to_owned(), self.of(model).await?);
+        let (model_name, available) = (model.to_owned(), self.of(model).await?);
         let serves = predictor.model(model).is_ok_and(|manifest| manifest.version == version);
-        if !known.contains(&version) {
+        if !available.contains(&version) {
             return Err(VersionError::Unknown {
                 model: model_name,
                 version,
-                known,
+                available,
             });
         }
         if self.shipped(model) == Some(version) {
@@ -294,9 +327,9 @@ impl Versions {
         Ok(())
     }
 
-    /// Loads what was chosen since, here or by another server. What is refused is logged and put into `refused`, so as not
-    /// to be tried again and again; what could not be looked at is tried again the next time. Errors: `Registry`, `Store`.
-    pub async fn follow(
+    /// Loads versions that other servers activated. A refused version is logged and added to `refused`, so that it is not
+    /// tried again; a version that could not be read is tried again at the next call. Errors: `Registry`, `Store`.
+    pub async fn load_activated(
         &self,
         predictor: &Predictor,
         refused: &mut BTreeSet<(String, u32)>,
@@ -309,7 +342,7 @@ impl Versions {
             if serves || refused.contains(&(model.clone(), version)) {
                 continue;
             }
-            match counted(self.load_model(predictor, &model, version).await) {
+            match count_load(self.load_model(predictor, &model, version).await) {
                 Ok(()) => info!(model, version, "version loaded"),
                 Err(error) => {
                     warn!(model, version, %error, "a version was not loaded");
@@ -322,18 +355,18 @@ impl Versions {
         Ok(())
     }
 
-    /// Has the predictor answer with a version.
+    /// Loads a version into the predictor.
     async fn load_model(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
         let loaded = self.load(model, version).await?;
         let predictor = predictor.clone();
-        let taken = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
-        match taken.unwrap_or(Err(ServingError::Stopped)) {
+        let result = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
+        match result.unwrap_or(Err(ServingError::Stopped)) {
             Ok(()) => Ok(()),
             Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
             Err(error) => Err(VersionError::Refused {
                 model: model.to_owned(),
                 version,
-                reason: wording::sentence(&error),
+                reason: error_text::with_causes(&error),
             }),
         }
     }
@@ -343,13 +376,13 @@ fn key(model: &str, version: u32) -> String {
     format!("models/{model}/{version}")
 }
 
-/// Counts a version that was to serve, unless it had nothing to do with the version that it does not.
-fn counted<T>(taken: Result<T, VersionError>) -> Result<T, VersionError> {
-    let outcome = match &taken {
+/// Counts the load of a version, unless it failed for a reason outside the version.
+fn count_load<T>(loaded: Result<T, VersionError>) -> Result<T, VersionError> {
+    let outcome = match &loaded {
         Ok(_) => "ok",
         Err(VersionError::Refused { .. }) => "refused",
-        Err(_) => return taken,
+        Err(_) => return loaded,
     };
     counter!(names::MODEL_LOADS, "outcome" => outcome).increment(1);
-    taken
+    loaded
 }

@@ -1,4 +1,4 @@
-//! Sessions and requests that come and go.
+//! Many short sessions and requests, to find leaks.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -10,136 +10,136 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, OnLate, ServerMes
 use futures_util::SinkExt as _;
 use tokio::task::JoinSet;
 
-use crate::figures::Bounds;
 use crate::http::{Http, Request};
-use crate::material::{self, Material};
-use crate::process::Taken;
+use crate::process_usage::Usage;
+use crate::report::Bounds;
 use crate::server::{Server, Target};
 use crate::session::{self, Session};
+use crate::workload::{self, Workload};
 
-/// Parts of the load, after each of which memory is told.
+/// Number of parts of the load; memory is printed after each.
 const PARTS: u64 = 5;
-/// What comes before it counts is a tenth, at most so many sessions; of requests ten times that.
-const MOST_WARM_UP: u64 = 1000;
-/// How long the server may take to notice that connections ended, and to let idle threads go.
+/// The warm-up is a tenth of the load, at most this many sessions, and ten times as many requests.
+const MAX_WARM_UP: u64 = 1000;
+/// How long the server may take to notice closed connections and to end idle threads.
 const SETTLE_LIMIT: Duration = Duration::from_secs(20);
-/// How long memory is left alone before it is looked at.
-const REST: Duration = Duration::from_secs(1);
+/// Idle time before memory is measured.
+const IDLE_TIME: Duration = Duration::from_secs(1);
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct ChurnArgs {
     #[command(flatten)]
     target: Target,
-    /// Sessions to open, to stream on, to close and to delete
+    /// Sessions to open, stream on, close and delete
     #[arg(long, default_value_t = 500)]
     sessions: u64,
-    /// Requests of many kinds after that, a fifth of them predictions
+    /// Requests of many kinds after the sessions, a fifth of them predictions
     #[arg(long, default_value_t = 5000)]
     requests: u64,
-    /// Frames of each session
+    /// Frames per session
     #[arg(long, default_value_t = 6)]
     frames: u64,
-    /// How many do so at a time, each on a kept connection
+    /// Concurrent clients, each with a kept-alive connection
     #[arg(long, default_value_t = 8)]
     workers: usize,
-    /// Bound: growth of the server's memory after the warm-up
+    /// Bound: growth of the server's memory in MB after the warm-up
     #[arg(long, default_value_t = 10.0)]
     growth_mb: f64,
 }
 
-/// What is done again and again.
+/// The repeated work.
 #[derive(Clone)]
-enum Deed {
-    /// A session from its opening to its deletion, with so many frames.
+enum Task {
+    /// A session from opening to deletion, with this many frames.
     Session(u64),
-    /// Requests by turns, each with the status that it shall have.
+    /// Requests in turn, each with its expected status.
     Requests(Arc<[(Request, u16)]>),
 }
 
 type Faults = BTreeMap<String, u64>;
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[]).await;
-    let material = Arc::new(Material::of(&args.target.model));
-    let deeds = [
-        (Deed::Session(args.frames), args.sessions, MOST_WARM_UP, "sessions"),
+    let workload = Arc::new(Workload::of(&args.target.model));
+    let tasks = [
+        (Task::Session(args.frames), args.sessions, MAX_WARM_UP, "sessions"),
         (
-            Deed::Requests(kinds(&material)),
+            Task::Requests(kinds(&workload)),
             args.requests,
-            10 * MOST_WARM_UP,
+            10 * MAX_WARM_UP,
             "requests",
         ),
     ];
     let mut faults = Faults::new();
-    let mut doing = async |deed: &Deed, count| {
-        for fault in many(args.workers, server.address, (deed, count), &material).await {
+    let mut repeat = async |task: &Task, count| {
+        for fault in many(args.workers, server.address, (task, count), &workload).await {
             *faults.entry(fault).or_default() += 1;
         }
     };
-    for (deed, count, most, _) in &deeds {
-        doing(deed, (count / 10).min(*most)).await;
+    for (task, count, max, _) in &tasks {
+        repeat(task, (count / 10).min(*max)).await;
     }
-    tokio::time::sleep(REST).await;
-    let before = server.process.taken();
+    tokio::time::sleep(IDLE_TIME).await;
+    let before = server.process.usage();
     println!("after the warm-up: {}", list(&before));
-    // What starting took is given back in time: the first part may find less than the warm-up left.
+    // The server returns memory of its start with a delay: after the first part it may use less than after the warm-up.
     let mut least_mb = before.rss_mb;
-    for (deed, count, _, name) in &deeds {
+    for (task, count, _, name) in &tasks {
         let (since, part) = (Instant::now(), count / PARTS);
         for done in 1..=PARTS {
-            doing(deed, part).await;
-            let taken = server.process.taken();
-            println!("after {} {name}: {}", done * part, list(&taken));
+            repeat(task, part).await;
+            let usage = server.process.usage();
+            println!("after {} {name}: {}", done * part, list(&usage));
             if done == 1 {
-                least_mb = least_mb.min(taken.rss_mb);
+                least_mb = least_mb.min(usage.rss_mb);
             }
         }
         println!("{:.0} {name}/s", (PARTS * part) as f64 / since.elapsed().as_secs_f64());
     }
-    bounds.hold(
+    bounds.check(
         faults.is_empty(),
-        format!("every request and every frame was answered as it should {faults:?}"),
+        format!("every request and every frame was answered as expected; faults: {faults:?}"),
     );
     let after = settled(&server, &before).await;
     println!("at the end: {}", list(&after));
     let growth_mb = after.rss_mb - least_mb;
-    let what = format!("memory grew by {growth_mb:.1} MB, at most {} MB", args.growth_mb);
-    bounds.hold(growth_mb <= args.growth_mb, what);
-    bounds.hold(after.descriptors <= before.descriptors, "no descriptor was lost");
-    bounds.hold(after.threads <= before.threads, "no thread was lost");
+    let what = format!("memory grew by {growth_mb:.1} MB; limit {} MB", args.growth_mb);
+    bounds.check(growth_mb <= args.growth_mb, what);
+    bounds.check(after.descriptors <= before.descriptors, "no file descriptor leaked");
+    bounds.check(after.threads <= before.threads, "no thread leaked");
     server.check(bounds);
 }
 
-fn list(taken: &Taken) -> String {
+fn list(usage: &Usage) -> String {
     format!(
-        "{:.1} MB, {} descriptors, {} threads",
-        taken.rss_mb, taken.descriptors, taken.threads
+        "{:.1} MB, {} file descriptors, {} threads",
+        usage.rss_mb, usage.descriptors, usage.threads
     )
 }
 
-/// What the server takes when it rests: no more than before, or what it is after a while.
-async fn settled(server: &Server, before: &Taken) -> Taken {
+/// The idle server's usage, once it is no more than before or the time limit has passed.
+async fn settled(server: &Server, before: &Usage) -> Usage {
     let since = Instant::now();
     loop {
-        tokio::time::sleep(REST).await;
-        let taken = server.process.taken();
-        let is_settled = taken.descriptors <= before.descriptors && taken.threads <= before.threads;
+        tokio::time::sleep(IDLE_TIME).await;
+        let usage = server.process.usage();
+        let is_settled = usage.descriptors <= before.descriptors && usage.threads <= before.threads;
         if is_settled || since.elapsed() > SETTLE_LIMIT {
-            return taken;
+            return usage;
         }
     }
 }
 
-/// Cheap ones and middling ones, predictions and refusals among them.
-fn kinds(material: &Material) -> Arc<[(Request, u16)]> {
+/// Cheap and expensive requests, among them predictions and refusals.
+fn kinds(workload: &Workload) -> Arc<[(Request, u16)]> {
     let get = |path: &str, status| (Request::get(path), status);
     Arc::new([
-        (material.predict_json(), 200),
+        (workload.predict_json(), 200),
         get("/livez", 200),
-        get(&format!("/v1/models/{}", material.model()), 200),
+        get(&format!("/v1/models/{}", workload.model()), 200),
         get("/v1/sessions", 200),
         get("/v1/sessions/none", 404),
-        (material.predict_form(), 200),
+        (workload.predict_form(), 200),
         get("/readyz", 200),
         get("/v1/models", 200),
         get("/v1/jobs", 200),
@@ -147,17 +147,17 @@ fn kinds(material: &Material) -> Arc<[(Request, u16)]> {
     ])
 }
 
-/// Does so many deeds, several at a time; what went wrong.
+/// Repeats a task `count` times with several workers, and returns the faults.
 async fn many(
     workers: usize,
     address: SocketAddr,
-    (deed, count): (&Deed, u64),
-    material: &Arc<Material>,
+    (task, count): (&Task, u64),
+    workload: &Arc<Workload>,
 ) -> Vec<String> {
     let next = Arc::new(AtomicU64::new(0));
     let mut working = JoinSet::new();
     for _ in 0..workers {
-        let (next, deed, material) = (Arc::clone(&next), deed.clone(), Arc::clone(material));
+        let (next, task, workload) = (Arc::clone(&next), task.clone(), Arc::clone(workload));
         let mut http = Http::new(address);
         working.spawn(async move {
             let mut faults = Vec::new();
@@ -166,9 +166,9 @@ async fn many(
                 if index >= count {
                     return faults;
                 }
-                let done = match &deed {
-                    Deed::Session(frames) => session(&mut http, address, &material, *frames).await,
-                    Deed::Requests(kinds) => {
+                let done = match &task {
+                    Task::Session(frames) => session(&mut http, address, &workload, *frames).await,
+                    Task::Requests(kinds) => {
                         let (request, status) = &kinds[index as usize % kinds.len()];
                         ask(&mut http, request, *status).await.map(drop)
                     }
@@ -180,39 +180,43 @@ async fn many(
     working.join_all().await.concat()
 }
 
-async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::http::Answer, String> {
+async fn ask(http: &mut Http, request: &Request, status: u16) -> Result<crate::http::Response, String> {
     let answer = http.ask(request).await.map_err(|error| format!("no answer: {error}"))?;
     if answer.status == status {
         Ok(answer)
     } else {
-        Err(format!("{} for {status}: {}", answer.status, answer.text()))
+        Err(format!(
+            "status {} instead of {status}: {}",
+            answer.status,
+            answer.text()
+        ))
     }
 }
 
-/// Opens a session and its stream, has a prediction of each frame that fills the context, closes and deletes.
-async fn session(http: &mut Http, address: SocketAddr, material: &Material, frames: u64) -> Result<(), String> {
-    let session = Session::of(&ask(http, &Session::request(material.model(), OnLate::Predict), 201).await?);
+/// Opens a session and its stream, sends frames, checks each answer, closes the stream and deletes the session.
+async fn session(http: &mut Http, address: SocketAddr, workload: &Workload, frames: u64) -> Result<(), String> {
+    let session = Session::of(&ask(http, &Session::request(workload.model(), OnLate::Predict), 201).await?);
     let socket = session::connect(address, &session.stream_path()).await;
     let mut socket = socket.map_err(|error| format!("no stream: {error}"))?;
     for seq in 0..frames {
         socket
-            .send(material.frame(seq))
+            .send(workload.frame(seq))
             .await
             .map_err(|error| error.to_string())?;
-        let is_full = seq + 1 >= material.context();
+        let is_full = seq + 1 >= workload.context();
         match session::receive(&mut socket).await {
             Some(ServerMessage::Prediction { seq: of, .. }) if is_full && of == seq => {}
             Some(ServerMessage::Buffering { seq: of, .. }) if !is_full && of == seq => {}
             other => return Err(format!("frame {seq} was answered with {other:?}")),
         }
     }
-    let close = material::message(&ClientMessage::Close(CloseMessage {}));
+    let close = workload::message(&ClientMessage::Close(CloseMessage {}));
     socket.send(close).await.map_err(|error| error.to_string())?;
     match session::receive(&mut socket).await {
         Some(ServerMessage::Closing { .. }) => {}
         other => return Err(format!("the close was answered with {other:?}")),
     }
-    // The rest of the closing, so that no socket is cut off.
+    // Read until the end, so that the closing handshake completes.
     while session::receive(&mut socket).await.is_some() {}
     ask(http, &session.deletion(), 204).await.map(drop)
 }

@@ -1,4 +1,4 @@
-//! A client of HTTP/1.1 that takes little of the machine: one connection, kept, and bodies of a stated length.
+//! A light HTTP/1.1 client: one kept-alive connection, and bodies with a content length.
 
 use std::io::{self, ErrorKind};
 use std::net::SocketAddr;
@@ -9,10 +9,10 @@ use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, Buf
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-/// Whoever has no answer by then gets none: longer than any deadline of the server.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(40);
+/// Time limit for an answer: longer than any deadline of the server.
+pub(crate) const TIMEOUT: Duration = Duration::from_secs(40);
 
-/// A request as it goes over the wire.
+/// The bytes of a request.
 #[derive(Clone)]
 pub(crate) struct Request(Vec<u8>);
 
@@ -46,16 +46,16 @@ impl Request {
     }
 }
 
-/// What came back.
+/// A response.
 #[derive(Default)]
-pub(crate) struct Answer {
+pub(crate) struct Response {
     pub(crate) status: u16,
-    /// Whether it says when to try again.
+    /// Whether it has a valid `Retry-After` header.
     pub(crate) retry_after: bool,
     pub(crate) body: Vec<u8>,
 }
 
-impl Answer {
+impl Response {
     pub(crate) fn text(&self) -> String {
         String::from_utf8_lossy(&self.body).into_owned()
     }
@@ -64,19 +64,19 @@ impl Answer {
         serde_json::from_slice(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.text()))
     }
 
-    /// Whether it is a refusal that its sender can do something with.
+    /// Whether it is a refusal that says when to try again.
     pub(crate) fn is_refusal(&self) -> bool {
         matches!(self.status, 429 | 503) && self.retry_after
     }
 }
 
-/// The server closes connections that ask nothing for a while: one that has rested so long is not asked again.
-const REST: Duration = Duration::from_secs(5);
+/// The server closes idle connections. One that was idle for this long is not used again.
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
 
-/// One connection, opened when it is needed.
+/// One connection, opened on demand.
 pub(crate) struct Http {
     address: SocketAddr,
-    /// With when it was last asked.
+    /// The connection, and when it was last used.
     kept: Option<(BufReader<TcpStream>, Instant)>,
 }
 
@@ -85,23 +85,23 @@ impl Http {
         Self { address, kept: None }
     }
 
-    /// The answer. Errors: the connection ended before it, or it did not come.
-    pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Answer> {
-        timeout(PATIENCE, self.exchange(request))
+    /// Sends a request and returns the response. Errors: the connection ended, or the time limit passed.
+    pub(crate) async fn ask(&mut self, request: &Request) -> io::Result<Response> {
+        timeout(TIMEOUT, self.exchange(request))
             .await
             .unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
     }
 
-    /// The answer, which has to have that status.
-    pub(crate) async fn expect(&mut self, status: u16, request: &Request) -> Answer {
+    /// Sends a request and returns the response, which must have this status.
+    pub(crate) async fn expect(&mut self, status: u16, request: &Request) -> Response {
         let answer = self.ask(request).await.expect("the server answers");
         assert_eq!(answer.status, status, "{}", answer.text());
         answer
     }
 
-    async fn exchange(&mut self, request: &Request) -> io::Result<Answer> {
+    async fn exchange(&mut self, request: &Request) -> io::Result<Response> {
         let mut stream = match self.kept.take() {
-            Some((stream, asked)) if asked.elapsed() < REST => stream,
+            Some((stream, asked)) if asked.elapsed() < KEEP_ALIVE => stream,
             _ => connect(self.address).await?,
         };
         stream.get_mut().write_all(&request.0).await?;
@@ -117,9 +117,9 @@ async fn connect(address: SocketAddr) -> io::Result<BufReader<TcpStream>> {
     Ok(BufReader::new(stream))
 }
 
-/// The answer, and whether the connection ends with it.
-async fn read(stream: &mut BufReader<TcpStream>) -> io::Result<(Answer, bool)> {
-    let (mut answer, mut length, mut is_last) = (Answer::default(), None, false);
+/// Reads a response, and whether the connection ends after it.
+async fn read(stream: &mut BufReader<TcpStream>) -> io::Result<(Response, bool)> {
+    let (mut answer, mut length, mut is_last) = (Response::default(), None, false);
     let mut line = String::new();
     stream.read_line(&mut line).await?;
     let status = line.split(' ').nth(1).and_then(|status| status.parse().ok());

@@ -1,68 +1,68 @@
-//! Load on the real server over loopback, by scenarios; `--help` tells of each. Loads that come at times are open loop:
-//! they come whether or not answers have, and a latency counts from the time that its frame or request was *scheduled*
-//! for. Linux, for what the server takes is read from `/proc`.
+//! Load tests of the real server over loopback; `--help` describes each scenario. Loads at a fixed rate are open loop: the
+//! next frame or request is sent whether or not the last one was answered, and a latency counts from the time that it was
+//! *scheduled* for. Linux only, because the server's memory and processor time are read from `/proc`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
-mod figures;
-mod flight;
 mod health;
 mod http;
-mod material;
-mod pace;
-mod process;
+mod process_usage;
+mod report;
 mod robot;
+mod robots;
 mod saturate;
+mod schedule;
 mod server;
 mod session;
 mod slow_reader;
 mod stream;
+mod workload;
 
 use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser as _;
-use figures::Bounds;
+use report::Bounds;
 
-/// Load on the real server over loopback: starts one of its own, prints what came of it, and ends with exit code 1 if a
-/// stated bound did not hold.
+/// Load on the real server over loopback: starts one of its own, prints the measurements, and exits with code 1 if
+/// a bound is exceeded.
 #[derive(clap::Parser)]
 #[command(
     name = "load",
     args_conflicts_with_subcommands = true,
-    after_help = "Without a scenario: stream, with the options above.
+    after_help = "Without a scenario, `stream` runs with the options above.
 
-Give each side a core of its own (Linux):
+To give the server and the load one core each (Linux):
   taskset -c 1 cargo bench --bench load -- stream --sessions 100 --server-cpu 0"
 )]
 struct Cli {
     #[command(subcommand)]
     scenario: Option<Scenario>,
     #[command(flatten)]
-    stream: stream::Args,
-    /// A short form of every scenario, as CI does it
+    stream: stream::StreamArgs,
+    /// Run a short form of every scenario, as CI does
     #[arg(long)]
     test: bool,
-    /// Given by cargo
+    /// Added by cargo
     #[arg(long, hide = true, global = true)]
     bench: bool,
 }
 
 #[derive(clap::Subcommand)]
 enum Scenario {
-    /// Robots at a fixed rate: their latencies, or by --find how many there can be
-    Stream(stream::Args),
-    /// Twice of what the server can do: goodput, refusals, and the server's memory over time
-    Saturate(saturate::Args),
-    /// A socket that sends and never reads, beside robots that do
-    SlowReader(slow_reader::Args),
-    /// Sessions opened and closed, then requests: what of memory, descriptors and threads stays
-    Churn(churn::Args),
-    /// How quickly the server says that it lives while a training takes every core
-    Health(health::Args),
+    /// Robots at a fixed frame rate: measure latencies, or with --find the largest number of robots
+    Stream(stream::StreamArgs),
+    /// Twice the load that the server can handle: measure goodput, refusals and memory over time
+    Saturate(saturate::SaturateArgs),
+    /// One client that sends and never reads: measure its effect on other robots
+    SlowReader(slow_reader::SlowReaderArgs),
+    /// Many sessions and requests: measure leaks of memory, file descriptors and threads
+    Churn(churn::ChurnArgs),
+    /// Health checks and streams while a training uses every core: measure latencies
+    Health(health::HealthArgs),
 }
 
-/// The scenarios as CI runs them: on a machine that is busy, so latencies are only kept from growing absurd.
+/// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.
 const SHORT_FORMS: [&str; 6] = [
     "stream --sessions 4 --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
     "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mb 40 --sessions 32",
@@ -87,9 +87,9 @@ fn main() -> ExitCode {
     for scenario in scenarios {
         let started = Instant::now();
         runtime.block_on(Box::pin(run(&scenario, &mut bounds)));
-        println!("in {:.0} s\n", started.elapsed().as_secs_f64());
+        println!("took {:.0} s\n", started.elapsed().as_secs_f64());
     }
-    bounds.conclude()
+    bounds.exit_code()
 }
 
 fn short_form(line: &'static str) -> Scenario {

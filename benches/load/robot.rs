@@ -1,4 +1,4 @@
-//! A robot: sends frames when it is told to, and notes what comes back.
+//! A robot: sends frames at given times, and records the answers.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -7,46 +7,46 @@ use foreframe::server::protocol::{ClientMessage, CloseMessage, ErrorCode, Server
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 
-use crate::material::{self, Material};
 use crate::session::{self, Socket};
+use crate::workload::{self, Workload};
 
-/// What came of a robot's frames, or of many robots'.
+/// Answers to the frames of one robot or of many.
 #[derive(Default)]
-pub(crate) struct Tally {
+pub(crate) struct FrameCounts {
     pub(crate) sent: u64,
     /// Frames that only filled the context.
     pub(crate) buffering: u64,
-    /// Taken in without a prediction, since a newer one waited.
+    /// Answered with `overtaken`: a newer frame was waiting.
     pub(crate) overtaken: u64,
-    /// Refused because the server is too busy.
+    /// Refused because the server is overloaded.
     pub(crate) overloaded: u64,
-    /// Refused for other reasons, and why the first was.
+    /// Refused for other reasons.
     pub(crate) refused: u64,
     pub(crate) first_refusal: Option<String>,
-    /// Left out because they were read too slowly.
+    /// Predictions that the server dropped because this client read too slowly.
     pub(crate) dropped: u64,
-    pub(crate) answers: Vec<Answer>,
+    pub(crate) answers: Vec<PredictionTimes>,
 }
 
 /// A prediction.
 #[derive(Clone, Copy)]
-pub(crate) struct Answer {
-    /// When its frame was to be sent.
+pub(crate) struct PredictionTimes {
+    /// When its frame was scheduled.
     pub(crate) scheduled: Instant,
-    /// When its frame was in fact sent.
+    /// When its frame was sent.
     pub(crate) sent: Instant,
-    /// When it came.
-    pub(crate) came: Instant,
-    /// Of that the model's computation.
+    /// When the prediction was received.
+    pub(crate) received: Instant,
+    /// Time that the model computed.
     pub(crate) compute: Duration,
 }
 
-impl Tally {
-    /// Frames of which nothing was heard again.
+impl FrameCounts {
+    /// Frames without an answer.
     pub(crate) fn unanswered(&self) -> u64 {
-        let heard =
+        let answered =
             self.answers.len() as u64 + self.buffering + self.overtaken + self.overloaded + self.refused + self.dropped;
-        self.sent.saturating_sub(heard)
+        self.sent.saturating_sub(answered)
     }
 
     pub(crate) fn add(&mut self, other: Self) {
@@ -61,63 +61,63 @@ impl Tally {
     }
 }
 
-/// Sends a frame at each cue, which is the time that it was scheduled for, and closes after the last. Calls `answered`
-/// after each answer.
-pub(crate) async fn fly(
+/// Sends a frame for each scheduled time that it receives, and closes the stream after the last. Calls `answered` after
+/// each answer.
+pub(crate) async fn run(
     socket: Socket,
-    material: Arc<Material>,
-    mut cues: mpsc::Receiver<Instant>,
+    workload: Arc<Workload>,
+    mut send_times: mpsc::Receiver<Instant>,
     mut answered: impl FnMut(),
-) -> Tally {
+) -> FrameCounts {
     let (mut sender, mut receiver) = socket.split();
-    // Of every frame when it was to be sent, and when it was.
+    // When each frame was scheduled, and when it was sent.
     let log = Mutex::new(Vec::<(Instant, Instant)>::new());
     let sending = async {
-        while let Some(scheduled) = cues.recv().await {
-            let frame = material.frame(log.lock().unwrap().len() as u64);
+        while let Some(scheduled) = send_times.recv().await {
+            let frame = workload.frame(log.lock().unwrap().len() as u64);
             log.lock().unwrap().push((scheduled, Instant::now()));
             if sender.send(frame).await.is_err() {
                 return;
             }
         }
-        let close = material::message(&ClientMessage::Close(CloseMessage {}));
-        // If it is gone, the receiver knows as well.
+        let close = workload::message(&ClientMessage::Close(CloseMessage {}));
+        // If the stream has ended, the receiver notices it as well.
         let _ = sender.send(close).await;
     };
     let receiving = async {
-        let mut tally = Tally::default();
-        while let Some((came, message)) = session::receive_timed(&mut receiver).await {
+        let mut counts = FrameCounts::default();
+        while let Some((received, message)) = session::receive_timed(&mut receiver).await {
             match message {
                 ServerMessage::Prediction {
                     seq, timing, dropped, ..
                 } => {
                     let (scheduled, sent) = log.lock().unwrap()[seq as usize];
                     let compute = Duration::from_micros(timing.compute_us);
-                    tally.answers.push(Answer {
+                    counts.answers.push(PredictionTimes {
                         scheduled,
                         sent,
-                        came,
+                        received,
                         compute,
                     });
-                    tally.dropped += dropped;
+                    counts.dropped += dropped;
                 }
-                ServerMessage::Buffering { .. } => tally.buffering += 1,
-                ServerMessage::Overtaken { .. } => tally.overtaken += 1,
+                ServerMessage::Buffering { .. } => counts.buffering += 1,
+                ServerMessage::Overtaken { .. } => counts.overtaken += 1,
                 ServerMessage::Error {
                     code: ErrorCode::Overloaded,
                     ..
-                } => tally.overloaded += 1,
+                } => counts.overloaded += 1,
                 ServerMessage::Error { code, detail, .. } => {
-                    tally.refused += 1;
-                    tally.first_refusal.get_or_insert(format!("{code:?}: {detail}"));
+                    counts.refused += 1;
+                    counts.first_refusal.get_or_insert(format!("{code:?}: {detail}"));
                 }
                 _ => continue,
             }
             answered();
         }
-        tally
+        counts
     };
-    let ((), mut tally) = tokio::join!(sending, receiving);
-    tally.sent = log.lock().unwrap().len() as u64;
-    tally
+    let ((), mut counts) = tokio::join!(sending, receiving);
+    counts.sent = log.lock().unwrap().len() as u64;
+    counts
 }

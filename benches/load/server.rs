@@ -1,4 +1,4 @@
-//! The server under load: the real program with data of its own.
+//! The server under load: the real program with its own data directory.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -7,25 +7,25 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::figures::Bounds;
 use crate::http::{Http, Request};
-use crate::process::Process;
+use crate::process_usage::Process;
+use crate::report::Bounds;
 
-/// How long the server may take to get ready.
+/// How long the server may take to become ready.
 const START_LIMIT: Duration = Duration::from_mins(1);
 
-/// What is put under load.
+/// The server and model under load.
 #[derive(clap::Args, Clone)]
 pub(crate) struct Target {
     /// A shipped model
     #[arg(long, default_value = "moving")]
     pub(crate) model: String,
-    /// The only core that the server may use
+    /// Restrict the server to this core
     #[arg(long)]
     pub(crate) server_cpu: Option<usize>,
 }
 
-/// The server's process, ended with this value.
+/// The server's process. Dropping it ends the process.
 pub(crate) struct Server {
     child: Child,
     pub(crate) address: SocketAddr,
@@ -35,7 +35,7 @@ pub(crate) struct Server {
 }
 
 impl Server {
-    /// Starts it with these settings and waits until it is ready.
+    /// Starts the server with these settings and waits until it is ready.
     pub(crate) async fn start(target: &Target, settings: &[(&str, usize)]) -> Self {
         let (program, data) = (env!("CARGO_BIN_EXE_foreframe"), tempfile::tempdir().unwrap());
         let mut command = match target.server_cpu {
@@ -85,29 +85,26 @@ impl Server {
         {
             assert!(
                 since.elapsed() < START_LIMIT,
-                "the server does not get ready: {}",
+                "the server does not become ready: {}",
                 read(&self.log)
             );
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
 
-    /// That it lives still and its log tells of no failure.
+    /// Checks that the server still runs and its log has no error.
     pub(crate) fn check(&mut self, bounds: &mut Bounds) {
         let log = read(&self.log);
-        let failures: Vec<&str> = log
+        let errors: Vec<&str> = log
             .lines()
             .filter(|line| line.contains("ERROR") || line.contains("panicked"))
             .collect();
-        for line in failures.iter().take(5) {
+        for line in errors.iter().take(5) {
             println!("  {line}");
         }
         let has_ended = self.child.try_wait().unwrap();
-        let what = format!(
-            "the server lives, and its log tells of no failure ({} lines do)",
-            failures.len()
-        );
-        bounds.hold(has_ended.is_none() && failures.is_empty(), what);
+        let what = format!("the server runs, and its log has no errors ({} found)", errors.len());
+        bounds.check(has_ended.is_none() && errors.is_empty(), what);
     }
 }
 

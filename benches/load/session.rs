@@ -1,4 +1,4 @@
-//! Sessions and their sockets.
+//! Sessions and their WebSockets.
 
 use std::io;
 use std::net::SocketAddr;
@@ -15,29 +15,29 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::http::{Answer, Http, PATIENCE, Request};
+use crate::http::{Http, Request, Response, TIMEOUT};
 
-/// Read at once: more than an answer takes. As much is zeroed before every read.
+/// Size of the read buffer: larger than an answer, but small, because it is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;
 
 pub(crate) type Socket = WebSocketStream<TcpStream>;
 
-/// A session as it was opened.
+/// Id and token of an opened session.
 pub(crate) struct Session {
     id: String,
     token: String,
 }
 
 impl Session {
-    /// The request for one, that goes on with what comes when frames are missing: robots want the present.
+    /// The request that opens a session. It accepts gaps, as robots do that want predictions from new frames.
     pub(crate) fn request(model: &str, on_late: OnLate) -> Request {
         let settings = json!({"model": model, "on_gap": "skip", "on_late": on_late});
         Request::json("/v1/sessions", &settings)
     }
 
-    pub(crate) fn of(answer: &Answer) -> Self {
+    pub(crate) fn of(answer: &Response) -> Self {
         let answer = answer.json();
-        let text = |field: &str| answer[field].as_str().expect("a session").to_owned();
+        let text = |field: &str| answer[field].as_str().expect("a session has this field").to_owned();
         Self {
             id: text("id"),
             token: text("token"),
@@ -57,14 +57,14 @@ impl Session {
     }
 }
 
-/// A stream whose `ready` has been read.
+/// Opens a stream and reads its `ready`.
 pub(crate) async fn connect(address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
     let stream = TcpStream::connect(address).await.map_err(Error::Io)?;
     stream.set_nodelay(true).map_err(Error::Io)?;
     over(stream, address, path).await
 }
 
-/// The same over a socket of one's own.
+/// The same over an existing socket.
 pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
     let mut request = format!("ws://{address}{path}").into_client_request()?;
     let protocol = HeaderValue::from_static(Codec::Msgpack.name());
@@ -77,22 +77,22 @@ pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> 
     }
 }
 
-/// The next message of the server; none at the end, or where none comes.
+/// The next message of the server; none at the end of the stream or after the time limit.
 pub(crate) async fn receive(
     socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
 ) -> Option<ServerMessage> {
     receive_timed(socket).await.map(|(_, message)| message)
 }
 
-/// The same, with when it came: before it was decoded, which is the client's own time.
+/// The same, with the time of its arrival before it was decoded.
 pub(crate) async fn receive_timed(
     socket: &mut (impl futures_util::Stream<Item = Result<Message, Error>> + Unpin),
 ) -> Option<(Instant, ServerMessage)> {
     loop {
-        match timeout(PATIENCE, socket.next()).await {
+        match timeout(TIMEOUT, socket.next()).await {
             Ok(Some(Ok(Message::Binary(bytes)))) => {
-                let came = Instant::now();
-                return Some((came, rmp_serde::from_slice(&bytes).unwrap()));
+                let received = Instant::now();
+                return Some((received, rmp_serde::from_slice(&bytes).unwrap()));
             }
             Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => {}
             _ => return None,

@@ -1,79 +1,79 @@
-//! Robots at a fixed rate.
+//! Robots that stream at a fixed frame rate.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use foreframe::server::protocol::OnLate;
 
-use crate::figures::Bounds;
-use crate::flight::{Drive, Flight, Flown};
-use crate::material::Material;
+use crate::report::Bounds;
+use crate::robots::{RobotLoad, RobotLoadResult, SendMode};
 use crate::server::{Server, Target};
+use crate::workload::Workload;
 
-/// A search ends when the answer is known to this share.
-const FIND_SHARE: f64 = 0.05;
+/// Relative precision of the search.
+const FIND_PRECISION: f64 = 0.05;
 
 #[derive(clap::Args)]
-pub(crate) struct Args {
+pub(crate) struct StreamArgs {
     #[command(flatten)]
     target: Target,
-    /// Sessions at a time; with --find, the number to begin with, which has to hold
+    /// Concurrent sessions; with --find, the number to start with, which must keep the bound
     #[arg(long, default_value_t = 16)]
     sessions: usize,
-    /// Frames a second of each session
+    /// Frames per second of each session
     #[arg(long, default_value_t = 30.0)]
     rate_hz: f64,
-    /// How long to measure
+    /// Seconds to measure
     #[arg(long, default_value_t = 10.0)]
     seconds: f64,
-    /// How long to send before that; frames of that time are not counted
+    /// Seconds of warm-up before the measurement
     #[arg(long, default_value_t = 2.0)]
     warm_up_s: f64,
-    /// Bound of the 99th percentile of the latency from schedule to prediction
+    /// Bound: 99th percentile of the latency from schedule to prediction
     #[arg(long, default_value_t = 33.0)]
     p99_ms: f64,
     /// Search for the largest number of sessions that keeps the bound
     #[arg(long)]
     find: bool,
-    /// The search's end
+    /// Largest number of sessions to try
     #[arg(long, default_value_t = 512, requires = "find")]
-    find_most: usize,
+    find_max: usize,
 }
 
-pub(crate) async fn run(args: &Args, bounds: &mut Bounds) {
-    let places = if args.find { args.find_most } else { args.sessions } + 1;
+pub(crate) async fn run(args: &StreamArgs, bounds: &mut Bounds) {
+    let capacity = if args.find { args.find_max } else { args.sessions } + 1;
     let settings = [
-        ("max_streams", places),
-        ("max_sessions", places),
-        ("max_connections", 2 * places),
-        ("max_queued_predictions", 4 * places),
+        ("max_streams", capacity),
+        ("max_sessions", capacity),
+        ("max_connections", 2 * capacity),
+        ("max_queued_predictions", 4 * capacity),
     ];
     let mut server = Server::start(&args.target, &settings).await;
-    let material = Arc::new(Material::of(&args.target.model));
+    let workload = Arc::new(Workload::of(&args.target.model));
     if args.find {
-        find(args, &server, &material, bounds).await;
+        find(args, &server, &workload, bounds).await;
     } else {
-        let flown = args.flight(args.sessions).run(&server, &material).await;
-        report(args, &flown);
-        let p99_ms = flown.since_schedule().at_ms(0.99);
-        bounds.hold(
+        let result = args.load(args.sessions).run(&server, &workload).await;
+        report(args, &result);
+        let p99_ms = result.since_schedule().at_ms(0.99);
+        bounds.check(
             p99_ms <= args.p99_ms,
             format!("p99 from schedule within {} ms", args.p99_ms),
         );
-        bounds.hold(all_predicted(&flown), "every frame was predicted");
+        bounds.check(all_predicted(&result), "every frame was predicted");
     }
     println!(
-        "the server's memory: {:.0} MB at most",
-        server.process.taken().peak_rss_mb
+        "peak memory of the server: {:.0} MB",
+        server.process.usage().peak_rss_mb
     );
     server.check(bounds);
 }
 
-impl Args {
-    fn flight(&self, sessions: usize) -> Flight {
-        Flight {
+impl StreamArgs {
+    fn load(&self, sessions: usize) -> RobotLoad {
+        RobotLoad {
             sessions,
-            drive: Drive::Paced(self.rate_hz),
+            mode: SendMode::Scheduled(self.rate_hz),
             on_late: OnLate::Predict,
             warm_up: Duration::from_secs_f64(self.warm_up_s),
             measured: Duration::from_secs_f64(self.seconds),
@@ -81,73 +81,73 @@ impl Args {
     }
 }
 
-fn all_predicted(flown: &Flown) -> bool {
-    let tally = &flown.tally;
-    tally.overloaded + tally.refused + tally.dropped + tally.unanswered() == 0 && !tally.answers.is_empty()
+fn all_predicted(result: &RobotLoadResult) -> bool {
+    let counts = &result.counts;
+    counts.overloaded + counts.refused + counts.dropped + counts.unanswered() == 0 && !counts.answers.is_empty()
 }
 
-fn report(args: &Args, flown: &Flown) {
-    let (tally, from_schedule) = (&flown.tally, flown.since_schedule());
+fn report(args: &StreamArgs, result: &RobotLoadResult) {
+    let (counts, from_schedule) = (&result.counts, result.since_schedule());
     println!(
-        "{} sessions at {} Hz for {} s: {} frames sent, {} predicted, of these {} counted; {} refused, {} dropped, {} \
+        "{} sessions at {} Hz for {} s: {} frames sent, {} predicted, {} of them measured; {} refused, {} dropped, {} \
          unanswered",
         args.sessions,
         args.rate_hz,
         args.seconds,
-        tally.sent,
-        tally.answers.len(),
+        counts.sent,
+        counts.answers.len(),
         from_schedule.len(),
-        tally.overloaded + tally.refused,
-        tally.dropped,
-        tally.unanswered()
+        counts.overloaded + counts.refused,
+        counts.dropped,
+        counts.unanswered()
     );
     println!("from schedule to prediction: {from_schedule}");
-    let from_sending = flown.latencies(|answer| answer.came - answer.sent);
+    let from_sending = result.latencies(|answer| answer.received - answer.sent);
     println!("from sending to prediction:  {from_sending}");
     println!(
-        "of it the model's own time:  {}",
-        flown.latencies(|answer| answer.compute)
+        "time in the model:           {}",
+        result.latencies(|answer| answer.compute)
     );
-    let beyond = flown.latencies(|answer| (answer.came - answer.sent).saturating_sub(answer.compute));
-    println!("beyond the model's own time: {beyond}");
+    let beyond = result.latencies(|answer| (answer.received - answer.sent).saturating_sub(answer.compute));
+    println!("time outside the model:      {beyond}");
     println!(
-        "the server takes {:.0} % of a core, this program {:.0} %",
-        flown.server_cpu, flown.own_cpu
+        "the server uses {:.0} % of a core, this program {:.0} %",
+        result.server_cpu, result.own_cpu
     );
 }
 
-/// Doubles until the bound breaks, then halves the way between; what breaks it has a second try.
-async fn find(args: &Args, server: &Server, material: &Arc<Material>, bounds: &mut Bounds) {
-    let (mut held, mut broke, mut sessions) = (0, None, args.sessions.clamp(1, args.find_most));
+/// Doubles the number of sessions until the bound fails, then bisects. A failed number is tried a second time.
+async fn find(args: &StreamArgs, server: &Server, workload: &Arc<Workload>, bounds: &mut Bounds) {
+    let (mut passed, mut failed, mut sessions) = (0, None, args.sessions.clamp(1, args.find_max));
     loop {
-        let holds = keeps(args, sessions, server, material).await || keeps(args, sessions, server, material).await;
+        let holds = passes(args, sessions, server, workload).await || passes(args, sessions, server, workload).await;
         if holds {
-            held = sessions;
+            passed = sessions;
         } else {
-            broke = Some(sessions);
+            failed = Some(sessions);
         }
-        sessions = match broke {
-            None if held == args.find_most => break,
-            None => (2 * held).min(args.find_most),
-            Some(broke) if (broke - held) as f64 <= (FIND_SHARE * held as f64).max(1.0) => break,
-            Some(broke) => usize::midpoint(held, broke),
+        sessions = match failed {
+            None if passed == args.find_max => break,
+            None => (2 * passed).min(args.find_max),
+            Some(failed) if (failed - passed) as f64 <= (FIND_PRECISION * passed as f64).max(1.0) => break,
+            Some(failed) => usize::midpoint(passed, failed),
         };
     }
     println!(
-        "{held} sessions at {} Hz with p99 within {} ms",
+        "{passed} sessions at {} Hz keep p99 within {} ms",
         args.rate_hz, args.p99_ms
     );
-    bounds.hold(held >= args.sessions, format!("at least {} sessions", args.sessions));
+    bounds.check(passed >= args.sessions, format!("at least {} sessions", args.sessions));
 }
 
-async fn keeps(args: &Args, sessions: usize, server: &Server, material: &Arc<Material>) -> bool {
-    let flown = args.flight(sessions).run(server, material).await;
-    let latencies = flown.since_schedule();
+async fn passes(args: &StreamArgs, sessions: usize, server: &Server, workload: &Arc<Workload>) -> bool {
+    let result = args.load(sessions).run(server, workload).await;
+    let latencies = result.since_schedule();
     println!(
-        "{sessions} sessions: {latencies}; {} of {} frames not predicted; the server takes {:.0} % of a core",
-        flown.tally.sent - flown.tally.buffering - flown.tally.answers.len() as u64,
-        flown.tally.sent,
-        flown.server_cpu
+        "{sessions} sessions: {latencies}; {} of {} frames not predicted; the server uses {:.0} % of a core",
+        result.counts.sent - result.counts.buffering - result.counts.answers.len() as u64,
+        result.counts.sent,
+        result.server_cpu
     );
-    all_predicted(&flown) && latencies.at_ms(0.99) <= args.p99_ms
+    all_predicted(&result) && latencies.at_ms(0.99) <= args.p99_ms
 }

@@ -1,19 +1,23 @@
 //! `foreframe config`
 
-use super::settings::Settings;
-use super::{CliError, say};
+use super::settings::ServerArgs;
+use super::{CliError, print_line};
 
-/// Print every setting with what it means, its range, and where its value comes from.
+/// Print every setting with its meaning, its range, and where its value comes from.
 ///
-/// The output is a configuration file: edit it and pass it with --config. Flags go over the environment (`FOREFRAME_BIND`,
-/// `FOREFRAME_MAX_STREAMS`, …), that over the file, that over the defaults. Passwords in URLs are not shown.
+/// The output is a configuration file: edit it and pass it with --config. Flags replace the environment (`FOREFRAME_BIND`,
+/// `FOREFRAME_MAX_STREAMS`, …), the environment replaces the file, and the file replaces the defaults. Passwords in URLs are
+/// hidden.
 #[derive(clap::Args)]
-#[command(after_help = "Example: FOREFRAME_MAX_STREAMS=8 foreframe config --set drain_ms=2000 > mine.toml")]
+#[command(after_help = "Examples:
+  foreframe config
+  foreframe config --set drain_ms=2000 > foreframe.toml
+  FOREFRAME_MAX_STREAMS=8 foreframe config")]
 pub(super) struct ConfigArgs {
     #[command(flatten)]
-    settings: Settings,
+    settings: ServerArgs,
 }
 
 pub(super) fn run(args: &ConfigArgs) -> Result<(), CliError> {
-    say(args.settings.load()?.to_toml().trim_end())
+    print_line(args.settings.load()?.to_toml().trim_end())
 }

@@ -1,4 +1,4 @@
-//! What a subcommand fails with, and whether the user's question or the world was at fault.
+//! Why a subcommand ended: the user's input cannot be carried out, or something failed.
 
 use std::error::Error;
 use std::io::{self, ErrorKind};
@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use crate::dataset::DatasetError;
+use crate::error_text;
 use crate::evaluation::EvaluationError;
 use crate::nn::NnError;
 use crate::registry::RegistryError;
@@ -13,25 +14,24 @@ use crate::serving::ServingError;
 use crate::sim::SimError;
 use crate::telemetry::TelemetryError;
 use crate::training::TrainError;
-use crate::wording;
 
-/// What a subcommand fails with: a sentence for the user.
+/// Why a subcommand ended, as a sentence for the user.
 pub(super) enum CliError {
-    /// It was asked wrongly.
+    /// The arguments, or what they name, cannot be used.
     Usage(String),
-    /// It went wrong.
+    /// Something failed.
     Failed(String),
-    /// It was interrupted; what was finished is kept.
+    /// The user interrupted it; finished work is kept.
     Interrupted(String),
 }
 
 impl CliError {
-    /// It went wrong, and why.
+    /// A failure with its causes.
     pub(super) fn failed(error: impl Error) -> Self {
-        Self::Failed(wording::sentence(&error))
+        Self::Failed(error_text::with_causes(&error))
     }
 
-    /// A file that can't be used: asked wrongly where the path leads to nothing of the kind.
+    /// A file that cannot be used: `Usage` if the path leads to nothing of the right kind.
     pub(super) fn io(action: &str, path: &Path, source: &io::Error) -> Self {
         let sentence = format!("could not {action} {}: {source}", path.display());
         match source.kind() {
@@ -42,8 +42,8 @@ impl CliError {
         }
     }
 
-    /// The line for standard error and the exit code: 2 for what was asked wrongly, 130 for an interruption, 1 otherwise.
-    pub(super) fn told(&self) -> (String, ExitCode) {
+    /// The line for standard error and the exit code: 2 for `Usage`, 1 for `Failed`, 130 for `Interrupted`.
+    pub(super) fn report(&self) -> (String, ExitCode) {
         match self {
             Self::Usage(sentence) => (format!("error: {sentence}"), ExitCode::from(2)),
             Self::Failed(sentence) => (format!("error: {sentence}"), ExitCode::from(1)),
@@ -52,15 +52,15 @@ impl CliError {
     }
 }
 
-/// An error that knows whether another question would have been answered.
-pub(super) trait Blame: Error {
-    /// Whether the arguments were wrong, or what they name does not fit together.
+/// An error that knows whether the user's input caused it.
+pub(super) trait UsageError: Error {
+    /// Whether the arguments are wrong, or what they name does not fit together.
     fn is_usage(&self) -> bool;
 }
 
-impl<E: Blame> From<E> for CliError {
+impl<E: UsageError> From<E> for CliError {
     fn from(error: E) -> Self {
-        let sentence = wording::sentence(&error);
+        let sentence = error_text::with_causes(&error);
         if error.is_usage() {
             Self::Usage(sentence)
         } else {
@@ -69,13 +69,13 @@ impl<E: Blame> From<E> for CliError {
     }
 }
 
-impl Blame for TelemetryError {
+impl UsageError for TelemetryError {
     fn is_usage(&self) -> bool {
         true
     }
 }
 
-impl Blame for SimError {
+impl UsageError for SimError {
     fn is_usage(&self) -> bool {
         matches!(
             self,
@@ -84,7 +84,7 @@ impl Blame for SimError {
     }
 }
 
-impl Blame for DatasetError {
+impl UsageError for DatasetError {
     fn is_usage(&self) -> bool {
         match self {
             Self::World(error) => error.is_usage(),
@@ -103,20 +103,20 @@ impl Blame for DatasetError {
     }
 }
 
-impl Blame for RegistryError {
+impl UsageError for RegistryError {
     fn is_usage(&self) -> bool {
         matches!(self, Self::Unknown { .. } | Self::Name(_) | Self::NotAModel(_))
     }
 }
 
-impl Blame for TrainError {
+impl UsageError for TrainError {
     fn is_usage(&self) -> bool {
         match self {
             Self::UnknownPreset(_)
             | Self::Config(_)
             | Self::NotARun(_)
             | Self::OtherRun { .. }
-            | Self::NoValidation { .. } => true,
+            | Self::NoWindows { .. } => true,
             Self::Dataset(error) => error.is_usage(),
             Self::Registry(error) => error.is_usage(),
             // The network's sizes come from the settings.
@@ -126,7 +126,7 @@ impl Blame for TrainError {
     }
 }
 
-impl Blame for EvaluationError {
+impl UsageError for EvaluationError {
     fn is_usage(&self) -> bool {
         match self {
             Self::FrameSize { .. }
@@ -143,7 +143,7 @@ impl Blame for EvaluationError {
     }
 }
 
-impl Blame for ServingError {
+impl UsageError for ServingError {
     fn is_usage(&self) -> bool {
         matches!(self, Self::Input(_))
     }

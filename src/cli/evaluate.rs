@@ -2,94 +2,123 @@
 
 use std::path::PathBuf;
 
-use super::{CliError, command_line, load_model, open_dataset, progress::ProgressLine, say};
-use crate::evaluation::{self, EvaluateConfig, EvaluationStage};
+use super::output::OutputDirectory;
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use super::{CliError, command_line, print_line, progress::ProgressLine};
+use crate::evaluation::{self, EvaluateConfig, Purpose};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
-/// Measure a model on held-out trials: report, figures, GIF.
+/// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///
-/// Two test sets: trials that training never saw, and start/goal pairs and controller gains that it never saw. The skill is
-/// the share of the best trivial baseline's error that the model takes away.
+/// There are three test sets: trials, start/goal pairs and controller gains that training never saw. The skill is 1 − MSE / MSE
+/// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. To choose between models or settings, use `--split
+/// validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
-#[command(after_help = "Example: foreframe evaluate --model paper --dataset static-observer --out reports/paper")]
+#[command(after_help = "Examples:
+  foreframe evaluate --model paper --dataset static-observer
+  foreframe evaluate --model runs/moving/model --twin runs/plain/model --out reports/moving
+  foreframe evaluate --model mine@2 --dataset small --data-dir /var/lib/foreframe")]
 pub(super) struct EvaluateArgs {
-    /// A model's name or directory
+    /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
-    /// The data set's directory, or its name in data/datasets [default: that of the scenario the model was trained on]
+    /// The directory of a data set, or its name in DATA_DIR/datasets [default: the scenario that the model was trained on]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
-    /// The directory to write report.md, report.json and figures into [default: reports/MODEL]
+    /// A new directory for report.md, report.json and the figures [default: reports/MODEL]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// An unconditioned model of the same budget, for the table that tells whether the action matters
+    /// A model of the same training budget that lacks the action, the state or both, for the table that shows what each
+    /// input is worth; may be given several times
     #[arg(long, value_name = "MODEL")]
-    twin: Option<String>,
-    /// Windows of each test set at most, spread evenly over its trials
+    twin: Vec<String>,
+    /// What to score: the validation split, or the test sets
+    #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
+    split: SplitChoice,
+    /// Windows of each set at most, spread evenly over its trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
-    /// Resamples of the trials for the intervals
+    /// Bootstrap resamples of the trials, for the intervals
     #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples)]
     resamples: usize,
-    /// Seed of the resamples and the shuffled actions
+    /// The seed of the resamples and of the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write the scores into the model's manifest too
+    /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
     record: bool,
-    /// Where models are looked for by name
-    #[arg(long, value_name = "DIR", default_value = "models")]
-    models: PathBuf,
+    #[command(flatten)]
+    settings: CommonArgs,
+}
+
+/// What to score.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum SplitChoice {
+    /// The validation split, to choose between models or settings
+    Validation,
+    /// The test sets, for the final numbers
+    Test,
 }
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
-    let (model_dir, loaded) = load_model(&args.model, &args.models)?;
-    let twin = args
+    let workspace = Workspace::new(args.settings.start()?);
+    let (model_dir, loaded) = workspace.load_model(&args.model)?;
+    let twins = args
         .twin
-        .as_deref()
-        .map(|twin| load_model(twin, &args.models))
-        .transpose()?;
+        .iter()
+        .map(|twin| Ok(workspace.load_model(twin)?.1))
+        .collect::<Result<Vec<LoadedModel>, CliError>>()?;
     let out = args
         .out
         .clone()
         .unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
-    let (_, dataset) = open_dataset(&args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?)?;
-    evaluation::prepare(&out)?;
+    let dataset = args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?;
+    let (_, dataset) = workspace.open_dataset(&dataset)?;
+    let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
+        purpose: match args.split {
+            SplitChoice::Validation => Purpose::Validation,
+            SplitChoice::Test => Purpose::Test,
+        },
         max_windows: args.windows,
         bootstrap_samples: args.resamples,
         seed: Seed(args.seed),
-        twin: twin.as_ref().map(|(_, twin)| twin),
+        twins: twins.iter().collect(),
         command: command_line(),
         ..EvaluateConfig::default()
     };
     let progress = ProgressLine::new("windows");
+    progress.label("evaluating");
     let mut report = evaluation::run(&loaded, &dataset, &config, &|now| {
-        let what = match now.stage {
-            EvaluationStage::Scores => "scores",
-            EvaluationStage::Actions => "actions",
-        };
-        progress.update(now.done as u64, now.total as u64, || format!("{} {what}", now.split));
+        let stage = now.stage.name();
+        progress.update(now.done as u64, now.total as u64, || format!("{} {stage}", now.split));
     })?;
     progress.finish();
     let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
-    let [markdown, _] = evaluation::write(&out, &mut report, &inputs)?;
+    evaluation::write(output.path(), &mut report, &inputs)?;
+    output.finish()?;
     if args.record {
-        registry::record_metrics(&model_dir, report.headline())?;
+        let mut scores = report.headline();
+        if config.purpose == Purpose::Test {
+            // Earlier versions scored unseen pairs and gains as one set.
+            scores["test-unseen"] = serde_json::Value::Null;
+        }
+        registry::record_metrics(&model_dir, scores)?;
     }
     for (split, score) in report.headline().as_object().into_iter().flatten() {
-        say(format!("{split}: {score}"))?;
+        print_line(format!("{split}: {score}"))?;
     }
-    say(markdown.display())
+    print_line(out.join("report.md").display())
 }
 
-/// The scenario that the model was trained on, which is its data set's name unless another was given.
+/// The scenario that the model was trained on: the default name of its data set.
 fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
     let manifest = &loaded.manifest;
     manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
         CliError::Usage(format!(
-            "--dataset is missing; model {:?} was trained on {:?}, which no scenario made",
+            "--dataset is missing; model {:?} was trained on {:?}, which is not a simulated scenario",
             manifest.name, manifest.dataset.name
         ))
     })

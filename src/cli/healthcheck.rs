@@ -1,26 +1,30 @@
 //! `foreframe healthcheck`
 
 use std::io::{Read, Write};
-use std::net::{IpAddr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
-use super::settings::Settings;
-use super::{CliError, say};
+use super::settings::ServerArgs;
+use super::{CliError, print_line};
 
 /// Longer than a healthy server takes, even while it trains.
-const PATIENCE: Duration = Duration::from_secs(3);
+const TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Ask a running server whether it is ready: exit code 0 if it is, 1 if not.
 ///
-/// For containers, which bring no curl. Without --url it asks the address that serve would listen on.
+/// For containers, which have no curl. Without --url it asks the address that `foreframe serve` would listen on with the same
+/// settings.
 #[derive(clap::Args)]
-#[command(after_help = "Example: foreframe healthcheck --url http://127.0.0.1:8642/livez")]
+#[command(after_help = "Examples:
+  foreframe healthcheck
+  foreframe healthcheck --port 9000
+  foreframe healthcheck --url http://127.0.0.1:8642/livez")]
 pub(super) struct HealthcheckArgs {
-    /// What to ask [default: /readyz at the address to listen on]
+    /// The URL to ask [default: /readyz at the address to listen on]
     #[arg(long, value_name = "URL")]
     url: Option<String>,
     #[command(flatten)]
-    settings: Settings,
+    settings: ServerArgs,
 }
 
 pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
@@ -28,26 +32,26 @@ pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
         Some(url) => url.clone(),
         None => format!("http://{}/readyz", reachable(args.settings.load()?.config.bind)),
     };
-    let status = ask(&url)?;
-    let first = status.lines().next().unwrap_or_default();
-    if first.split(' ').nth(1) == Some("200") {
-        return say(format!("{url}: ready"));
+    let answer = get(&url)?;
+    let status = answer.lines().next().unwrap_or_default();
+    if status.split(' ').nth(1) == Some("200") {
+        return print_line(format!("{url}: ready"));
     }
-    Err(CliError::Failed(format!("{url}: {first}")))
+    Err(CliError::Failed(format!("{url}: {status}")))
 }
 
-/// The address under which a server on this machine is reached.
+/// The address under which this machine reaches a server that listens on `bind`.
 fn reachable(bind: SocketAddr) -> SocketAddr {
     let host = match bind.ip() {
-        IpAddr::V4(address) if address.is_unspecified() => IpAddr::from([127, 0, 0, 1]),
-        IpAddr::V6(address) if address.is_unspecified() => IpAddr::from([0, 0, 0, 0, 0, 0, 0, 1]),
+        IpAddr::V4(address) if address.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(address) if address.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
         address => address,
     };
     SocketAddr::new(host, bind.port())
 }
 
-/// The beginning of the answer.
-fn ask(url: &str) -> Result<String, CliError> {
+/// The first bytes of the answer.
+fn get(url: &str) -> Result<String, CliError> {
     let (host, path) = url
         .strip_prefix("http://")
         .map(|rest| rest.split_once('/').unwrap_or((rest, "")))
@@ -55,11 +59,11 @@ fn ask(url: &str) -> Result<String, CliError> {
     let failed = |error: std::io::Error| CliError::Failed(format!("{url}: {error}"));
     let address = host
         .to_socket_addrs()
-        .map_err(|error| CliError::Usage(format!("--url {url} has no HOST:PORT: {error}")))?
+        .map_err(|error| CliError::Usage(format!("--url {url} is not http://HOST:PORT/PATH: {error}")))?
         .next()
         .ok_or_else(|| CliError::Failed(format!("{url}: {host} has no address")))?;
-    let mut stream = TcpStream::connect_timeout(&address, PATIENCE).map_err(failed)?;
-    stream.set_read_timeout(Some(PATIENCE)).map_err(failed)?;
+    let mut stream = TcpStream::connect_timeout(&address, TIMEOUT).map_err(failed)?;
+    stream.set_read_timeout(Some(TIMEOUT)).map_err(failed)?;
     let request = format!("GET /{path} HTTP/1.1\r\nhost: {host}\r\nconnection: close\r\n\r\n");
     stream.write_all(request.as_bytes()).map_err(failed)?;
     let mut answer = vec![0; 256];

@@ -1,53 +1,66 @@
 //! `foreframe inspect`
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use super::{CliError, DATASETS_DIR, say};
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use super::{CliError, print_line};
 use crate::dataset::{self, Dataset, DatasetInfo};
+use crate::error_text::{comma_separated, existing};
 use crate::nn::{ChannelScale, ModelSpec, costs};
 use crate::registry::{self, Manifest};
-use crate::wording::{listed, those};
 
 /// Describe a model or a data set.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe inspect paper
-  foreframe inspect static-observer")]
+  foreframe inspect runs/paper/model
+  foreframe inspect static-observer --data-dir /var/lib/foreframe")]
 pub(super) struct InspectArgs {
-    /// A model's name or directory, or a data set's name or directory
+    /// The name or directory of a model (or NAME@VERSION), or the name or directory of a data set
+    #[arg(value_name = "WHAT")]
     what: String,
-    /// Where models are looked for by name
-    #[arg(long, value_name = "DIR", default_value = "models")]
-    models: PathBuf,
+    #[command(flatten)]
+    settings: CommonArgs,
 }
 
 pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
-    let (models, datasets) = (args.models.as_path(), Path::new(DATASETS_DIR));
-    if let Ok(dir) = registry::locate(models, &args.what) {
-        return describe_model(&dir, &registry::load(&dir)?.manifest);
+    let workspace = Workspace::new(args.settings.start()?);
+    let (name, path) = (args.what.as_str(), Path::new(&args.what));
+    let models = workspace.model_names()?;
+    let is_model = registry::directory_of(name).is_ok_and(|dir| dir.is_some());
+    if is_model || models.iter().any(|model| name.split('@').next() == Some(model)) {
+        let (dir, loaded) = workspace.load_model(name)?;
+        return describe_model(&dir, &loaded.manifest);
     }
-    if let Ok(dir) = dataset::find(datasets, Path::new(&args.what)) {
+    let config = workspace.config();
+    let models_dir = &config.server.models_dir;
+    let misnamed = models_dir.join(name);
+    if misnamed.join(registry::MANIFEST_FILE).is_file() {
+        return workspace.load_model(name).map(drop);
+    }
+    if let Ok(dir) = workspace.find_dataset(path) {
         return describe_dataset(&dir);
     }
-    let names: Vec<String> = registry::list(models)?.into_iter().map(|(name, _)| name).collect();
+    let datasets_dir = workspace.datasets_dir();
     Err(CliError::Usage(format!(
-        "there is no model or data set {:?}; in {} there {}; in {DATASETS_DIR} there {}",
-        args.what,
-        models.display(),
-        those(&names),
-        those(&dataset::list(datasets)?)
+        "there is no model or data set {name:?}; in {} there {}; in {} there {}",
+        models_dir.display(),
+        existing(&models),
+        datasets_dir.display(),
+        existing(&dataset::list(&datasets_dir)?)
     )))
 }
 
 fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
     let spec = &manifest.spec;
-    say(format!(
+    print_line(format!(
         "{} ({} version {})",
         dir.display(),
         manifest.name,
         manifest.version
     ))?;
-    say(format!(
+    print_line(format!(
         "  takes       {} frames of {}×{} px, gray, {} s apart{}",
         spec.context,
         spec.frame_width_px,
@@ -55,8 +68,8 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
         spec.frame_period_s,
         conditions(spec)
     ))?;
-    say(format!("  predicts    the {} frames that follow", spec.horizon))?;
-    say(format!(
+    print_line(format!("  predicts    the {} frames that follow", spec.horizon))?;
+    print_line(format!(
         "  network     dense {} → LSTM {} → dense {}; conditioning {}, reconstruction {}, {}",
         spec.features,
         spec.hidden,
@@ -69,31 +82,31 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
             "not inverted"
         },
     ))?;
-    say_costs(manifest)?;
-    say(format!(
+    print_costs(manifest)?;
+    print_line(format!(
         "  trained on  {} windows of {} (content {})",
         manifest.dataset.windows, manifest.dataset.name, manifest.dataset.content_hash
     ))?;
-    say(format!("  seed        {}", manifest.seed.0))?;
-    say(format!("  made by     {}", manifest.command))?;
-    say(format!("  weights     SHA-256 {}", manifest.weights_sha256))?;
+    print_line(format!("  seed        {}", manifest.seed.0))?;
+    print_line(format!("  made by     {}", manifest.command))?;
+    print_line(format!("  weights     SHA-256 {}", manifest.weights_sha256))?;
     let metrics = serde_json::to_string_pretty(&manifest.metrics).map_err(CliError::failed)?;
-    say(format!("  metrics     {}", metrics.replace('\n', "\n              ")))
+    print_line(format!("  metrics     {}", metrics.replace('\n', "\n              ")))
 }
 
-/// The model's cost and, for the same frames, that of the networks which the paper sets itself against.
-fn say_costs(manifest: &Manifest) -> Result<(), CliError> {
+/// The model's cost and, for the same frames, that of the networks that the paper compares itself with.
+fn print_costs(manifest: &Manifest) -> Result<(), CliError> {
     let own = manifest.multiply_adds_per_frame;
-    say(format!("  parameters  {}", manifest.parameters))?;
-    say(format!(
-        "  cost        {own} multiply–adds a predicted frame; on the same frames"
+    print_line(format!("  parameters  {}", manifest.parameters))?;
+    print_line(format!(
+        "  cost        {own} multiply–adds for each predicted frame; on the same frames:"
     ))?;
     for (name, cost) in [
         ("ConvLSTM (Shi et al. 2015)", costs::conv_lstm(&manifest.spec)),
         ("CDNA (Finn et al. 2016)", costs::cdna(&manifest.spec)),
     ] {
-        say(format!(
-            "              {name} takes {:.0} million, {:.0} times as many, with {:.2} million parameters",
+        print_line(format!(
+            "              {name} needs {:.0} million, {:.0} times as many, and has {:.2} million parameters",
             cost.multiply_adds_per_frame as f64 / 1e6,
             cost.multiply_adds_per_frame as f64 / own as f64,
             cost.parameters as f64 / 1e6
@@ -103,7 +116,7 @@ fn say_costs(manifest: &Manifest) -> Result<(), CliError> {
 }
 
 fn conditions(spec: &ModelSpec) -> String {
-    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", listed(channels));
+    let list = |what: &str, channels: &[ChannelScale]| format!("; {what} [{}]", comma_separated(channels));
     let mut text = String::new();
     if spec.state_inputs().is_some() {
         text += &list("the state", &spec.states);
@@ -117,21 +130,21 @@ fn conditions(spec: &ModelSpec) -> String {
 fn describe_dataset(dir: &Path) -> Result<(), CliError> {
     let dataset = Dataset::open(dir)?;
     let info = dataset.info();
-    say(format!("{} ({})", dir.display(), info.name))?;
-    say(format!(
+    print_line(format!("{} ({})", dir.display(), info.name))?;
+    print_line(format!(
         "  frames      {} of {}×{} px, {} s apart",
         info.frame_count, info.frame_width_px, info.frame_height_px, info.frame_period_s
     ))?;
-    say(format!("  episodes    {}", info.episode_count))?;
-    say(format!("  action      [{}]", listed(&info.action_channels)))?;
-    say(format!("  state       [{}]", listed(&info.state_channels)))?;
-    say(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
-    say(format!("  camera      {}", camera(info)))?;
-    say(format!(
+    print_line(format!("  episodes    {}", info.episode_count))?;
+    print_line(format!("  action      [{}]", comma_separated(&info.action_channels)))?;
+    print_line(format!("  state       [{}]", comma_separated(&info.state_channels)))?;
+    print_line(format!("  masks       {}", if info.has_masks { "yes" } else { "no" }))?;
+    print_line(format!("  camera      {}", camera(info)))?;
+    print_line(format!(
         "  scenario    {}",
-        info.scenario.as_deref().unwrap_or("none: recorded")
+        info.scenario.as_deref().unwrap_or("none (recorded)")
     ))?;
-    say(format!("  content     SHA-256 {}", info.content_hash))
+    print_line(format!("  content     SHA-256 {}", info.content_hash))
 }
 
 fn camera(info: &DatasetInfo) -> String {

@@ -1,14 +1,14 @@
-//! Ctrl-C as a flag that long work looks at; a second Ctrl-C ends the process at once.
+//! Ctrl-C as a flag that long work checks; a second Ctrl-C ends the process at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::CliError;
 
-/// A flag that the first Ctrl-C (or SIGTERM) raises.
+/// A flag that the first Ctrl-C (or SIGTERM) sets.
 pub(super) fn flag() -> Result<Arc<AtomicBool>, CliError> {
     let cancelled = Arc::new(AtomicBool::new(false));
-    let raised = Arc::clone(&cancelled);
+    let shared = Arc::clone(&cancelled);
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()
@@ -18,8 +18,8 @@ pub(super) fn flag() -> Result<Arc<AtomicBool>, CliError> {
         .spawn(move || {
             runtime.block_on(async {
                 crate::server::shutdown::requested().await;
-                raised.store(true, Ordering::Relaxed);
-                tracing::info!("stopping after what is under way; press Ctrl-C again to stop at once");
+                shared.store(true, Ordering::Relaxed);
+                tracing::info!("stopping; press Ctrl-C again to stop without saving");
                 crate::server::shutdown::requested().await;
                 std::process::exit(130);
             });

@@ -1,35 +1,42 @@
 //! `foreframe keys`
 
-use std::time::SystemTime;
-
-use super::settings::{StoreSettings, open_store};
-use super::{CliError, say};
+use super::settings::{CommonArgs, open_store};
+use super::workspace::block_on;
+use super::{CliError, print_line};
 use crate::server::keys::NewKey;
-use crate::store::{KeyRow, Store};
+use crate::store::{KeyRow, Store, unix_s};
 
-/// Make, list and revoke the keys that callers of a server show.
+const SECONDS_PER_DAY: f64 = 86_400.0;
+
+/// Create, list and revoke API keys.
 ///
-/// A server that can be reached from other machines asks for a key: the header Authorization: Bearer KEY. A running server
-/// takes a change within seconds.
+/// A server that other machines can reach, or for which a key exists, asks for a key in the header `Authorization: Bearer KEY`.
+/// A running server applies changes within seconds.
 #[derive(clap::Args)]
-#[command(after_help = "Example: foreframe keys create robot-7")]
+#[command(after_help = "Examples:
+  foreframe keys create robot-7
+  foreframe keys list
+  foreframe keys revoke 5f0c2ab91d34")]
 pub(super) struct KeysArgs {
     #[command(subcommand)]
     action: KeysCommand,
     #[command(flatten)]
-    settings: StoreSettings,
+    settings: CommonArgs,
 }
 
 #[derive(clap::Subcommand)]
 enum KeysCommand {
-    /// Make a key and print it: only its hash is kept, so it is never seen again
+    /// Create a key and print it. Only its hash is stored, so it cannot be shown again
+    #[command(after_help = "Example:\n  foreframe keys create robot-7 --data-dir /var/lib/foreframe")]
     Create {
-        /// Whose it is, for the list
+        /// Who will use it; for the list
         name: String,
     },
-    /// List the keys: id, name, since when, and whether they are revoked
+    /// List the keys: id, state, age, name
+    #[command(after_help = "Example:\n  foreframe keys list")]
     List,
-    /// Take a key's right away
+    /// Revoke a key: requests with it are refused
+    #[command(after_help = "Example:\n  foreframe keys revoke 5f0c2ab91d34")]
     Revoke {
         /// The key's id, as in the list
         id: String,
@@ -37,12 +44,8 @@ enum KeysCommand {
 }
 
 pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
-    let config = args.settings.load()?.config;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .map_err(CliError::failed)?;
-    runtime.block_on(async {
+    let config = args.settings.start()?;
+    block_on(async {
         let store = open_store(&config).await?;
         match &args.action {
             KeysCommand::Create { name } => create(&store, name).await,
@@ -54,11 +57,13 @@ pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
 
 async fn create(store: &Store, name: &str) -> Result<(), CliError> {
     if name.is_empty() || name.len() > 64 || name.chars().any(char::is_control) {
-        return Err(CliError::Usage("a key's name is a line of 1 to 64 bytes".to_owned()));
+        return Err(CliError::Usage(format!(
+            "{name:?} is not a name for a key; use one line of 1 to 64 bytes"
+        )));
     }
     let key = NewKey::generate().map_err(CliError::failed)?;
     store.create_key(&key.id, name, &key.hash, unix_s()).await?;
-    say(key.text)
+    print_line(key.text)
 }
 
 async fn list(store: &Store) -> Result<(), CliError> {
@@ -71,8 +76,8 @@ async fn list(store: &Store) -> Result<(), CliError> {
     } in store.list_keys().await?
     {
         let state = if revoked_s.is_some() { "revoked" } else { "valid" };
-        let age_days = (unix_s() - created_s) / 86_400.0;
-        say(format!("{id}  {state:7}  {age_days:6.1} days old  {name}"))?;
+        let age_days = (unix_s() - created_s) / SECONDS_PER_DAY;
+        print_line(format!("{id}  {state:7}  {age_days:6.1} days old  {name}"))?;
     }
     Ok(())
 }
@@ -80,19 +85,14 @@ async fn list(store: &Store) -> Result<(), CliError> {
 async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
     if store.revoke_key(id, unix_s()).await? {
         let is_last = store.list_keys().await?.iter().all(|key| key.revoked_s.is_some());
-        let then = if is_last {
-            "; it was the last: nobody may call until another is made"
+        let consequence = if is_last {
+            "; it was the last valid key: every request is refused until another is created"
         } else {
             ""
         };
-        return say(format!("{id} is revoked{then}"));
+        return print_line(format!("{id} is revoked{consequence}"));
     }
     Err(CliError::Usage(format!(
-        "there is no valid key {id}; foreframe keys list names them"
+        "there is no valid key {id}; foreframe keys list lists them"
     )))
-}
-
-fn unix_s() -> f64 {
-    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since_1970.unwrap_or_default().as_secs_f64()
 }

@@ -1,194 +1,168 @@
 //! `foreframe predict`
 
-use std::path::{Path, PathBuf};
+mod actions;
+mod images;
 
-use serde::Deserialize;
+use std::path::PathBuf;
 
-use super::{CliError, load_model, say};
-use crate::evaluation::{self, figures::montage};
-use crate::files::write_atomically;
-use crate::frame::{Frame, codec};
+use self::actions::ActionsFile;
+use self::images::ImageFiles;
+use super::output::OutputDirectory;
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use super::{CliError, print_line};
+use crate::error_text;
+use crate::evaluation::figures::montage;
+use crate::frame::fit::Fit;
+use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::serving::{self, PredictionInput};
-use crate::types::{Action, RobotState};
-use crate::wording;
 
-/// Predict the frames that follow those in a directory.
+/// Predict the frames that follow the images in a directory.
 ///
-/// Takes the first frames of the directory, in the order of their names, as many as the model's context; if there are more,
-/// they are the truth that the prediction is shown over. Writes predicted-1.png and so on, contact-sheet.png and
-/// prediction.gif.
+/// Takes the last frames of the directory, as many as the model needs, and predicts what follows. File names are sorted in
+/// natural order: 2.png comes before 10.png. With --at N it predicts what follows frame N instead, and shows the true frames
+/// after N beside the prediction. Writes predicted-1.png and so on, contact-sheet.png and prediction.gif.
 #[derive(clap::Args)]
 #[command(
-    after_help = "The actions file is JSON, one entry a frame from the directory's first on:
+    after_help = "The actions file is JSON with one entry for each image of the directory, in the same order:
   {\"states\": [[…], …], \"actions\": [[…], …]}
-The action of a frame acts from it to the next. A model that is told the state takes that of the last frame it sees.
+The action of a frame acts from that frame to the next one. So the file needs an action for frame N (the last frame, or that
+of --at) and for each frame to predict but the last, as planned by the robot. The model takes the state at frame N.
 
-Example: foreframe export --dataset moving-observer --episode 3 --out look
-         foreframe predict --model moving --frames look --actions look/actions.json --out seen"
+Examples:
+  foreframe predict --model paper --frames images --out predicted
+  foreframe predict --model static --frames photos --fit crop --out predicted
+
+  foreframe export --dataset moving-observer --episode 3 --out look
+  foreframe predict --model moving --frames look --actions look/actions.json --at 9 --out seen"
 )]
 pub(super) struct PredictArgs {
-    /// A model's name or directory
+    /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
-    /// A directory of PNG or JPEG frames
+    /// A directory of PNG or JPEG images; color images are converted to gray
     #[arg(long, value_name = "DIR")]
     frames: PathBuf,
-    /// What the robot did and will do; needed by models that are told actions
+    /// The number of the last frame that the model sees, counted from 0 [default: the last frame]
+    #[arg(long, value_name = "N")]
+    at: Option<usize>,
+    /// The robot's states and actions; needed by models that take them
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
-    /// A new directory to write into
+    /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
+    #[arg(long, value_name = "FIT")]
+    fit: Option<Fit>,
+    /// A new directory for the files
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Where models are looked for by name
-    #[arg(long, value_name = "DIR", default_value = "models")]
-    models: PathBuf,
+    #[command(flatten)]
+    settings: CommonArgs,
 }
 
-/// The actions file.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct ActionsFile {
-    #[serde(default)]
-    states: Vec<RobotState>,
-    actions: Vec<Action>,
+/// What the model sees, and what followed where that is known.
+struct Selected {
+    /// The number of the last frame that the model sees.
+    last: usize,
+    seen: Vec<Frame>,
+    truth: Vec<Frame>,
 }
 
 pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
-    let (_, loaded) = load_model(&args.model, &args.models)?;
-    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
-    let frames = read_frames(&args.frames, name, spec)?;
-    if frames.len() < spec.context {
-        return Err(CliError::Usage(format!(
-            "{} holds {} PNG or JPEG frames; model {name:?} takes {}",
-            args.frames.display(),
-            frames.len(),
-            spec.context
-        )));
-    }
-    let (seen, truth) = frames.split_at(spec.context);
-    let mut input = PredictionInput {
-        frames: seen.to_vec(),
-        ..PredictionInput::default()
-    };
-    if let Some(path) = &args.actions {
-        read_trace(path)?.enter(&mut input, path, name, spec)?;
-    } else if spec.action_inputs().is_some() {
-        return Err(CliError::Usage(format!(
-            "--actions is missing; model {name:?} takes {}",
-            wording::listed(&spec.actions)
-        )));
-    }
+    let workspace = Workspace::new(args.settings.start()?);
+    let (_, loaded) = workspace.load_model(&args.model)?;
+    let selected = select(args, &loaded)?;
+    let input = input(args, &loaded, &selected)?;
     let predicted = serving::predict(&loaded, &[&input])?.remove(0);
-    evaluation::prepare(&args.out)?;
-    write(&args.out, &loaded, seen, &predicted, truth)?;
-    say(format!(
-        "{}: {} predicted frames, contact-sheet.png, prediction.gif",
+    let output = OutputDirectory::create(&args.out)?;
+    write(&output, loaded.model.spec(), &selected, &predicted)?;
+    output.finish()?;
+    print_line(format!(
+        "{}: {} frames predicted after frame {}, contact-sheet.png, prediction.gif",
         args.out.display(),
-        predicted.len()
+        predicted.len(),
+        selected.last
     ))
 }
 
-impl ActionsFile {
-    /// Takes what the model is told: the state of the last frame seen, and the actions from there on.
-    fn enter(self, input: &mut PredictionInput, path: &Path, model: &str, spec: &ModelSpec) -> Result<(), CliError> {
-        let last = spec.context - 1;
-        let needed = [
-            (
-                "actions",
-                self.actions.len(),
-                spec.action_inputs().map(|_| last + spec.horizon),
-            ),
-            ("states", self.states.len(), spec.state_inputs().map(|_| spec.context)),
-        ];
-        for (what, found, needed) in needed {
-            if let Some(needed) = needed.filter(|&needed| found < needed) {
-                return Err(CliError::Usage(format!(
-                    "{} holds {found} {what}; model {model:?} sees {} frames and predicts {}, which takes {needed}",
-                    path.display(),
-                    spec.context,
-                    spec.horizon
-                )));
-            }
-        }
-        input.state = self.states.into_iter().nth(last);
-        let future = self.actions.into_iter().skip(last).take(spec.horizon);
-        input.future_actions = spec.action_inputs().map(|_| future.collect());
-        Ok(())
+/// Reads the frames up to the last that the model sees, and the true frames after it.
+fn select(args: &PredictArgs, loaded: &LoadedModel) -> Result<Selected, CliError> {
+    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
+    let mut images = ImageFiles::list(&args.frames, args.fit)?;
+    let count = images.count();
+    if count < spec.context {
+        return Err(CliError::Usage(format!(
+            "{} holds {count} PNG or JPEG frames; model {name:?} takes {}",
+            args.frames.display(),
+            spec.context
+        )));
     }
-}
-
-fn read_trace(path: &Path) -> Result<ActionsFile, CliError> {
-    let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
-    serde_json::from_slice(&bytes).map_err(|error| {
-        CliError::Usage(format!(
-            "{} is no actions file: {error}; it is JSON of finite numbers, \
-             {{\"states\": [[…], …], \"actions\": [[…], …]}}",
-            path.display()
-        ))
+    let last = args.at.unwrap_or(count - 1);
+    if !(spec.context - 1..count).contains(&last) {
+        return Err(CliError::Usage(format!(
+            "--at is {last}; it must be {} to {}: model {name:?} takes {} frames, and {} holds {count}",
+            spec.context - 1,
+            count - 1,
+            spec.context,
+            args.frames.display()
+        )));
+    }
+    let end = count.min(last + 1 + spec.horizon);
+    Ok(Selected {
+        last,
+        seen: images.read(last + 1 - spec.context..last + 1, name, spec)?,
+        truth: images.read(last + 1..end, name, spec)?,
     })
 }
 
-/// The images of a directory, in the order of their names, all of the model's size.
-fn read_frames(dir: &Path, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, CliError> {
-    let unreadable = |error| CliError::io("read", dir, &error);
-    let mut paths = std::fs::read_dir(dir)
-        .map_err(unreadable)?
-        .map(|entry| entry.map(|entry| entry.path()))
-        .collect::<Result<Vec<_>, _>>()
-        .map_err(unreadable)?;
-    paths.retain(|path| {
-        let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
-        ["png", "jpg", "jpeg"].iter().any(|known| extension == *known)
-    });
-    paths.sort();
-    paths.iter().map(|path| read_frame(path, model, spec)).collect()
-}
-
-fn read_frame(path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
-    let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
-    let frame = codec::decode(&bytes)
-        .map_err(|error| CliError::Failed(format!("{}: {}", path.display(), wording::sentence(&error))))?;
-    if (frame.width(), frame.height()) != (spec.frame_width_px, spec.frame_height_px) {
+fn input(args: &PredictArgs, loaded: &LoadedModel, selected: &Selected) -> Result<PredictionInput, CliError> {
+    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
+    let mut input = PredictionInput {
+        frames: selected.seen.clone(),
+        ..PredictionInput::default()
+    };
+    if let Some(path) = &args.actions {
+        let file = ActionsFile::read(path)?;
+        file.check(path, selected.last, spec)?;
+        (input.state, input.future_actions) = file.conditioning(selected.last, spec);
+    } else if spec.action_inputs().is_some() {
         return Err(CliError::Usage(format!(
-            "{} is {}×{} px; model {model:?} takes {}×{}",
-            path.display(),
-            frame.width(),
-            frame.height(),
-            spec.frame_width_px,
-            spec.frame_height_px
+            "--actions is missing; model {name:?} takes {}",
+            error_text::comma_separated(&spec.actions)
         )));
     }
-    Ok(frame)
+    Ok(input)
 }
 
-fn write(
-    out: &Path,
-    loaded: &LoadedModel,
-    seen: &[Frame],
-    predicted: &[Frame],
-    truth: &[Frame],
-) -> Result<(), CliError> {
-    let save = |name: String, bytes: &[u8]| {
-        let path = out.join(name);
-        write_atomically(&path, bytes).map_err(|error| CliError::io("write", &path, &error))
-    };
+fn write(output: &OutputDirectory, spec: &ModelSpec, selected: &Selected, predicted: &[Frame]) -> Result<(), CliError> {
+    let png = |frame: &Frame| codec::encode_png(frame).map_err(CliError::failed);
     for (index, frame) in predicted.iter().enumerate() {
-        save(
-            format!("predicted-{}.png", index + 1),
-            &codec::encode_png(frame).map_err(CliError::failed)?,
-        )?;
+        output.write(&format!("predicted-{}.png", index + 1), &png(frame)?)?;
     }
-    let sheet = montage::prediction_sheet(seen, predicted, truth).map_err(CliError::failed)?;
-    save(
-        "contact-sheet.png".to_owned(),
-        &codec::encode_png(&sheet).map_err(CliError::failed)?,
-    )?;
-    let delay_ms = (loaded.model.spec().frame_period_s * 1000.0).round() as u32;
-    let film: Vec<Frame> = seen.iter().chain(predicted).cloned().collect();
-    save(
-        "prediction.gif".to_owned(),
+    output.write("contact-sheet.png", &png(&contact_sheet(selected, predicted)?)?)?;
+    let film = selected.seen.iter().chain(predicted).map(montage::enlarged);
+    let film = film.collect::<Result<Vec<Frame>, _>>().map_err(CliError::failed)?;
+    let delay_ms = (spec.frame_period_s * 1000.0).round() as u32;
+    output.write(
+        "prediction.gif",
         &codec::encode_gif(&film, delay_ms).map_err(CliError::failed)?,
     )
+}
+
+/// The frames next to the last one seen, as many on each side as fit into an image.
+fn contact_sheet(selected: &Selected, predicted: &[Frame]) -> Result<Frame, CliError> {
+    let mut count = selected.seen.len().max(predicted.len());
+    loop {
+        let seen = &selected.seen[selected.seen.len().saturating_sub(count)..];
+        let sheet = montage::prediction_sheet(seen, first(predicted, count), first(&selected.truth, count));
+        match sheet {
+            Err(FrameError::Size { .. }) if count > 1 => count /= 2,
+            other => return other.map_err(CliError::failed),
+        }
+    }
+}
+
+fn first(frames: &[Frame], count: usize) -> &[Frame] {
+    frames.get(..count).unwrap_or(frames)
 }

@@ -3,83 +3,101 @@
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
-use super::settings::{Settings, checked, open_store};
-use super::{CliError, say};
+use super::settings::{ServerArgs, open_store, with_checked_directories};
+use super::{CliError, print_line};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App};
+use crate::store::Store;
 use crate::telemetry;
 
 /// Serve models over HTTP and WebSocket.
 ///
-/// Loads the models in --models and those that its own training jobs published in --data-dir, prints its address, and
-/// answers until Ctrl-C or SIGTERM.
+/// Loads the active version of every model in the models directory and the data directory, prints its address, and serves until
+/// Ctrl-C or SIGTERM. `foreframe config` lists all settings.
 #[derive(clap::Args, Default)]
-#[command(after_help = "Then look at http://127.0.0.1:8642/ or ask it:
+#[command(after_help = "Examples:
+  foreframe serve
+  foreframe serve --port 9000
+  foreframe serve --bind localhost:8642 --data-dir /var/lib/foreframe --set drain_ms=5000
+
+Then open http://127.0.0.1:8642/ in a browser, or ask on the command line:
   curl http://127.0.0.1:8642/v1/models")]
 pub(super) struct ServeArgs {
     #[command(flatten)]
-    settings: Settings,
+    settings: ServerArgs,
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let config = checked(args.settings.load()?)?;
+    let mut config = with_checked_directories(args.settings.load()?)?;
+    config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
-    telemetry::record();
+    telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
-        // Each such thread keeps memory, and many that decode would leave the one that predicts few turns.
+        // Every such thread uses memory, and many decoding threads would slow down the one that predicts.
         .max_blocking_threads(config.server.request_threads)
         .build()
         .map_err(CliError::failed)?;
     let result = runtime.block_on(listen(config));
-    // What has not ended by the deadline is not waited for.
+    // Tasks that did not end by the deadline are dropped.
     runtime.shutdown_background();
     result
 }
 
 async fn listen(config: Config) -> Result<(), CliError> {
-    let keys = keys(&config).await?;
+    let store = open_store(&config).await?;
+    let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
         CliError::Failed(format!(
-            "could not listen on {}: {error}; try another --bind",
+            "could not listen on {}: {error}; choose another address or port with --bind or --port",
             config.bind
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    let app = Box::pin(App::open(config.server))
+    let app = Box::pin(App::with_store(config.server, store))
         .await
         .map_err(CliError::failed)?
         .with_keys(keys);
+    report_models(&app);
+    print_line(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
+    let store = app.store().clone();
+    server::serve(listener, app, server::shutdown::requested()).await;
+    // From now on, the database file alone is complete.
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
+    }
+    Ok(())
+}
+
+/// Logs the models that are served, or what to do if there are none.
+fn report_models(app: &App) {
     let models = app.predictor().models();
     for manifest in &models {
         info!(model.id = %manifest.name, model.version = manifest.version, "model loaded");
     }
-    if models.is_empty() {
-        info!(directory = %app.config().models_dir.display(), "no models there; train one by POST /v1/jobs, or copy there what foreframe train made");
+    if let Some(advice) = app.no_model_advice() {
+        warn!("{advice}");
     }
-    say(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
-    server::serve(listener, app, server::shutdown::requested()).await;
-    Ok(())
 }
 
-/// Who may call. Errors: `Usage` if other machines can, and there is no key to ask them for.
-async fn keys(config: &Config) -> Result<Keys, CliError> {
+/// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.
+async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
-    let keys = Keys::of(open_store(config).await?, is_required).await?;
+    let keys = Keys::open(store, is_required).await?;
     if is_required && keys.count() == 0 {
         return Err(CliError::Usage(format!(
-            "{} can be reached from other machines and there is no key to ask for; make one by foreframe keys create \
-             NAME, bind a loopback address, or say --insecure",
+            "other machines can reach {}, but no API keys exist; create one with foreframe keys create NAME, bind a \
+             loopback address, or use --insecure",
             config.bind
         )));
     }
     match keys.count() {
-        0 if keys.are_asked_for() => {
-            warn!("all keys are revoked: nobody may call until foreframe keys create makes one");
+        0 if keys.are_required() => {
+            warn!("no valid API key exists: every request is refused until foreframe keys create makes one");
         }
-        0 => info!("no key was ever made: everybody may call"),
-        count => info!(keys = count, "whoever has a key may call"),
+        0 => info!("authentication is off: no API keys exist"),
+        count => info!(keys = count, "authentication is on"),
     }
     Ok(keys)
 }

@@ -1,106 +1,153 @@
-//! The flags that go over file and environment, shared by the commands that run long.
+//! The flags that set values of the configuration. Each flag has the name of its setting.
 
 use std::path::PathBuf;
 
 use super::CliError;
-use crate::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
+use crate::config::{Config, ConfigError, LoadedConfig};
+use crate::settings::{SettingsError, SettingsLayer};
 use crate::store::{Store, StoreError};
+use crate::telemetry;
 
-/// Where state is kept.
+/// The heading of these flags in every help text.
+const HEADING: &str = "Settings";
+
+/// Where data sets, models and state are.
 #[derive(clap::Args, Default)]
-pub(super) struct StoreSettings {
-    /// A TOML file of settings [default: foreframe.toml, if it is there]
-    #[arg(global = true, long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Where jobs keep data sets, runs and the models they train [default: data]
-    #[arg(global = true, long, value_name = "DIR")]
+pub(super) struct DirectoryArgs {
+    /// The data directory: data sets, published models and the database [default: data]
+    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
     data_dir: Option<PathBuf>,
-    /// Rows, to share them with other servers: PostgreSQL's URL [default: SQLite in the data directory]
-    #[arg(global = true, long, value_name = "URL")]
+    /// The directory of the models that came with the program [default: models]
+    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
+    models_dir: Option<PathBuf>,
+    /// A PostgreSQL URL, to share the database with other servers [default: SQLite in the data directory]
+    #[arg(global = true, long, value_name = "URL", help_heading = HEADING, hide_short_help = true)]
     database_url: Option<String>,
-    /// Files, to share them with other servers: an S3 bucket's URL [default: the data directory]
-    #[arg(global = true, long, value_name = "URL")]
+    /// A directory or the URL of an S3 bucket, to share files with other servers [default: the data directory]
+    #[arg(global = true, long, value_name = "URL", help_heading = HEADING, hide_short_help = true)]
     objects_url: Option<String>,
-    /// How log lines look: text or json [default: text]
-    #[arg(global = true, long, value_name = "FORMAT")]
+    /// The format of log lines: text or json [default: text]
+    #[arg(global = true, long, value_name = "FORMAT", help_heading = HEADING, hide_short_help = true)]
     log_format: Option<String>,
-    /// Any other setting, as in `max_streams=64`; may be given many times
-    #[arg(global = true, long = "set", value_name = "KEY=VALUE")]
-    settings: Vec<String>,
 }
 
-impl StoreSettings {
+impl DirectoryArgs {
+    /// The configuration with these flags over everything else; starts the log.
+    pub(super) fn start(&self) -> Result<Config, CliError> {
+        start(LoadedConfig::read(None, self.layers())?)
+    }
+
+    fn layers(&self) -> Vec<SettingsLayer> {
+        let text = |path: &Option<PathBuf>| path.as_ref().map(|path| path.to_string_lossy().into_owned());
+        let flags = [
+            ("--data-dir", "data_dir", text(&self.data_dir)),
+            ("--models-dir", "models_dir", text(&self.models_dir)),
+            ("--database-url", "database_url", self.database_url.clone()),
+            ("--objects-url", "objects_url", self.objects_url.clone()),
+            ("--log-format", "log_format", self.log_format.clone()),
+        ];
+        let layer = |(flag, key, value): (&str, &str, Option<String>)| Some(SettingsLayer::value(flag, key, value?));
+        flags.into_iter().filter_map(layer).collect()
+    }
+}
+
+/// The settings of every command but `train`, which has settings of its own.
+#[derive(clap::Args, Default)]
+pub(super) struct CommonArgs {
+    /// A TOML file of settings [default: foreframe.toml, if it exists]
+    #[arg(global = true, long, value_name = "FILE", help_heading = HEADING, hide_short_help = true)]
+    config: Option<PathBuf>,
+    /// Any setting, as in `max_streams=64`; may be repeated. `foreframe config` lists all settings
+    #[arg(global = true, long = "set", value_name = "KEY=VALUE", help_heading = HEADING, hide_short_help = true)]
+    settings: Vec<String>,
+    #[command(flatten)]
+    directories: DirectoryArgs,
+}
+
+impl CommonArgs {
+    /// The configuration with these flags over everything else; starts the log.
+    pub(super) fn start(&self) -> Result<Config, CliError> {
+        start(self.load()?)
+    }
+
     /// The configuration with these flags over everything else.
     pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
         self.load_with(Vec::new())
     }
 
-    fn load_with(&self, mut flags: Vec<ConfigLayer>) -> Result<LoadedConfig, CliError> {
-        let data_dir = self.data_dir.as_ref().map(|dir| dir.to_string_lossy().into_owned());
-        flags.extend(given([
-            ("--data-dir", "data_dir", data_dir),
-            ("--database-url", "database_url", self.database_url.clone()),
-            ("--objects-url", "objects_url", self.objects_url.clone()),
-            ("--log-format", "log_format", self.log_format.clone()),
-        ]));
+    fn load_with(&self, mut flags: Vec<SettingsLayer>) -> Result<LoadedConfig, CliError> {
+        flags.extend(self.directories.layers());
         for setting in &self.settings {
-            flags.push(ConfigLayer::setting(setting)?);
+            flags.push(SettingsLayer::assignment(setting)?);
         }
         Ok(LoadedConfig::read(self.config.as_deref(), flags)?)
     }
 }
 
-/// All that `serve` takes; `foreframe config` prints every setting, with where it comes from.
+/// The settings of a server.
 #[derive(clap::Args, Default)]
-pub(super) struct Settings {
-    /// Where to listen [default: 127.0.0.1:8642]
-    #[arg(long, value_name = "ADDRESS:PORT")]
+pub(super) struct ServerArgs {
+    /// The address to listen on: an IP address or a name, with or without a port [default: 127.0.0.1:8642]
+    #[arg(long, value_name = "HOST:PORT", help_heading = HEADING)]
     bind: Option<String>,
-    /// The directory of the models to serve [default: models]
-    #[arg(long, value_name = "DIR")]
-    models: Option<PathBuf>,
-    #[command(flatten)]
-    store: StoreSettings,
-    /// Leave jobs to workers
-    #[arg(long)]
+    /// The port to listen on; replaces the port of --bind
+    #[arg(long, value_name = "PORT", help_heading = HEADING)]
+    port: Option<u16>,
+    /// Accept jobs, but leave the work to `foreframe worker`
+    #[arg(long, help_heading = HEADING)]
     no_jobs: bool,
-    /// Listen on other than a loopback address although nobody needs a key
-    #[arg(long)]
+    /// Accept requests from other machines although no API key exists
+    #[arg(long, help_heading = HEADING)]
     insecure: bool,
+    #[command(flatten)]
+    common: CommonArgs,
 }
 
-impl Settings {
+impl ServerArgs {
     /// The configuration with these flags over everything else.
     pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
-        let models = self.models.as_ref().map(|dir| dir.to_string_lossy().into_owned());
-        let mut flags = given([
-            ("--bind", "bind", self.bind.clone()),
-            ("--models", "models_dir", models),
-        ]);
-        flags.extend(self.no_jobs.then(|| ConfigLayer::one("--no-jobs", "no_jobs", true)));
-        flags.extend(self.insecure.then(|| ConfigLayer::one("--insecure", "insecure", true)));
-        self.store.load_with(flags)
+        let mut flags = Vec::new();
+        if let Some(bind) = &self.bind {
+            flags.push(SettingsLayer::value("--bind", "bind", bind.clone()));
+        }
+        if let Some(port) = self.port {
+            flags.push(SettingsLayer::value("--port", "port", port));
+        }
+        if self.no_jobs {
+            flags.push(SettingsLayer::value("--no-jobs", "no_jobs", true));
+        }
+        if self.insecure {
+            flags.push(SettingsLayer::value("--insecure", "insecure", true));
+        }
+        self.common.load_with(flags)
     }
 }
 
-fn given<const N: usize>(flags: [(&str, &str, Option<String>); N]) -> Vec<ConfigLayer> {
-    let given = |(flag, field, text): (&str, &str, Option<String>)| Some(ConfigLayer::one(flag, field, text?));
-    flags.into_iter().filter_map(given).collect()
+fn start(loaded: LoadedConfig) -> Result<Config, CliError> {
+    // Short commands send no traces.
+    let _ = telemetry::init(loaded.config.log_format, None)?;
+    Ok(loaded.config)
 }
 
-/// The configuration of a command that is about to begin its work in its directories.
-pub(super) fn checked(loaded: LoadedConfig) -> Result<Config, CliError> {
+/// The configuration of a command that is about to work in its directories. Errors: `Usage` if one cannot be used.
+pub(super) fn with_checked_directories(loaded: LoadedConfig) -> Result<Config, CliError> {
     loaded.check_directories()?;
     Ok(loaded.config)
 }
 
-/// The store that the settings name.
+/// The store of the configuration.
 pub(super) async fn open_store(config: &Config) -> Result<Store, CliError> {
     Ok(Store::open(&config.server.store()).await?)
 }
 
 impl From<ConfigError> for CliError {
     fn from(error: ConfigError) -> Self {
+        Self::Usage(error.to_string())
+    }
+}
+
+impl From<SettingsError> for CliError {
+    fn from(error: SettingsError) -> Self {
         Self::Usage(error.to_string())
     }
 }

@@ -1,55 +1,61 @@
 //! `foreframe train`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use super::{CliError, command_line, interrupt, open_dataset, progress::ProgressLine, say};
+use super::settings::DirectoryArgs;
+use super::workspace::Workspace;
+use super::{CliError, command_line, interrupt, print_line, progress::ProgressLine};
+use crate::settings::SettingsLayer;
 use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
 /// Train a model on a data set.
 ///
-/// Two stages: the dense codec alone (pretrain), then the recurrent network (fit). Validation chooses the weights. Ctrl-C
-/// writes a checkpoint, and so does every few hundred steps; the same command goes on from it, to the same weights as if
-/// it had never stopped.
+/// Training has two stages: pretrain (the frame codec alone) and fit (the recurrent network). The weights with the lowest
+/// validation error are kept. A checkpoint is written every few hundred steps and on Ctrl-C; the same command continues from it,
+/// and ends with the same weights as without the interruption.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe train --preset paper --dataset static-observer
   foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
-  foreframe train --preset paper --print-config > mine.toml   # every field, to edit and pass with --config")]
+  foreframe train --preset paper --print-config > mine.toml
+  foreframe train --preset paper --config mine.toml")]
 pub(super) struct TrainArgs {
-    /// paper (1000 windows), static (all windows) or moving (told the robot's state and actions)
+    /// paper (1000 windows), static (all windows) or moving (also takes the robot's state and actions)
     #[arg(long, default_value = "paper")]
     preset: String,
-    /// The data set's directory, or its name in data/datasets [default: static-observer or, for moving, moving-observer]
+    /// The directory of a data set, or its name in DATA_DIR/datasets [default: static-observer; for moving, moving-observer]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
-    /// The run's directory: configuration, checkpoint and at the end the model [default: runs/NAME]
+    /// The directory of the run, for the configuration, the checkpoint and at the end the model [default: runs/NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// A TOML file whose fields replace the preset's
+    /// A TOML file of training settings, which replace those of the preset
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// One field, as in fit.steps=3000; may be given many times, and goes over --config
+    /// One training setting, as in fit.steps=3000; may be repeated, and replaces that of --config
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
-    /// Print the configuration and stop
+    /// Print the training settings and stop
     #[arg(long)]
     print_config: bool,
+    #[command(flatten)]
+    directories: DirectoryArgs,
 }
 
 pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
-    let file = args.config.as_deref().map(read_config).transpose()?;
-    let config = TrainConfig::layered(&args.preset, file.as_deref(), &args.settings)?;
+    let config = training_config(args)?;
     if args.print_config {
-        return say(config.to_toml()?.trim_end());
+        return print_line(config.to_toml()?.trim_end());
     }
+    let workspace = Workspace::new(args.directories.start()?);
     let dataset = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
-    let (dataset_dir, dataset) = open_dataset(&dataset)?;
+    let (dataset_dir, dataset) = workspace.open_dataset(&dataset)?;
     let run_dir = args
         .out
         .clone()
         .unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
     let command = command_line();
-    let job = Training {
+    let training = Training {
         config: &config,
         dataset: &dataset,
         run_dir: &run_dir,
@@ -57,27 +63,40 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     };
     let cancelled = interrupt::flag()?;
     let progress = ProgressLine::new("steps");
-    let mut watch = TrainingDisplay::new(&progress, &config);
-    let outcome = training::run(&job, &mut |event: TrainingEvent| watch.on_event(event), &cancelled);
+    let mut display = TrainingDisplay::new(&progress, &config);
+    let outcome = training::run(
+        &training,
+        &mut |event: TrainingEvent| display.on_event(event),
+        &cancelled,
+    );
     progress.finish();
     match outcome? {
-        TrainingOutcome::Finished { model_dir, manifest } => say(format!(
-            "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}",
+        TrainingOutcome::Finished { model_dir, manifest } => print_line(format!(
+            "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
             model_dir.display(),
             manifest.parameters,
             manifest.metrics["validation"],
             model_dir.display(),
             dataset_dir.display(),
+            run_dir.display(),
         )),
         TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
-            "stopped in {stage} after step {step}; the checkpoint is in {}, the same command goes on from it",
+            "stopped in {stage} after step {step}; the checkpoint is in {}, and the same command continues from it",
             run_dir.display()
         ))),
     }
 }
 
-fn read_config(path: &Path) -> Result<String, CliError> {
-    std::fs::read_to_string(path).map_err(|error| CliError::io("read", path, &error))
+/// The preset under the file of settings and the single settings.
+fn training_config(args: &TrainArgs) -> Result<TrainConfig, CliError> {
+    let mut layers = Vec::new();
+    if let Some(path) = &args.config {
+        layers.push(SettingsLayer::file(path)?);
+    }
+    for setting in &args.settings {
+        layers.push(SettingsLayer::assignment(setting)?);
+    }
+    Ok(TrainConfig::from_layers(&args.preset, layers)?)
 }
 
 fn default_dataset(preset: &str) -> PathBuf {
@@ -93,7 +112,8 @@ struct TrainingDisplay<'a> {
     progress: &'a ProgressLine,
     steps: [usize; 2],
     stage: Option<TrainingStage>,
-    validation: Option<f64>,
+    /// The lowest validation error of the stage.
+    best: [Option<f64>; 2],
 }
 
 impl<'a> TrainingDisplay<'a> {
@@ -102,7 +122,7 @@ impl<'a> TrainingDisplay<'a> {
             progress,
             steps: [config.pretrain.steps, config.fit.steps],
             stage: None,
-            validation: None,
+            best: [None; 2],
         }
     }
 
@@ -121,27 +141,77 @@ impl<'a> TrainingDisplay<'a> {
                 if self.stage != Some(stage) {
                     self.start(stage, step - 1);
                 }
-                let validation = self.validation;
-                self.progress.update(step as u64, steps as u64, || match validation {
-                    Some(best) => format!("loss {loss:.6}, validation {best:.6}"),
-                    None => format!("loss {loss:.6}"),
-                });
+                let message = self.message(stage, loss);
+                self.progress.update(step as u64, steps as u64, || message);
             }
             TrainingEvent::Validated {
-                step, loss, is_best, ..
+                stage,
+                step,
+                loss,
+                is_best,
             } => {
-                self.validation = Some(loss);
-                let kept = if is_best { ", the best so far" } else { "" };
+                self.validated(stage, loss);
+                let remark = if is_best { ", the best so far" } else { "" };
                 self.progress
-                    .line(&format!("step {step}: validation MSE {loss:.6}{kept}"));
+                    .line(&format!("step {step}: validation MSE {loss:.6}{remark}"));
             }
-            TrainingEvent::Recalled { .. } | TrainingEvent::Checkpointed { .. } => {}
+            TrainingEvent::Restored {
+                stage, validation_loss, ..
+            } => self.validated(stage, validation_loss),
+            TrainingEvent::CheckpointDamaged { is_previous } => {
+                tracing::warn!(is_previous, "a checkpoint is damaged and is not used");
+            }
+            TrainingEvent::Checkpointed { .. } => {}
         }
     }
 
+    /// The stage's own losses: those of the other stage measure something else.
+    fn message(&self, stage: TrainingStage, loss: f64) -> String {
+        match self.best[index(stage)] {
+            Some(best) => format!("loss {loss:.6}, best validation {best:.6}"),
+            None => format!("loss {loss:.6}"),
+        }
+    }
+
+    fn validated(&mut self, stage: TrainingStage, loss: f64) {
+        let best = &mut self.best[index(stage)];
+        *best = Some(best.map_or(loss, |best| best.min(loss)));
+    }
+
     fn start(&mut self, stage: TrainingStage, step: usize) {
-        let total = self.steps[usize::from(stage == TrainingStage::Fit)];
+        let total = self.steps[index(stage)];
         self.progress.start(&stage.to_string(), step as u64, total as u64);
         self.stage = Some(stage);
+    }
+}
+
+fn index(stage: TrainingStage) -> usize {
+    usize::from(stage == TrainingStage::Fit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fit_shows_its_own_best_validation() {
+        let progress = ProgressLine::new("steps");
+        let config = TrainConfig::preset("paper").unwrap();
+        let mut display = TrainingDisplay::new(&progress, &config);
+        let mut validated = |stage, loss| {
+            display.on_event(TrainingEvent::Validated {
+                stage,
+                step: 1,
+                loss,
+                is_best: false,
+            });
+            display.message(TrainingStage::Fit, 0.5)
+        };
+        assert_eq!(validated(TrainingStage::Pretrain, 0.1), "loss 0.500000");
+        validated(TrainingStage::Fit, 0.3);
+        assert_eq!(
+            validated(TrainingStage::Fit, 0.4),
+            "loss 0.500000, best validation 0.300000"
+        );
     }
 }

@@ -1,17 +1,15 @@
-//! Values and ranges as people read them.
+//! Settings as people read them.
 
 use std::collections::HashMap;
 
-use figment::Figment;
-use figment::error::Kind;
-use figment::value::Value;
 use utoipa::PartialSchema as _;
 use utoipa::openapi::{RefOr, Schema};
 
-use super::{Config, origin};
+use super::{Config, range};
 use crate::server::ServerConfig;
+use crate::settings::LayeredSettings;
 
-/// What each field means, from its documentation.
+/// What each setting means, from its documentation.
 pub(super) fn meanings() -> HashMap<String, String> {
     let schemas = [Config::schema(), ServerConfig::schema()];
     let properties = schemas.into_iter().filter_map(|schema| match schema {
@@ -26,53 +24,23 @@ pub(super) fn meanings() -> HashMap<String, String> {
     properties.flatten().filter_map(meaning).collect()
 }
 
-/// What it means, and `field = value  # where it came from; its range`. What hides a password is a remark, not to be taken
-/// for a value.
-pub(super) fn entry(values: &Figment, field: &str, meanings: &HashMap<String, String>) -> String {
+/// The meaning of a setting, then `field = value  # origin; range`. A value with a hidden password is a comment, so that
+/// it is not read back as the value.
+pub(super) fn entry(values: &LayeredSettings, field: &str, meanings: &HashMap<String, String>) -> String {
     let meaning = meanings
         .get(field)
         .map_or_else(String::new, |meaning| format!("# {}\n", meaning.replace('\n', "\n# ")));
     let range = range(field).map_or_else(String::new, |range| format!("; {range}"));
-    let origin = origin(values, field);
-    let line = match values.find_value(field) {
-        Ok(Value::Empty(..)) | Err(_) => format!("# {field} is not set"),
-        Ok(Value::String(_, text)) if masked(&text) != text => {
-            format!(
-                "# {field} is {}, its password not shown  # {origin}",
-                shown(values, field)
-            )
+    let origin = values.origin(field);
+    let line = match values.value(field) {
+        None => format!("# {field} is not set"),
+        Some(toml::Value::String(text)) if masked(&text) != text => {
+            let shown = toml::Value::String(masked(&text));
+            format!("# {field} is {shown}, with the password hidden  # {origin}")
         }
-        Ok(_) => format!("{field} = {}  # {origin}{range}", shown(values, field)),
+        Some(value) => format!("{field} = {value}  # {origin}{range}"),
     };
     format!("{meaning}{line}\n")
-}
-
-/// A value as TOML, with the password in a URL masked.
-pub(super) fn shown(values: &Figment, field: &str) -> String {
-    let value: Option<toml::Value> = values.find_value(field).ok().and_then(|value| value.deserialize().ok());
-    match value {
-        Some(toml::Value::String(text)) => toml::Value::String(masked(&text)).to_string(),
-        Some(value) => value.to_string(),
-        None => "not set".to_owned(),
-    }
-}
-
-/// What would be right for a field.
-pub(super) fn right(field: &str, kind: &Kind) -> String {
-    match (field, kind) {
-        ("bind", _) => "ADDRESS:PORT, as in 127.0.0.1:8642".to_owned(),
-        (_, Kind::UnknownVariant(_, variants)) => variants.join(" or "),
-        (_, Kind::InvalidType(_, expected) | Kind::InvalidValue(_, expected)) => {
-            range(field).unwrap_or_else(|| expected.clone())
-        }
-        (_, other) => other.to_string(),
-    }
-}
-
-fn range(field: &str) -> Option<String> {
-    let bounds = ServerConfig::default().bounds();
-    let (_, _, range) = bounds.iter().find(|(name, _, _)| *name == field)?;
-    Some(format!("{} to {}", range.start(), range.end()))
 }
 
 /// `scheme://user:***@host/…?password=***`

@@ -1,37 +1,37 @@
-//! Data sets by name, in the directory that keeps them.
+//! Finds data sets by name in a directory.
 
 use std::path::{Path, PathBuf};
 
 use super::DatasetError;
 use super::layout::INFO;
 
-/// Whether a directory holds a finished data set: what says so is written last.
+/// Whether a directory holds a finished data set. The file that it checks is written last.
 #[must_use]
 pub fn is_finished(dir: &Path) -> bool {
     dir.join(INFO).is_file()
 }
 
-/// Names of the finished data sets in a directory, sorted; an absent one holds none. Errors: `Io`.
+/// Names of the finished data sets in a directory, sorted. A missing directory contains none. Errors: `Io`.
 pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
     if !datasets_dir.exists() {
         return Ok(Vec::new());
     }
-    let unlisted = DatasetError::io("list", datasets_dir);
+    let list_failed = DatasetError::io("list", datasets_dir);
     let entries = std::fs::read_dir(datasets_dir).and_then(Iterator::collect::<Result<Vec<_>, _>>);
     let mut names: Vec<String> = entries
-        .map_err(unlisted)?
+        .map_err(list_failed)?
         .into_iter()
         .filter(|entry| is_finished(&entry.path()))
         .filter_map(|entry| entry.file_name().into_string().ok())
-        // One that is being deleted has a hidden name.
+        // A data set that is being deleted has a hidden name.
         .filter(|name| !name.starts_with('.'))
         .collect();
     names.sort();
     Ok(names)
 }
 
-/// The directory of the data set called `what`: a path that leads to one, or else a name below `datasets_dir`. It may be
-/// unfinished. Errors: `Unknown` with the names there are, `NotADataset`, `Io`.
+/// The directory of a data set that the user gave as a path or as a name below `datasets_dir`. A path is tried first. The
+/// data set may be unfinished. Errors: `Unknown` with the existing names, `NotADataset`, `Io`.
 pub fn find(datasets_dir: &Path, what: &Path) -> Result<PathBuf, DatasetError> {
     if what.join("meta").is_dir() {
         return Ok(what.to_owned());
@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_data_set_is_found_by_path_before_name_and_an_unknown_one_answered_with_those_there_are() {
+    fn data_sets_are_found_by_path_or_name() {
         let dir = tempfile::tempdir().unwrap();
         let datasets = dir.path().join("datasets");
         for name in ["b", "a", "unfinished"] {

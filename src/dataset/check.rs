@@ -1,4 +1,4 @@
-//! What every data set must hold to: parts that fit together, finite numbers, time that grows.
+//! Checks that every data set must pass: matching lengths, finite numbers, increasing timestamps.
 
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::frame::MAX_SIDE_PX;
@@ -66,11 +66,11 @@ pub(super) fn check_numbers(info: &DatasetInfo, episode: usize, numbers: &Number
 
 fn check_finite(episode: usize, part: &'static str, values: &[f32], size: usize) -> Result<(), DatasetError> {
     match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => Err(DatasetError::NotFinite {
+        Some(index) => Err(DatasetError::NotFinite {
             episode,
-            frame: place / size,
+            frame: index / size,
             part,
-            value: f64::from(values[place]),
+            value: f64::from(values[index]),
         }),
         None => Ok(()),
     }
@@ -86,9 +86,9 @@ fn check_time(episode: usize, timestamps_s: &[f64]) -> Result<(), DatasetError> 
         });
     }
     match timestamps_s.windows(2).position(|pair| pair[1] <= pair[0]) {
-        Some(before) => Err(DatasetError::TimeOrder {
+        Some(previous) => Err(DatasetError::TimeOrder {
             episode,
-            frame: before + 1,
+            frame: previous + 1,
         }),
         None => Ok(()),
     }

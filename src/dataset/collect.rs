@@ -1,7 +1,8 @@
-//! Simulates trials into a data set on disk, on several threads, so that nothing finished is lost when it is stopped.
+//! Simulates trials on several threads and writes them as a data set. Finished shards stay on disk if it is stopped.
 //!
-//! Threads simulate whole shards of consecutive trials; the calling thread writes them in order, each as a whole. What
-//! is written depends on the seed and the trial alone, not on threads or interruptions.
+//! Each thread simulates a complete shard of consecutive trials; the calling thread writes the shards in order, each
+//! atomically. If the collection is stopped, the finished trials of the other shards are saved beside them. The finished
+//! data set depends only on seed and trial numbers, not on threads or interruptions.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -15,30 +16,30 @@ use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::sim::{Observation, Scenario, SimError, World, WorldConfig, action_channels};
 use crate::types::Seed;
 
-/// Trials that make one file, unless asked otherwise.
+/// Default number of trials in a shard.
 pub const DEFAULT_TRIALS_PER_SHARD: u64 = 50;
 
-/// What to collect, and where to.
+/// Settings of a collection.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CollectConfig {
     /// The scenario.
     pub scenario: Scenario,
-    /// Trials from 0 on.
+    /// Number of trials. Trials are numbered from 0.
     pub trials: u64,
-    /// The seed that every trial's own is derived from.
+    /// The seed from which the seed of every trial is derived.
     pub seed: Seed,
     /// The data set's directory.
     pub out: PathBuf,
-    /// How the world is run and seen.
+    /// Settings of the simulated world.
     pub world: WorldConfig,
-    /// Threads that simulate; 0 for as many as there are cores.
+    /// Number of simulation threads; 0 for the number of cores.
     pub threads: usize,
-    /// Trials that make one file.
+    /// Number of trials in a shard.
     pub trials_per_shard: u64,
 }
 
 impl CollectConfig {
-    /// That many trials of a scenario, with the defaults for all else.
+    /// A collection of this many trials of a scenario, with default values for all other settings.
     #[must_use]
     pub fn new(scenario: Scenario, trials: u64, seed: Seed, out: &Path) -> Self {
         Self {
@@ -52,7 +53,7 @@ impl CollectConfig {
         }
     }
 
-    /// Errors: `Zero`, and what the world says of its settings.
+    /// Checks the settings. Errors: `Zero`, `World`.
     pub fn validate(&self) -> Result<(), DatasetError> {
         for (what, value) in [
             ("the number of trials", self.trials),
@@ -65,7 +66,7 @@ impl CollectConfig {
         self.world.validate().map_err(DatasetError::World)
     }
 
-    /// Files that it takes.
+    /// Number of shards.
     pub(super) fn shard_count(&self) -> usize {
         self.trials.div_ceil(self.trials_per_shard) as usize
     }
@@ -87,14 +88,14 @@ impl CollectConfig {
 /// How far a collection is, in trials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CollectProgress {
-    /// Trials simulated, with those found when it was taken up again.
+    /// Simulated trials, including those found on disk when the collection was resumed.
     pub done: u64,
-    /// Trials asked for.
+    /// Requested trials.
     pub total: u64,
 }
 
-/// Collects a data set, or goes on with one that was begun with the same arguments; returns at once where it is
-/// finished already ([`CollectionStatus::of`] tells). Progress is told from several threads.
+/// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished
+/// ([`CollectionStatus::of`] tells). Several threads call `on_progress`.
 /// Errors: `Zero`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect(
     config: &CollectConfig,
@@ -105,8 +106,8 @@ pub fn collect(
     if let CollectionStatus::Finished(info) = CollectionStatus::of(config)? {
         return Ok(*info);
     }
-    let mut collection = Collection::begin(config)?;
-    let crew = CollectWorkers {
+    let mut collection = Collection::open(config)?;
+    let workers = CollectWorkers {
         config,
         info: collection.info().clone(),
         next_shard: AtomicUsize::new(collection.shard_count()),
@@ -115,21 +116,24 @@ pub fn collect(
         cancelled,
         failed: AtomicBool::new(false),
     };
-    crew.report(0);
+    workers.report(0);
     let written = std::thread::scope(|scope| {
         let threads = config.thread_count();
         let (sender, receiver) = sync_channel(threads);
         for _ in 0..threads {
-            let (crew, sender) = (&crew, sender.clone());
-            scope.spawn(move || crew.work(&sender));
+            let (workers, sender) = (&workers, sender.clone());
+            scope.spawn(move || workers.work(&sender));
         }
         drop(sender);
         let written = write_in_order(&mut collection, receiver);
-        crew.failed.store(written.is_err(), Ordering::Relaxed);
+        workers.failed.store(written.is_err(), Ordering::Relaxed);
         written
     });
-    written?;
+    let unwritten = written?;
     if collection.shard_count() < config.shard_count() {
+        for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
+            collection.save_unfinished(*shard, episodes)?;
+        }
         return Err(DatasetError::Cancelled {
             done: collection.trial_count(),
             total: config.trials,
@@ -138,22 +142,29 @@ pub fn collect(
     collection.complete()
 }
 
-/// A shard's number and what became of it.
+/// A shard's number and its finished episodes (all of them, unless the collection was stopped), or the error.
 type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
 
-/// Writes shards as they come, each once those before it are written.
-fn write_in_order(collection: &mut Collection<'_>, deliveries: Receiver<ShardResult>) -> Result<(), DatasetError> {
-    let mut early = BTreeMap::new();
-    for (shard, episodes) in deliveries {
-        early.insert(shard, episodes?);
-        while let Some(episodes) = early.remove(&collection.shard_count()) {
-            collection.write(&episodes)?;
+/// Writes complete shards in order. A shard that arrives early waits for the shards before it. Returns the episodes that
+/// could not be written: those of incomplete shards, and of shards after an incomplete one.
+fn write_in_order(
+    collection: &mut Collection<'_>,
+    results: Receiver<ShardResult>,
+) -> Result<BTreeMap<usize, Vec<EncodedEpisode>>, DatasetError> {
+    let mut waiting = BTreeMap::new();
+    for (shard, episodes) in results {
+        waiting.insert(shard, episodes?);
+        while let Some(entry) = waiting.first_entry()
+            && *entry.key() == collection.shard_count()
+            && collection.is_complete(*entry.key(), entry.get())
+        {
+            collection.write(&entry.remove())?;
         }
     }
-    Ok(())
+    Ok(waiting)
 }
 
-/// What the simulating threads share.
+/// State shared by the simulation threads.
 struct CollectWorkers<'a> {
     config: &'a CollectConfig,
     info: DatasetInfo,
@@ -176,39 +187,34 @@ impl CollectWorkers<'_> {
         self.cancelled.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
     }
 
-    /// Takes shard after shard until none is left, the collection is stopped or nobody takes the results.
+    /// Simulates shards until none is left, the collection is stopped, or the receiver is gone.
     fn work(&self, sender: &SyncSender<ShardResult>) {
         loop {
             let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
             if shard >= self.config.shard_count() {
                 return;
             }
-            let delivery = match self.simulate_shard(shard) {
-                Ok(Some(episodes)) => Ok(episodes),
-                Ok(None) => return,
-                Err(error) => Err(error),
-            };
-            if sender.send((shard, delivery)).is_err() {
+            if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
                 return;
             }
         }
     }
 
-    /// The trials of a shard; none when stopped.
-    fn simulate_shard(&self, shard: usize) -> Result<Option<Vec<EncodedEpisode>>, DatasetError> {
-        let mut episodes = Vec::new();
-        for trial in self.config.shard_trials(shard) {
+    /// Simulates the trials of a shard that are not saved yet; stops early if the collection was stopped.
+    fn simulate_shard(&self, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
+        let mut episodes = Collection::saved_episodes(self.config, &self.info, shard);
+        for trial in self.config.shard_trials(shard).skip(episodes.len()) {
             let simulated = self.simulate(trial);
             let Some(data) = simulated.map_err(|source| DatasetError::Simulation { trial, source })? else {
-                return Ok(None);
+                break;
             };
             episodes.push(EncodedEpisode::new(&self.info, trial as usize, data)?);
             self.report(1);
         }
-        Ok(Some(episodes))
+        Ok(episodes)
     }
 
-    /// A trial from its start to its end; none when stopped.
+    /// Simulates a trial; none if the collection was stopped.
     fn simulate(&self, trial: u64) -> Result<Option<EpisodeData>, SimError> {
         let config = self.config;
         let mut world = World::new(config.scenario, &config.world, config.seed, trial)?;
@@ -227,7 +233,7 @@ impl CollectWorkers<'_> {
             record(&mut data, &observation, action.as_slice());
             observation = step.observation;
             if step.terminated || step.truncated {
-                // Nothing acts after the last frame.
+                // There is no action after the last frame.
                 record(&mut data, &observation, &vec![0.0; action_channels().len()]);
                 return Ok(Some(data));
             }

@@ -1,4 +1,4 @@
-//! The directory of a collection: begun, left, taken up again, completed.
+//! The directory of a collection: how far it is, and how it is started, resumed and completed.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -8,17 +8,16 @@ use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
 use super::files::{sha256_of_file, write_atomically};
-use super::layout::{ARGUMENTS, CollectionStamp, INFO, shard_path};
+use super::layout::{ARGUMENTS, DatasetMetadata, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
-use super::{DatasetError, DatasetInfo};
-use crate::frame::warp::CameraModel;
-use crate::files::{is_partial_of, remove_abandoned, sha256_hex};
+use super::{DatasetError, DatasetInfo, unfinished};
+use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
-/// What decides a collection's bytes; kept in the directory from the start.
+/// The arguments that determine a collection's bytes. They are written to the directory first.
 #[derive(Serialize)]
 struct Arguments<'a> {
     program_version: &'static str,
@@ -48,19 +47,19 @@ impl Arguments<'_> {
 /// How far the collection in a directory is.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CollectionStatus {
-    /// Nothing is there yet.
+    /// Nothing has been written yet.
     New,
-    /// So many trials are there already.
-    PendingStep {
-        /// Trials in finished shards.
+    /// Some trials may be saved, but not all.
+    Unfinished {
+        /// Saved trials.
         trials: u64,
     },
-    /// Everything is there.
+    /// The data set is complete.
     Finished(Box<DatasetInfo>),
 }
 
 impl CollectionStatus {
-    /// How far the collection of that configuration is; changes nothing.
+    /// How far the collection with this configuration is. Changes nothing.
     /// Errors: `OutExists`, `OtherArguments`, as [`super::collect()`].
     pub fn of(config: &CollectConfig) -> Result<Self, DatasetError> {
         let out = &config.out;
@@ -79,11 +78,15 @@ impl CollectionStatus {
             });
         }
         if out.join(INFO).exists() {
-            return Ok(Self::Finished(Box::new(CollectionStamp::read(out)?.info())));
+            return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
         }
-        let shards = (0..config.shard_count()).take_while(|&shard| out.join(shard_path(shard)).exists());
-        let trials = shards.map(|shard| config.shard_trials(shard).count() as u64).sum();
-        Ok(Self::PendingStep { trials })
+        let shards = config.shard_count();
+        let complete = (0..shards)
+            .take_while(|&shard| out.join(shard_path(shard)).exists())
+            .count();
+        let in_shards: u64 = (0..complete).map(|shard| config.shard_trials(shard).count() as u64).sum();
+        let beside: u64 = (complete..shards).map(|shard| unfinished::count(out, shard) as u64).sum();
+        Ok(Self::Unfinished { trials: in_shards + beside })
     }
 }
 
@@ -91,7 +94,7 @@ fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
     let path = out.join(ARGUMENTS);
     match fs::read_to_string(&path) {
         Ok(text) => Ok(Some(text)),
-        // Where `out` is a file, that says so itself.
+        // If `out` is a file, `is_unused` reports it.
         Err(error)
             if matches!(
                 error.kind(),
@@ -104,8 +107,8 @@ fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
     }
 }
 
-/// Whether a directory is missing, empty, or holds no more than a collection that was killed before its first write
-/// was done.
+/// Whether a directory is missing, empty, or contains only the partial file of a collection that was killed during its
+/// first write.
 fn is_unused(out: &Path) -> Result<bool, DatasetError> {
     if !out.exists() {
         return Ok(true);
@@ -132,32 +135,39 @@ fn is_unused(out: &Path) -> Result<bool, DatasetError> {
     Ok(true)
 }
 
-/// Every argument that differs, as `trials: 5 there, 6 asked`.
+/// Every argument that differs, for example `trials: 5 in the directory, 6 requested`.
 fn differences(found: &str, wanted: &str) -> String {
+    // A damaged file has no arguments; then all of them differ.
     let object = |text: &str| serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();
     let (found, wanted) = (object(found), object(wanted));
-    let shown = |value: Option<&Value>| value.map_or_else(|| "none".to_owned(), Value::to_string);
+    let text = |value: Option<&Value>| value.map_or_else(|| "none".to_owned(), Value::to_string);
     let differing: Vec<_> = wanted
         .iter()
         .filter(|(key, value)| found.get(*key) != Some(value))
-        .map(|(key, value)| format!("{key}: {} there, {} asked", shown(found.get(key)), shown(Some(value))))
+        .map(|(key, value)| {
+            format!(
+                "{key}: {} in the directory, {} requested",
+                text(found.get(key)),
+                text(Some(value))
+            )
+        })
         .collect();
     differing.join("; ")
 }
 
-/// A collection that is being written: its finished shards, from the first without a hole.
+/// A collection that is being written. Its finished shards are the first ones, without gaps.
 pub(super) struct Collection<'a> {
     config: &'a CollectConfig,
     info: DatasetInfo,
     shards: Vec<FinishedShard>,
     start: ShardStart,
-    /// Held as long as this process writes.
+    /// Locks the directory while this process writes.
     _lock: File,
 }
 
 impl<'a> Collection<'a> {
-    /// Takes a directory whose standing was found to be new or begun, and looks what is there.
-    pub(super) fn begin(config: &'a CollectConfig) -> Result<Self, DatasetError> {
+    /// Locks a new or unfinished collection's directory and finds its finished shards. Errors: `Busy`, `Io`.
+    pub(super) fn open(config: &'a CollectConfig) -> Result<Self, DatasetError> {
         let path = config.out.join(ARGUMENTS);
         if !path.exists() {
             write_atomically(&path, Arguments::text(config)?.as_bytes())?;
@@ -169,7 +179,7 @@ impl<'a> Collection<'a> {
             },
             TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
         })?;
-        remove_abandoned(&config.out);
+        remove_stale_partials(&config.out);
         let mut collection = Self {
             info: description(config),
             config,
@@ -183,22 +193,43 @@ impl<'a> Collection<'a> {
         Ok(collection)
     }
 
-    /// What is being collected; counts and hash are not filled in yet.
+    /// The description of the data set, without counts and hash.
     pub(super) fn info(&self) -> &DatasetInfo {
         &self.info
     }
 
-    /// Shards that are there.
+    /// Number of finished shards.
     pub(super) fn shard_count(&self) -> usize {
         self.shards.len()
     }
 
-    /// Trials that are there.
+    /// Number of saved trials, including those of unfinished shards.
     pub(super) fn trial_count(&self) -> u64 {
-        self.start.episode as u64
+        let unfinished = (self.shards.len()..self.config.shard_count())
+            .map(|shard| unfinished::count(&self.config.out, shard))
+            .sum::<usize>();
+        (self.start.episode + unfinished) as u64
     }
 
-    /// The next shard, if it is on the disk and whole; a damaged one is made anew.
+    /// The saved trials of an unfinished shard.
+    pub(super) fn saved_episodes(config: &CollectConfig, info: &DatasetInfo, shard: usize) -> Vec<EncodedEpisode> {
+        let mut episodes = unfinished::load(info, &config.out, shard);
+        episodes.truncate(config.shard_trials(shard).count());
+        episodes
+    }
+
+    /// Whether these are all trials of a shard.
+    pub(super) fn is_complete(&self, shard: usize, episodes: &[EncodedEpisode]) -> bool {
+        episodes.len() == self.config.shard_trials(shard).count()
+    }
+
+    /// Saves the finished trials of a shard until a later call completes it. Errors: `Io`.
+    pub(super) fn save_unfinished(&self, shard: usize, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
+        let first = self.config.shard_trials(shard).start;
+        unfinished::save(&self.info, &self.config.out, (shard, first), episodes)
+    }
+
+    /// The next shard, if it is on disk and complete. A damaged shard is simulated again.
     fn finished_on_disk(&self) -> Option<FinishedShard> {
         let shard = self.shards.len();
         if shard >= self.config.shard_count() {
@@ -222,7 +253,7 @@ impl<'a> Collection<'a> {
     pub(super) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
         let built = build(&self.info, self.start, episodes)?;
         write_atomically(&self.config.out.join(shard_path(self.shards.len())), &built.bytes)?;
-        // Read back from the text, as a later run would, so that going on changes no digit.
+        // Parse the text as a resumed run would, so that a resumed collection has the same digits.
         let records =
             serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
         self.push(FinishedShard {
@@ -232,8 +263,9 @@ impl<'a> Collection<'a> {
         Ok(())
     }
 
-    /// Writes the tables and descriptions, once every shard is there.
+    /// Writes the tables and metadata after all shards are written.
     pub(super) fn complete(self) -> Result<DatasetInfo, DatasetError> {
+        unfinished::remove_all(&self.config.out)?;
         complete(&self.config.out, self.info, &self.shards)
     }
 }
@@ -252,9 +284,7 @@ fn description(config: &CollectConfig) -> DatasetInfo {
         frame_count: 0,
         episode_count: 0,
         has_masks: true,
-        camera: Some(CameraModel {
-            horizontal_fov_rad: config.world.camera.horizontal_fov_rad as f32,
-            tilt_down_rad: config.world.camera.tilt_down_rad as f32,
-        }),
+        camera: Some(config.world.camera.model()),
+        world: Some(config.world.clone()),
     }
 }

@@ -1,21 +1,22 @@
-//! Why a data set was refused.
+//! Errors of data sets.
 
 use std::path::PathBuf;
 
 use crate::frame::FrameError;
 use crate::sim::SimError;
 
-/// Why a data set could not be made, read or sampled: what was wrong and what would be right.
+/// Why a data set could not be written, read or sampled.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum DatasetError {
-    /// The parts of an episode don't hold the same number of frames.
-    #[error("episode {episode}: {part} has {found} values; {frames} frames take {expected}")]
+    /// The parts of an episode have different numbers of frames.
+    #[error("episode {episode}: {part} has {found} values; {frames} frames need {expected}")]
     PartLength {
         /// Position of the episode.
         episode: usize,
         /// `pixels`, `mask`, `action` or `state`.
         part: &'static str,
-        /// Frames of the episode, one for each timestamp.
+        /// Number of frames of the episode, one for each timestamp.
         frames: usize,
         /// Values found.
         found: usize,
@@ -34,30 +35,32 @@ pub enum DatasetError {
         /// The value found.
         value: f64,
     },
-    /// Time stands still or runs back within an episode.
-    #[error("episode {episode}, frame {frame}: its timestamp is not after the one before; timestamps must grow")]
+    /// The timestamps of an episode do not increase.
+    #[error(
+        "episode {episode}, frame {frame}: the timestamp is not later than the previous one; timestamps must increase"
+    )]
     TimeOrder {
         /// Position of the episode.
         episode: usize,
         /// Frame within the episode.
         frame: usize,
     },
-    /// Some episodes have masks and others not.
-    #[error("episode {episode}: masks must be there for every episode or for none")]
+    /// Some episodes have masks and others do not.
+    #[error("episode {episode}: either every episode must have masks, or none")]
     MixedMasks {
         /// Position of the first episode that differs.
         episode: usize,
     },
-    /// No frames at all.
+    /// The data set has no frames.
     #[error("the data set \"{name}\" has no frames; at least one episode with one frame is needed")]
     Empty {
         /// The data set's name.
         name: String,
     },
-    /// The description of the data set can't be right.
+    /// The description of the data set is invalid.
     #[error("{0}")]
     Description(String),
-    /// Its frames have another size than what uses them.
+    /// The frames have another size than the user of the data set needs.
     #[error("the data set \"{name}\" has frames of {width}×{height} px; {wanted_width}×{wanted_height} px are needed")]
     FrameSize {
         /// The data set's name.
@@ -71,53 +74,54 @@ pub enum DatasetError {
         /// Height needed.
         wanted_height: u32,
     },
-    /// Its actions or states have another number of components than what uses them.
+    /// The actions or states have another number of components than the user of the data set needs.
     #[error("the data set \"{name}\" has {kind}s of {found} components ({names}); {wanted} are needed")]
     Channels {
         /// The data set's name.
         name: String,
         /// `action` or `state`.
         kind: &'static str,
-        /// Components there are.
+        /// Components found.
         found: usize,
         /// Their names and units.
         names: String,
         /// Components needed.
         wanted: usize,
     },
-    /// A window or stride of no frames.
+    /// A count that must be at least 1 is 0.
     #[error("{what} is 0; it must be at least 1")]
     Zero {
-        /// The value, as the user knows it.
+        /// The setting, as the user knows it.
         what: &'static str,
     },
     /// No episode is long enough.
     #[error(
-        "a window of {window} frames ({context} seen, {horizon} to come) is longer than every episode of the {split} \
-         split; the longest runs {longest} frames without a gap"
+        "a window of {window} frames (context {context}, horizon {horizon}) is longer than every episode of the {split} \
+         split; the longest has {longest} frames without a gap"
     )]
     WindowTooLong {
         /// Frames of the window.
         window: usize,
-        /// Frames seen.
+        /// Context frames.
         context: usize,
-        /// Frames to come.
+        /// Frames to predict.
         horizon: usize,
-        /// The split asked for.
+        /// The split.
         split: &'static str,
-        /// The longest stretch in it.
+        /// Frames of the longest segment without a gap.
         longest: usize,
     },
-    /// Fewer windows than asked for.
+    /// The split has fewer windows than requested.
     #[error(
-        "data.windows is {asked}, but the {split} split has only {available}; ask for fewer (data.windows=all takes what there is) or collect more"
+        "data.windows is {requested}, but the {split} split has only {available} windows; use a smaller number, use \
+         data.windows=all, or collect more trials"
     )]
     TooFewWindows {
-        /// Windows asked for.
-        asked: usize,
-        /// The split asked.
+        /// Requested windows.
+        requested: usize,
+        /// The split.
         split: &'static str,
-        /// Windows there are.
+        /// Available windows.
         available: usize,
     },
     /// A file could not be read or written.
@@ -127,84 +131,85 @@ pub enum DatasetError {
         action: &'static str,
         /// The file or directory.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A file is not what its place says.
-    #[error("{path} is damaged or not a Foreframe data set's file: {reason}", path = path.display())]
+    /// The content of a file is invalid.
+    #[error("{path} is damaged or not a file of a Foreframe data set: {reason}", path = path.display())]
     Corrupt {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
-    /// A frame in a file is no image of the right size.
+    /// A frame in a file is not a valid image.
     #[error("{path}, row {row}: {column} is damaged", path = path.display())]
     CorruptFrame {
         /// The file.
         path: PathBuf,
         /// The column of images.
         column: &'static str,
-        /// Row in it.
+        /// The row.
         row: usize,
-        /// What is wrong with the image.
+        /// The image decoder's error.
         source: FrameError,
     },
-    /// A frame could not be compressed.
-    #[error("a frame could not be stored")]
+    /// A frame could not be encoded.
+    #[error("could not encode a frame")]
     Encode(#[source] FrameError),
     /// A table could not be built.
-    #[error("a table of the data set could not be built")]
+    #[error("could not build a table of the data set")]
     Build(#[source] parquet::errors::ParquetError),
-    /// A file is not the one that was collected.
+    /// A file has changed since it was written.
     #[error(
-        "{path} has the sha256 {found}, but {expected} was recorded when it was made; restore the file or collect the \
-         data set anew",
+        "{path} has the SHA-256 {found}, but its metadata states {expected}; restore the file or collect the data set \
+         again",
         path = path.display()
     )]
     HashDiffers {
         /// The file.
         path: PathBuf,
-        /// Hash recorded.
+        /// Hash in the metadata.
         expected: String,
-        /// Hash found.
+        /// Hash of the file.
         found: String,
     },
-    /// There is no data set of that name.
+    /// No data set has this name.
     #[error(
-        "there is no data set {name:?} in {dir}; there {those}; `foreframe collect` makes one",
+        "there is no data set {name:?} in {dir}; there {existing}; `foreframe collect` creates one",
         dir = dir.display(),
-        those = crate::wording::those(known)
+        existing = crate::error_text::existing(known)
     )]
     Unknown {
         /// The name asked for.
         name: String,
-        /// Where it was looked for.
+        /// The directory that was searched.
         dir: PathBuf,
-        /// The names there are.
+        /// The names of the existing data sets.
         known: Vec<String>,
     },
     /// The directory holds no data set.
     #[error(
-        "{path} holds no data set (meta/info.json is missing); name one that `foreframe collect` made",
+        "{path} holds no data set (meta/info.json is missing); give a directory that `foreframe collect` wrote",
         path = path.display()
     )]
     NotADataset {
         /// The directory.
         path: PathBuf,
     },
-    /// The directory is in use for something else.
+    /// The directory contains something else.
     #[error(
-        "{path} exists and is not a collection; name a directory that doesn't exist or is empty",
+        "{path} exists and is not a collection; use a directory that does not exist or is empty",
         path = path.display()
     )]
     OutExists {
         /// The directory.
         path: PathBuf,
     },
-    /// The collection there was begun with other arguments.
+    /// The directory holds a collection with other arguments.
     #[error(
-        "{path} was begun with other arguments ({differences}); use those to go on, or name another directory",
+        "{path} holds a collection with other arguments ({differences}); use the same arguments to resume it, or use \
+         another directory",
         path = path.display()
     )]
     OtherArguments {
@@ -213,56 +218,56 @@ pub enum DatasetError {
         /// Each argument that differs, with both values.
         differences: String,
     },
-    /// Another collection is writing there.
-    #[error("another collection is running in {path}; wait for it or name another directory", path = path.display())]
+    /// Another collection is writing to the directory.
+    #[error("another collection is running in {path}; wait until it ends or use another directory", path = path.display())]
     Busy {
         /// The directory.
         path: PathBuf,
     },
-    /// The collection was stopped before its end.
-    #[error("stopped with {done} of {total} trials kept; run the same command again to go on")]
+    /// The collection was stopped before it was complete.
+    #[error("stopped after {done} of {total} trials were saved; run the same command again to resume")]
     Cancelled {
         /// Trials in finished shards.
         done: u64,
-        /// Trials asked for.
+        /// Requested trials.
         total: u64,
     },
     /// The world's settings are out of range.
     #[error(transparent)]
     World(SimError),
-    /// The world refused.
-    #[error("trial {trial} could not be simulated")]
+    /// The simulation of a trial failed.
+    #[error("could not simulate trial {trial}")]
     Simulation {
         /// The trial.
         trial: u64,
-        /// What the world said.
+        /// The simulator's error.
         source: SimError,
     },
-    /// The collection was interrupted.
+    /// The collection is not complete.
     #[error(
-        "the data set in {path} is unfinished; run `foreframe collect` with the same arguments to go on: {arguments}",
+        "the data set in {path} is unfinished; run `foreframe collect` with the same arguments to resume it: {arguments}",
         path = path.display()
     )]
     Unfinished {
         /// The directory.
         path: PathBuf,
-        /// The arguments it was begun with.
+        /// The arguments of the collection.
         arguments: String,
     },
-    /// There is no such episode.
+    /// The episode does not exist.
     #[error("there is no episode {episode} in \"{name}\"; it has {count}, counted from 0")]
     NoEpisode {
         /// The data set's name.
         name: String,
-        /// The episode asked for.
+        /// The requested episode.
         episode: usize,
-        /// How many there are.
+        /// Number of episodes.
         count: usize,
     },
 }
 
 impl DatasetError {
-    /// An [`DatasetError::Io`] of that action on that path.
+    /// Makes a [`DatasetError::Io`] for this action and path.
     pub(crate) fn io(action: &'static str, path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }

@@ -1,4 +1,4 @@
-//! A data set's files: whole or not there, and the ones that were written.
+//! Writes and verifies the files of a data set.
 
 use std::fs::{self, File};
 use std::io;
@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use super::DatasetError;
 use crate::files::{self, hex};
 
-/// Writes a file as a whole, in a directory that is made where it is missing.
+/// Writes a file atomically. Creates its directory if it is missing. Errors: `Io`.
 pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory)
@@ -17,7 +17,7 @@ pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetE
         .map_err(DatasetError::io("write", path))
 }
 
-/// The hex sha256 of a file.
+/// The SHA-256 of a file in hexadecimal. Errors: `Io`.
 pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
     let mut hasher = Sha256::new();
     File::open(path)
@@ -26,7 +26,7 @@ pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
     Ok(hex(&hasher.finalize()))
 }
 
-/// Errors: `HashDiffers` unless the file has that hex sha256.
+/// Errors: `HashDiffers` unless the file has this SHA-256 (hexadecimal).
 pub(super) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
     let found = sha256_of_file(path)?;
     if found == expected {

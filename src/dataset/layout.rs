@@ -1,4 +1,4 @@
-//! Where things lie in a data set's directory (LeRobot's v3.0 layout) and what its descriptions say.
+//! Paths in a data set's directory (LeRobot's v3.0 layout) and the content of its metadata files.
 
 use std::path::{Path, PathBuf};
 
@@ -8,22 +8,25 @@ use serde_json::{Value, json};
 use super::{DatasetError, DatasetInfo};
 use crate::files::sha256_hex;
 use crate::frame::warp::CameraModel;
+use crate::sim::{CameraConfig, WorldConfig};
 use crate::types::{Channel, Seed};
 
-/// LeRobot's description; written last, so a directory without it is unfinished.
+/// LeRobot's description. It is written last, so a directory without it is unfinished.
 pub const INFO: &str = "meta/info.json";
-/// Ours: hashes and exact values.
-pub const STAMP: &str = "meta/foreframe.json";
-/// The arguments of the collection; written first.
+/// Foreframe's metadata: hashes and exact values.
+pub const METADATA: &str = "meta/foreframe.json";
+/// The arguments of the collection. They are written first.
 pub(super) const ARGUMENTS: &str = "meta/collect.json";
-/// Figures of every column.
+/// The source and options of an import. They are written first.
+pub(super) const IMPORT_ARGUMENTS: &str = "meta/import.json";
+/// Statistics of every column.
 pub(super) const STATS: &str = "meta/stats.json";
-/// The one task.
+/// The table of tasks, with one task.
 pub(super) const TASKS: &str = "meta/tasks.parquet";
-/// The episodes.
+/// The table of episodes.
 pub(super) const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
 
-/// Most files in one chunk directory.
+/// Largest number of files in one chunk directory.
 const CHUNK_FILES: usize = 1000;
 
 /// Names of the columns.
@@ -32,21 +35,21 @@ pub(super) const MASK: &str = "observation.mask";
 pub(super) const STATE: &str = "observation.state";
 pub(super) const ACTION: &str = "action";
 pub(super) const TIMESTAMP: &str = "timestamp";
-/// Counters that LeRobot keeps for every frame.
+/// Counters that LeRobot stores for every frame.
 pub(super) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", "index", "task_index"];
 
-/// Chunk directory and file within it of a shard.
-pub(super) fn shard_place(shard: usize) -> (usize, usize) {
+/// Number of a shard's chunk directory, and of its file in that directory.
+pub(super) fn shard_location(shard: usize) -> (usize, usize) {
     (shard / CHUNK_FILES, shard % CHUNK_FILES)
 }
 
-/// Path of a shard within the data set.
+/// Path of a shard in the data set's directory.
 pub(super) fn shard_path(shard: usize) -> PathBuf {
-    let (chunk, file) = shard_place(shard);
+    let (chunk, file) = shard_location(shard);
     PathBuf::from(format!("data/chunk-{chunk:03}/file-{file:03}.parquet"))
 }
 
-/// One data file, as the stamp records it.
+/// One shard in the metadata.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ShardEntry {
@@ -56,10 +59,10 @@ pub(super) struct ShardEntry {
     pub(super) frames: usize,
 }
 
-/// What `meta/foreframe.json` holds.
+/// The content of `meta/foreframe.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct CollectionStamp {
+pub(super) struct DatasetMetadata {
     pub(super) program_version: String,
     pub(super) name: String,
     pub(super) scenario: Option<String>,
@@ -78,12 +81,13 @@ pub(super) struct CollectionStamp {
     pub(super) shards: Vec<ShardEntry>,
 }
 
-impl CollectionStamp {
-    /// Reads and checks the stamp of a finished data set. Errors: `Unfinished`, `NotADataset`, `Corrupt`.
+impl DatasetMetadata {
+    /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotADataset`, `Corrupt`.
     pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
-            return Err(match std::fs::read_to_string(arguments) {
+            let found = std::fs::read_to_string(arguments);
+            return Err(match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
                 Ok(text) => DatasetError::Unfinished {
                     path: directory.to_owned(),
                     arguments: one_line(&text),
@@ -93,27 +97,37 @@ impl CollectionStamp {
                 },
             });
         }
-        let path = directory.join(STAMP);
+        let path = directory.join(METADATA);
         let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
         Self::parse(&path, &text)
     }
 
-    /// Checks what a file of that path says. Errors: `Corrupt`.
+    /// The description of the data set in that directory. Metadata of older data sets have no camera model; it is then taken
+    /// from the arguments of the collection. Errors: `Corrupt`, `Io`.
+    pub(super) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
+        let mut info = self.info();
+        info.world = collected_world(directory)?;
+        let camera = info.world.as_ref().map(|world| &world.camera);
+        info.camera = info.camera.or(camera.map(CameraConfig::model));
+        Ok(info)
+    }
+
+    /// Parses and checks the text of a metadata file. Errors: `Corrupt`; they name `path`.
     pub(super) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
         let corrupt = |reason| DatasetError::Corrupt {
             path: path.to_owned(),
             reason,
         };
-        let stamp: Self = serde_json::from_slice(text).map_err(|error| corrupt(error.to_string()))?;
-        if stamp.content_hash != content_hash(&stamp.shards) {
+        let metadata: Self = serde_json::from_slice(text).map_err(|error| corrupt(error.to_string()))?;
+        if metadata.content_hash != content_hash(&metadata.shards) {
             return Err(corrupt(
-                "its content hash is not that of the shards it lists".to_owned(),
+                "its content hash does not match the shards that it lists".to_owned(),
             ));
         }
-        Ok(stamp)
+        Ok(metadata)
     }
 
-    /// What the data set is.
+    /// The description of the data set.
     pub(super) fn info(&self) -> DatasetInfo {
         DatasetInfo {
             name: self.name.clone(),
@@ -129,17 +143,38 @@ impl CollectionStamp {
             episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
             has_masks: self.has_masks,
             camera: self.camera,
+            world: None,
         }
     }
 }
 
-/// The hex sha256 over the shards' hex hashes, one after another.
+/// The part of a collection's arguments that is used later.
+#[derive(Deserialize)]
+struct CollectedWith {
+    world: WorldConfig,
+}
+
+/// The world settings of a collection; `None` for other data sets. Errors: `Corrupt`, `Io`.
+fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError> {
+    let path = directory.join(ARGUMENTS);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+    let arguments: CollectedWith = serde_json::from_slice(&text).map_err(|error| DatasetError::Corrupt {
+        path,
+        reason: error.to_string(),
+    })?;
+    Ok(Some(arguments.world))
+}
+
+/// The SHA-256 of the shards' hexadecimal hashes, one after another, in hexadecimal.
 pub(super) fn content_hash(shards: &[ShardEntry]) -> String {
     let hashes: String = shards.iter().map(|shard| shard.sha256.as_str()).collect();
     sha256_hex(hashes.as_bytes())
 }
 
-/// A JSON object without its line breaks, for a message.
+/// A JSON object without line breaks, for a message.
 fn one_line(text: &str) -> String {
     serde_json::from_str::<Value>(text).map_or_else(|_| text.trim().to_owned(), |value| value.to_string())
 }
@@ -163,7 +198,7 @@ pub(super) fn lerobot_info(info: &DatasetInfo) -> Value {
     })
 }
 
-/// Frames a second: a whole number where the period allows, since LeRobot wants one.
+/// Frames per second: an integer if possible, because LeRobot expects one.
 fn frame_rate(period_s: f64) -> Value {
     let rate = 1.0 / period_s;
     if (rate - rate.round()).abs() < 1e-6 * rate {
@@ -201,7 +236,7 @@ fn lerobot_features(info: &DatasetInfo) -> Value {
     Value::Object(features)
 }
 
-/// The columns as the `datasets` library describes them, for the Parquet schema's `huggingface` entry.
+/// The columns in the format of the `datasets` library, for the Parquet schema's `huggingface` entry.
 pub(super) fn huggingface_features(info: &DatasetInfo) -> Value {
     let value = |dtype: &str| json!({"dtype": dtype, "_type": "Value"});
     let mut features = serde_json::Map::new();

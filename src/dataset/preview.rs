@@ -1,37 +1,38 @@
-//! One episode of a data set on disk, without reading the others: only the file that holds it is read and verified.
+//! Reads one episode of a data set on disk. Only the shard with this episode is read and verified.
 
 use std::path::Path;
 
 use super::files::verify;
-use super::layout::{CollectionStamp, EPISODES};
+use super::layout::{DatasetMetadata, EPISODES};
 use super::shard_reader::{ShardSlot, read};
 use super::store::read_episodes;
 use super::{Dataset, DatasetError, DatasetInfo};
 use crate::frame::Frame;
 
-/// What the finished data set in a directory is, from its description alone.
+/// The description of the finished data set in a directory, without reading its frames.
 /// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
 pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
-    Ok(CollectionStamp::read(directory)?.info())
+    DatasetMetadata::read(directory)?.info_in(directory)
 }
 
-/// What the data set is whose [`super::STAMP`] of that path holds the text. Errors: `Corrupt`.
-pub fn describe_stamp(path: &Path, text: &[u8]) -> Result<DatasetInfo, DatasetError> {
-    Ok(CollectionStamp::parse(path, text)?.info())
+/// The description of a data set from the text of its metadata file ([`super::METADATA`]). Errors: `Corrupt`; they name
+/// `path`.
+pub fn describe_metadata(path: &Path, text: &[u8]) -> Result<DatasetInfo, DatasetError> {
+    Ok(DatasetMetadata::parse(path, text)?.info())
 }
 
 impl Dataset {
     /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
     pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {
-        let stamp = CollectionStamp::read(directory)?;
-        let info = stamp.info();
+        let metadata = DatasetMetadata::read(directory)?;
+        let info = metadata.info();
         let missing = || DatasetError::NoEpisode {
             name: info.name.clone(),
             episode,
             count: info.episode_count,
         };
         let (mut first_episode, mut first_frame) = (0, 0);
-        let shard = stamp.shards.iter().find(|shard| {
+        let shard = metadata.shards.iter().find(|shard| {
             let holds_it = episode < first_episode + shard.episodes;
             if !holds_it {
                 first_episode += shard.episodes;
@@ -41,7 +42,7 @@ impl Dataset {
         });
         let shard = shard.ok_or_else(missing)?;
         let table = directory.join(EPISODES);
-        verify(&table, &stamp.episodes_sha256)?;
+        verify(&table, &metadata.episodes_sha256)?;
         let wanted = read_episodes(&table, &info)?
             .into_iter()
             .nth(episode)

@@ -1,4 +1,4 @@
-//! Which windows of a data set train, validate and test: a seeded split of whole trials, or of time for recordings.
+//! Divides a data set into training, validation and test parts: by complete trials with a seed, or by time for recordings.
 
 use std::fmt;
 use std::ops::Range;
@@ -9,38 +9,47 @@ use rand::seq::index;
 use super::{Dataset, DatasetError, Window};
 use crate::types::Seed;
 
-/// Timestamps further apart than this many median periods are a gap that no window crosses.
+/// A time step longer than this many median periods is a gap. No window crosses a gap.
 const GAP_PERIODS: f64 = 3.0;
-/// Episodes without trial parameters are split whole when there are at least so many.
+/// Recordings are split by complete episodes if there are at least this many, otherwise by time.
 const WHOLE_EPISODES: usize = 10;
-/// Trials are dealt out in blocks of ten: eight train, one validates, one tests.
+/// Trials are split in blocks of ten: eight for training, one for validation, one for testing.
 const BLOCK: u64 = 10;
 
 /// A part of the data with one purpose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Split {
-    /// Weights are fitted to it.
+    /// For fitting the weights.
     Train,
-    /// Models and settings are selected on it.
+    /// For selecting weights and settings.
     Validation,
-    /// Opened once, for the final figures: trials never seen.
+    /// For the final scores: trials that training never uses.
     Test,
-    /// Start/goal pairs and gains never seen; empty for recordings.
-    TestUnseen,
+    /// Trials with a start/goal pair that training never uses; empty for recordings.
+    UnseenPairs,
+    /// Trials with a PID gain that training never uses, and with one of its start/goal pairs; empty for recordings.
+    UnseenGains,
 }
 
 impl Split {
-    /// Every split, in the order of their declaration.
-    pub const ALL: [Self; 4] = [Self::Train, Self::Validation, Self::Test, Self::TestUnseen];
+    /// All splits, in the order of declaration.
+    pub const ALL: [Self; 5] = [
+        Self::Train,
+        Self::Validation,
+        Self::Test,
+        Self::UnseenPairs,
+        Self::UnseenGains,
+    ];
 
-    /// `train`, `validation`, `test` or `test-unseen`.
+    /// `train`, `validation`, `test`, `unseen-pairs` or `unseen-gains`.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Train => "train",
             Self::Validation => "validation",
             Self::Test => "test",
-            Self::TestUnseen => "test-unseen",
+            Self::UnseenPairs => "unseen-pairs",
+            Self::UnseenGains => "unseen-gains",
         }
     }
 }
@@ -51,12 +60,12 @@ impl fmt::Display for Split {
     }
 }
 
-/// How many frames a window spans: those seen and those to come.
+/// The number of frames of a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WindowShape {
-    /// Frames seen.
+    /// Context frames.
     pub context: usize,
-    /// Frames to come.
+    /// Frames to predict.
     pub horizon: usize,
 }
 
@@ -68,37 +77,39 @@ impl WindowShape {
     }
 }
 
-/// A stretch of one episode that belongs to one split and has no gap in it.
+/// Consecutive frames of one episode that belong to one split and contain no gap.
 #[derive(Clone, Debug, PartialEq)]
 struct EpisodeSegment {
     episode: usize,
     frames: Range<usize>,
 }
 
-/// Whose data is whose. Simulated trials are split whole, by `(split seed, trial)` alone, so that a larger collection
-/// keeps a smaller one's split; recordings by whole episodes where there are ten or more, else by time.
+/// The episodes and segments of each split. Simulated trials are never divided; their split depends only on split seed and
+/// trial number, so that trials keep their split when a collection grows. Recordings are split by complete episodes if
+/// there are ten or more, otherwise by time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
-    episodes: [Vec<usize>; 4],
-    runs: [Vec<EpisodeSegment>; 4],
-    /// Timestamps further apart are a gap.
+    episodes: [Vec<usize>; Split::ALL.len()],
+    segments: [Vec<EpisodeSegment>; Split::ALL.len()],
+    /// A longer time step is a gap, in seconds.
     max_step_s: f64,
 }
 
 impl Splits {
-    /// The split of this data set by that seed.
+    /// Splits the data set with this seed.
     #[must_use]
     pub fn new(dataset: &Dataset, split_seed: Seed) -> Self {
         let mut splits = Self {
             episodes: Default::default(),
-            runs: Default::default(),
+            segments: Default::default(),
             max_step_s: GAP_PERIODS * median_period_s(dataset),
         };
         let by_trial = dataset.episodes().iter().all(|episode| episode.trial.is_some());
         if by_trial || dataset.episodes().len() >= WHOLE_EPISODES {
             for episode in dataset.episodes() {
                 let split = match &episode.trial {
-                    Some(trial) if trial.is_held_out() => Split::TestUnseen,
+                    Some(trial) if trial.has_held_out_pair() => Split::UnseenPairs,
+                    Some(trial) if trial.is_held_out() => Split::UnseenGains,
                     Some(trial) => split_of(split_seed, trial.trial),
                     None => split_of(split_seed, episode.index as u64),
                 };
@@ -110,7 +121,7 @@ impl Splits {
         splits
     }
 
-    /// Deals all frames out in order: the first 80 % train, the next 10 % validate, the last 10 % test.
+    /// Splits all frames by time: the first 80 % for training, the next 10 % for validation, the last 10 % for testing.
     fn add_by_time(&mut self, dataset: &Dataset) {
         let frame_count = dataset.info().frame_count;
         let (validation, test) = (frame_count * 8 / 10, frame_count * 9 / 10);
@@ -134,7 +145,7 @@ impl Splits {
         let mut start = frames.start;
         for frame in frames.start + 1..=frames.end {
             if frame == frames.end || self.is_gap(dataset, frame) {
-                self.runs[split as usize].push(EpisodeSegment {
+                self.segments[split as usize].push(EpisodeSegment {
                     episode,
                     frames: start..frame,
                 });
@@ -143,28 +154,28 @@ impl Splits {
         }
     }
 
-    /// Whether too much time passed between that frame and the one before.
+    /// Whether there is a gap between the previous frame and this one.
     fn is_gap(&self, dataset: &Dataset, frame: usize) -> bool {
         dataset.timestamp_s(frame) - dataset.timestamp_s(frame - 1) > self.max_step_s
     }
 
-    /// Frames at the start of a run to leave out, because those just before belong to another split.
-    fn guard(&self, dataset: &Dataset, run: &EpisodeSegment, shape: WindowShape) -> usize {
-        let start = run.frames.start;
-        let opens = dataset.episodes()[run.episode].first_frame == start || self.is_gap(dataset, start);
-        if opens { 0 } else { shape.frames() }
+    /// Number of frames to skip at the start of a segment, if the frames just before it belong to another split.
+    fn skipped_frames(&self, dataset: &Dataset, segment: &EpisodeSegment, shape: WindowShape) -> usize {
+        let start = segment.frames.start;
+        let is_first = dataset.episodes()[segment.episode].first_frame == start || self.is_gap(dataset, start);
+        if is_first { 0 } else { shape.frames() }
     }
 
-    /// Positions in [`Dataset::episodes`] of the episodes in a split, rising. Where recordings are split by time, an
-    /// episode can have a part in more than one split.
+    /// Positions in [`Dataset::episodes`] of the episodes of a split, in increasing order. If recordings are split by time,
+    /// one episode can belong to several splits.
     #[must_use]
     pub fn episodes(&self, split: Split) -> &[usize] {
         &self.episodes[split as usize]
     }
 
-    /// Every `stride`-th window of a split, in order; none where the split is empty. No window crosses an episode's end
-    /// or a gap in time, and where recordings are split by time the first ones after a boundary are left out.
-    /// Errors: `Zero` for a stride, context or horizon of 0, `WindowTooLong` if none fits anywhere in the split.
+    /// Every `stride`-th window of a split, in order; no windows if the split is empty. No window crosses an episode's end or
+    /// a gap. If recordings are split by time, the first windows after a boundary are skipped, so that splits do not overlap.
+    /// Errors: `Zero` for a stride, context or horizon of 0, `WindowTooLong` if no segment of the split is long enough.
     pub fn windows(
         &self,
         dataset: &Dataset,
@@ -183,16 +194,17 @@ impl Splits {
         }
         let mut windows = Vec::new();
         let mut longest = 0;
-        for run in &self.runs[split as usize] {
-            let frames = run.frames.start + self.guard(dataset, run, shape)..run.frames.end;
+        for segment in &self.segments[split as usize] {
+            let first = segment.frames.start + self.skipped_frames(dataset, segment, shape);
+            let frames = first..segment.frames.end;
             longest = longest.max(frames.len());
             let last = (frames.end + 1).saturating_sub(shape.frames());
             windows.extend((frames.start..last).step_by(stride).map(|first_frame| Window {
-                episode: run.episode,
+                episode: segment.episode,
                 first_frame,
             }));
         }
-        if windows.is_empty() && !self.runs[split as usize].is_empty() {
+        if windows.is_empty() && !self.segments[split as usize].is_empty() {
             return Err(DatasetError::WindowTooLong {
                 window: shape.frames(),
                 context: shape.context,
@@ -205,8 +217,8 @@ impl Splits {
     }
 
     /// `count` different windows of a split, drawn at random, in random order.
-    /// Errors: as [`Splits::windows`]; `TooFewWindows` if there aren't that many.
-    #[expect(clippy::too_many_arguments, reason = "a draw is named by all five")]
+    /// Errors: as [`Splits::windows`]; `TooFewWindows` if the split has fewer windows.
+    #[expect(clippy::too_many_arguments, reason = "the draw depends on all five")]
     pub fn sample(
         &self,
         dataset: &Dataset,
@@ -218,29 +230,29 @@ impl Splits {
         let windows = self.windows(dataset, split, shape, 1)?;
         if count > windows.len() {
             return Err(DatasetError::TooFewWindows {
-                asked: count,
+                requested: count,
                 split: split.name(),
                 available: windows.len(),
             });
         }
         let chosen = index::sample(&mut seed.derive("windows", 0).rng(), windows.len(), count);
-        Ok(chosen.iter().map(|place| windows[place]).collect())
+        Ok(chosen.iter().map(|index| windows[index]).collect())
     }
 }
 
-/// The split of a trial: within each block of ten trials one validates and one tests, drawn by seed and block.
+/// The split of a trial. In each block of ten trials, one is for validation and one for testing, drawn from seed and block.
 fn split_of(split_seed: Seed, trial: u64) -> Split {
     let mut rng = split_seed.derive("split", trial / BLOCK).rng();
     let validation = rng.random_range(0..BLOCK);
     let test = (validation + rng.random_range(1..BLOCK)) % BLOCK;
     match trial % BLOCK {
-        place if place == validation => Split::Validation,
-        place if place == test => Split::Test,
+        position if position == validation => Split::Validation,
+        position if position == test => Split::Test,
         _ => Split::Train,
     }
 }
 
-/// The median step from one timestamp to the next within episodes; the nominal period where no episode has two frames.
+/// The median time step within episodes, in seconds; the frame period of the description if no episode has two frames.
 fn median_period_s(dataset: &Dataset) -> f64 {
     let mut steps: Vec<f64> = dataset
         .episodes()

@@ -1,5 +1,5 @@
-//! One data file: the frames of some consecutive episodes as Parquet, one row group an episode. Its footer also keeps
-//! each episode's record, so that an interrupted collection can go on from the files alone.
+//! A shard: the frames of some consecutive episodes as a Parquet file, with one row group for each episode. Its footer also
+//! contains the record of each episode, so that an interrupted collection can resume from the shards alone.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -22,31 +22,31 @@ use super::stats::ChannelStats;
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::frame::{Frame, codec};
 
-/// Key of the episodes' records in a shard's footer.
+/// Key of the episode records in a shard's footer.
 pub(super) const RECORDS_KEY: &str = "foreframe.episodes";
 
-/// What is known of an episode besides its frames.
+/// Data of an episode besides its frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct EpisodeRecord {
     pub(super) frames: usize,
-    /// The trial's parameters as JSON, where it was simulated.
+    /// Parameters of the trial as JSON; none for recordings.
     pub(super) trial: Option<String>,
-    /// Figures of the columns that differ from episode to episode in more than their place.
+    /// Statistics of the columns whose values do not follow from the episode's position.
     pub(super) stats: BTreeMap<String, ChannelStats>,
 }
 
-/// An episode ready to be written.
+/// An episode with encoded frames, ready to be written.
 pub(super) struct EncodedEpisode {
     pub(super) images: Vec<Vec<u8>>,
-    masks: Option<Vec<Vec<u8>>>,
+    pub(super) masks: Option<Vec<Vec<u8>>>,
     pub(super) actions: Vec<f32>,
-    states: Vec<f32>,
-    timestamps_s: Vec<f32>,
+    pub(super) states: Vec<f32>,
+    pub(super) timestamps_s: Vec<f32>,
     pub(super) record: EpisodeRecord,
 }
 
 impl EncodedEpisode {
-    /// Compresses an episode's frames, after the checks of [`super::Dataset::from_episodes`]; `episode` is its position.
+    /// Checks an episode as [`super::Dataset::from_episodes`] does, and encodes its frames. `episode` is its position.
     pub(super) fn new(info: &DatasetInfo, episode: usize, data: EpisodeData) -> Result<Self, DatasetError> {
         check_episode(info, episode, &data)?;
         let frames = data.timestamps_s.len();
@@ -102,22 +102,22 @@ fn encode_frames(info: &DatasetInfo, pixels: &[u8]) -> Result<Vec<Vec<u8>>, Data
         .collect()
 }
 
-/// Where a shard stands in its data set.
+/// Position of a shard in its data set.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShardStart {
-    /// Episodes before it.
+    /// Number of episodes before it.
     pub(super) episode: usize,
-    /// Frames before it.
+    /// Number of frames before it.
     pub(super) frame: usize,
 }
 
-/// The bytes of a shard and the text of its records.
+/// The bytes of a shard, and its episode records as JSON.
 pub(super) struct ShardBytes {
     pub(super) bytes: Vec<u8>,
     pub(super) records: String,
 }
 
-/// Lays a shard's episodes out as a Parquet file.
+/// Writes a shard's episodes as a Parquet file in memory. Errors: `Build`, `Description`.
 pub(super) fn build(
     info: &DatasetInfo,
     start: ShardStart,
@@ -150,7 +150,8 @@ fn write_parquet(
     writer.into_inner()
 }
 
-/// PNG doesn't compress again, but masks often repeat the one before.
+/// PNG images are already compressed, so their column is not compressed again. Masks often repeat, so their column keeps
+/// its dictionary.
 fn properties() -> WriterProperties {
     let image = ColumnPath::new(vec![IMAGE.to_owned(), "bytes".to_owned()]);
     let mask = ColumnPath::new(vec![MASK.to_owned(), "bytes".to_owned()]);

@@ -1,4 +1,4 @@
-//! Reads a shard back: its records from the footer, or its frames into their places in memory.
+//! Reads a shard: the episode records from its footer, or its frames into memory.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     serde_json::from_str(text).map_err(|error| corrupt(path, &error))
 }
 
-/// The batches of a Parquet file, read whole.
+/// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
 pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = ParquetRecordBatchReaderBuilder::try_new(file)
@@ -42,7 +42,7 @@ fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
     }
 }
 
-/// A shard's place in memory and what is expected of it.
+/// The memory into which a shard is read, and the expected number of frames.
 pub(super) struct ShardSlot<'a> {
     pub(super) path: PathBuf,
     pub(super) frames: usize,
@@ -52,7 +52,7 @@ pub(super) struct ShardSlot<'a> {
     pub(super) masks: Option<&'a mut [u8]>,
 }
 
-/// The numbers of a shard's frames.
+/// Actions, states and timestamps of a shard's frames.
 #[derive(Default)]
 pub(super) struct ShardNumbers {
     pub(super) actions: Vec<f32>,
@@ -60,7 +60,7 @@ pub(super) struct ShardNumbers {
     pub(super) timestamps_s: Vec<f64>,
 }
 
-/// Decodes a shard's frames into their places. Errors: `Io`, `Corrupt`, `CorruptFrame`.
+/// Decodes a shard's frames into the slot's memory. Errors: `Io`, `Corrupt`, `CorruptFrame`.
 pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
     let mut numbers = ShardNumbers::default();
     let mut row = 0;
@@ -80,7 +80,7 @@ pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
 fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
     corrupt(
         &slot.path,
-        &format!("it has {found} rows or more where {} are recorded", slot.frames),
+        &format!("it has {found} or more rows; its metadata states {}", slot.frames),
     )
 }
 
@@ -91,15 +91,15 @@ fn read_batch(
     row: usize,
     numbers: &mut ShardNumbers,
 ) -> Result<(), DatasetError> {
-    let place = row * info.frame_pixels()..(row + batch.num_rows()) * info.frame_pixels();
+    let range = row * info.frame_pixels()..(row + batch.num_rows()) * info.frame_pixels();
     let target = ImageTarget {
         info,
         path: &slot.path,
         row,
     };
-    target.decode(batch, IMAGE, &mut slot.pixels[place.clone()])?;
+    target.decode(batch, IMAGE, &mut slot.pixels[range.clone()])?;
     if let Some(masks) = &mut slot.masks {
-        target.decode(batch, MASK, &mut masks[place])?;
+        target.decode(batch, MASK, &mut masks[range])?;
     }
     let column = Column {
         batch,
@@ -114,12 +114,15 @@ fn read_batch(
     let first = (slot.first_frame + row) as i64;
     let indexes = column.numbers::<Int64Type>("index")?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(corrupt(&slot.path, &"its index column does not count the frames"));
+        return Err(corrupt(
+            &slot.path,
+            &"its column \"index\" does not number the frames one after another",
+        ));
     }
     Ok(())
 }
 
-/// Where images of a batch go.
+/// Decodes the images of a batch into memory.
 struct ImageTarget<'a> {
     info: &'a DatasetInfo,
     path: &'a Path,
@@ -153,20 +156,20 @@ impl ImageTarget<'_> {
     }
 }
 
-fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
+pub(super) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
     let images: &StructArray = batch.column_by_name(key)?.as_struct_opt()?;
     let bytes = images.column_by_name("bytes")?.as_binary_opt::<i32>()?;
     (bytes.null_count() == 0).then_some(bytes)
 }
 
-/// The columns of a batch of a file, with errors that name both.
+/// The columns of a batch. Errors name the file and the column.
 pub(super) struct Column<'a> {
     pub(super) batch: &'a RecordBatch,
     pub(super) path: &'a Path,
 }
 
 impl<'a> Column<'a> {
-    /// The numbers of a column without empty places.
+    /// The numbers of a column without null values. Errors: `Corrupt`.
     pub(super) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
         self.batch
             .column_by_name(key)
@@ -176,8 +179,8 @@ impl<'a> Column<'a> {
             .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
     }
 
-    /// The vectors of `size` numbers of a column, one after another; none where `size` is 0.
-    fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
+    /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
+    pub(super) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
         match size {
             0 => return Ok(&[]),
             1 => return self.numbers::<Float32Type>(key),
@@ -190,20 +193,28 @@ impl<'a> Column<'a> {
             .filter(|list| list.null_count() == 0)
             .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
         if list.value_length() as usize != size {
-            let reason = format!("\"{key}\" has {} components; {size} are described", list.value_length());
+            let reason = format!(
+                "column \"{key}\" has {} components; the metadata states {size}",
+                list.value_length()
+            );
             return Err(corrupt(self.path, &reason));
         }
         let values = list.values().as_primitive_opt::<Float32Type>();
-        // A slice of a list array keeps all values: take those of its rows.
+        // A slice of a list array still refers to all values. Select those of its rows.
         let first = list.value_offset_at(0);
         let rows = first..first + list.len() * size;
         values
             .filter(|values| values.null_count() == 0)
             .and_then(|values| values.values().get(rows))
-            .ok_or_else(|| corrupt(self.path, &format!("\"{key}\" does not hold 32-bit numbers")))
+            .ok_or_else(|| {
+                corrupt(
+                    self.path,
+                    &format!("column \"{key}\" does not contain 32-bit floating-point numbers"),
+                )
+            })
     }
 
-    /// The texts of a column, empty places as none.
+    /// The texts of a column; null values become none. Errors: `Corrupt`.
     pub(super) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
         self.batch
             .column_by_name(key)

@@ -1,20 +1,20 @@
-//! Minimum, maximum, mean and standard deviation of every column, as LeRobot keeps them beside the data.
+//! Statistics of every column: minimum, maximum, mean and standard deviation, as LeRobot stores them with the data.
 
 use serde::{Deserialize, Serialize};
 
-/// One column's figures; one value for each of its components.
+/// Statistics of one column, with one value for each component.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct ChannelStats {
     pub(super) min: Vec<f64>,
     pub(super) max: Vec<f64>,
     pub(super) mean: Vec<f64>,
     pub(super) std: Vec<f64>,
-    /// Frames the figures come from.
+    /// Number of frames.
     pub(super) count: u64,
 }
 
 impl ChannelStats {
-    /// Of rows of `size` numbers each, one row a frame.
+    /// Statistics of rows of `size` numbers, one row for each frame.
     pub(super) fn of_rows(rows: &[f64], size: usize) -> Self {
         let count = rows.len() / size.max(1);
         let mut stats = Self::with_components(size, count as u64);
@@ -30,7 +30,7 @@ impl ChannelStats {
         stats
     }
 
-    /// Of the pixels of `frames` frames, with 255 as 1.
+    /// Statistics of the pixels of `frames` frames, scaled so that 255 is 1.
     pub(super) fn of_pixels(pixels: &[u8], frames: usize) -> Self {
         let mut histogram = [0u64; 256];
         for &pixel in pixels {
@@ -43,17 +43,17 @@ impl ChannelStats {
             .map(|(value, count)| (value - mean).powi(2) * count as f64)
             .sum::<f64>()
             / total;
-        let seen = || levels().filter(|&(_, count)| count > 0).map(|(value, _)| value);
+        let present = || levels().filter(|&(_, count)| count > 0).map(|(value, _)| value);
         Self {
-            min: vec![seen().fold(f64::INFINITY, f64::min)],
-            max: vec![seen().fold(f64::NEG_INFINITY, f64::max)],
+            min: vec![present().fold(f64::INFINITY, f64::min)],
+            max: vec![present().fold(f64::NEG_INFINITY, f64::max)],
             mean: vec![mean],
             std: vec![variance.sqrt()],
             count: frames as u64,
         }
     }
 
-    /// Of all parts together, each weighted by its frames.
+    /// Statistics of all parts together, each weighted by its number of frames.
     pub(super) fn merged(parts: &[&Self]) -> Self {
         let size = parts.first().map_or(0, |part| part.mean.len());
         let count: u64 = parts.iter().map(|part| part.count).sum();
@@ -90,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn figures_of_two_components_are_those_of_their_columns() {
+    fn statistics_are_computed_for_each_component() {
         let stats = ChannelStats::of_rows(&[1.0, 10.0, 3.0, 10.0], 2);
         assert_eq!(
             (stats.min, stats.max, stats.mean, stats.std, stats.count),
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn merged_figures_are_those_of_all_frames() {
+    fn merged_statistics_equal_those_of_all_frames() {
         let all: Vec<f64> = (0..30).map(|i| f64::from(i * i % 17)).collect();
         let parts = [ChannelStats::of_rows(&all[..9], 1), ChannelStats::of_rows(&all[9..], 1)];
         let merged = ChannelStats::merged(&[&parts[0], &parts[1]]);
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn half_black_and_half_white_pixels_have_mean_and_deviation_one_half() {
+    fn half_black_half_white_has_mean_and_deviation_one_half() {
         let stats = ChannelStats::of_pixels(&[0, 255, 255, 0], 1);
         assert_eq!((stats.mean[0], stats.std[0]), (0.5, 0.5));
     }

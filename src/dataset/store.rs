@@ -1,4 +1,4 @@
-//! A data set on disk: reading one whole, and completing one whose shards are there.
+//! Reads a complete data set from disk, and writes the tables and metadata that complete one.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::check::{Numbers, check_numbers};
 use super::files::{verify, write_atomically};
-use super::layout::{self, CollectionStamp, EPISODES, INFO, STAMP, STATS, ShardEntry, TASKS};
+use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, ShardEntry, TASKS};
 use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};
@@ -15,13 +15,13 @@ use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
 use crate::files::sha256_hex;
 
 impl Dataset {
-    /// Reads a data set whole, after checking that every file is the one that was written.
-    /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, numbers that aren't finite.
+    /// Reads a complete data set and verifies the hash of every file.
+    /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, `NotFinite`, `TimeOrder`.
     pub fn open(directory: &Path) -> Result<Self, DatasetError> {
-        let stamp = CollectionStamp::read(directory)?;
-        let info = stamp.info();
+        let metadata = DatasetMetadata::read(directory)?;
+        let info = metadata.info_in(directory)?;
         let path = directory.join(EPISODES);
-        verify(&path, &stamp.episodes_sha256)?;
+        verify(&path, &metadata.episodes_sha256)?;
         let episodes = read_episodes(&path, &info)?;
         let mut dataset = Self {
             pixels: vec![0; info.frame_count * info.frame_pixels()],
@@ -32,11 +32,11 @@ impl Dataset {
             info,
             episodes,
         };
-        let slots = slots(&mut dataset, directory, &stamp.shards);
-        let info = stamp.info();
+        let info = dataset.info.clone();
+        let slots = slots(&mut dataset, directory, &metadata.shards);
         let numbers: Result<Vec<ShardNumbers>, DatasetError> = slots
             .into_par_iter()
-            .zip(&stamp.shards)
+            .zip(&metadata.shards)
             .map(|(mut slot, entry)| {
                 verify(&slot.path, &entry.sha256)?;
                 read(&info, &mut slot)
@@ -65,7 +65,7 @@ impl Dataset {
     }
 }
 
-/// Hands every shard its part of the buffers.
+/// Divides the buffers of the data set among its shards.
 fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) -> Vec<ShardSlot<'a>> {
     let size = dataset.info.frame_pixels();
     let mut pixels = dataset.pixels.as_mut_slice();
@@ -73,16 +73,16 @@ fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) 
     let mut first_frame = 0;
     let mut slots = Vec::with_capacity(shards.len());
     for shard in shards {
-        let (mine, rest) = std::mem::take(&mut pixels).split_at_mut(shard.frames * size);
+        let (own, rest) = std::mem::take(&mut pixels).split_at_mut(shard.frames * size);
         pixels = rest;
         let mask = masks.take().map(|all| all.split_at_mut(shard.frames * size));
-        let (mask, rest) = mask.map_or((None, None), |(mine, rest)| (Some(mine), Some(rest)));
+        let (mask, rest) = mask.map_or((None, None), |(own, rest)| (Some(own), Some(rest)));
         masks = rest;
         slots.push(ShardSlot {
             path: directory.join(&shard.path),
             frames: shard.frames,
             first_frame,
-            pixels: mine,
+            pixels: own,
             masks: mask,
         });
         first_frame += shard.frames;
@@ -90,6 +90,7 @@ fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) 
     slots
 }
 
+/// Reads the table of episodes. Errors: `Io`, `Corrupt`.
 pub(super) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
     let corrupt = |reason: String| DatasetError::Corrupt {
         path: path.to_owned(),
@@ -117,7 +118,7 @@ pub(super) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episo
     }
     if (episodes.len(), first_frame) != (info.episode_count, info.frame_count) {
         return Err(corrupt(format!(
-            "it has {} episodes of {first_frame} frames in all; {} of {} are recorded",
+            "it has {} episodes with {first_frame} frames in total; the metadata states {} episodes with {} frames",
             episodes.len(),
             info.episode_count,
             info.frame_count
@@ -126,21 +127,21 @@ pub(super) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episo
     Ok(episodes)
 }
 
-/// A shard that is on the disk.
+/// A shard that has been written to disk.
 pub(super) struct FinishedShard {
     pub(super) sha256: String,
     pub(super) records: Vec<EpisodeRecord>,
 }
 
 impl FinishedShard {
-    /// Frames in it.
+    /// Number of frames in the shard.
     pub(super) fn frames(&self) -> usize {
         self.records.iter().map(|record| record.frames).sum()
     }
 }
 
-/// Writes what completes a data set whose shards are all there; `meta/info.json` last. The counts and the hash of
-/// `info` are filled in.
+/// Writes the tables and metadata of a data set whose shards are all written, `meta/info.json` last. Returns `info` with
+/// counts and hash filled in. Errors: `Build`, `Io`.
 pub(super) fn complete(
     directory: &Path,
     info: DatasetInfo,
@@ -160,18 +161,22 @@ pub(super) fn complete(
     }
     let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
     let episodes = tables::episodes(&rows, &task).map_err(DatasetError::Build)?;
-    let stamp = stamp(info, shards, sha256_hex(&episodes));
-    let info = stamp.info();
+    let world = info.world.clone();
+    let metadata = metadata(info, shards, sha256_hex(&episodes));
+    let info = DatasetInfo {
+        world,
+        ..metadata.info()
+    };
     write_atomically(&directory.join(EPISODES), &episodes)?;
     let tasks = tables::tasks(&task).map_err(DatasetError::Build)?;
     write_atomically(&directory.join(TASKS), &tasks)?;
     write_json(&directory.join(STATS), &tables::stats_json(&rows))?;
-    write_json(&directory.join(STAMP), &stamp)?;
+    write_json(&directory.join(METADATA), &metadata)?;
     write_json(&directory.join(INFO), &layout::lerobot_info(&info))?;
     Ok(info)
 }
 
-fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> CollectionStamp {
+fn metadata(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> DatasetMetadata {
     let entries: Vec<_> = shards
         .iter()
         .enumerate()
@@ -182,7 +187,7 @@ fn stamp(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -
             frames: finished.frames(),
         })
         .collect();
-    CollectionStamp {
+    DatasetMetadata {
         program_version: env!("CARGO_PKG_VERSION").to_owned(),
         name: info.name,
         scenario: info.scenario,
@@ -233,7 +238,7 @@ mod tests {
         }
     }
 
-    /// Writes a set of one shard, changed on the way, and opens it as one that `described` describes.
+    /// Writes a data set with one shard after two changes, and opens it with the description `described`.
     fn open_changed(
         described: DatasetInfo,
         change: impl Fn(&mut EncodedEpisode),
@@ -255,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn one_component_actions_and_no_states_come_back_as_they_were() {
+    fn one_component_actions_without_states_are_read_back() {
         let read = open_changed(info(), |_| {}, |_| {}).unwrap();
         let mut made = Dataset::from_episodes(info(), vec![episode(5)]).unwrap();
         made.info.content_hash = read.info.content_hash.clone();
@@ -297,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn truncated_or_damaged_bytes_never_panic_and_name_the_file() {
+    fn errors_about_damaged_files_name_the_file() {
         for kept in [0, 3, 40, 400] {
             let error = open_changed(info(), |_| {}, |bytes| bytes.truncate(kept)).unwrap_err();
             assert!(error.to_string().contains("file-000.parquet is damaged"), "{error}");
@@ -307,15 +312,15 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_no_image_is_named_with_its_cause() {
+    fn the_error_for_an_invalid_image_names_its_cause() {
         let error = open_changed(info(), |episode| episode.images[3] = vec![1, 2, 3], |_| {}).unwrap_err();
-        let sentence = crate::wording::sentence(&error);
+        let sentence = crate::error_text::with_causes(&error);
         let expected = "file-000.parquet, row 3: observation.image is damaged: not a readable PNG or JPEG image: ";
         assert!(sentence.contains(expected), "{sentence}");
     }
 
     #[test]
-    fn the_content_hash_is_that_of_the_shards_hashes_in_order() {
+    fn the_content_hash_is_the_hash_of_the_shard_hashes() {
         let read = open_changed(info(), |_| {}, |_| {}).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();

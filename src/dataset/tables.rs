@@ -1,4 +1,4 @@
-//! The small tables beside the data: tasks, episodes and figures of every column.
+//! The small tables of a data set: tasks, episodes and statistics of every column.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -12,11 +12,11 @@ use parquet::errors::ParquetError;
 use parquet::file::properties::WriterProperties;
 use serde_json::{Value, json};
 
-use super::layout::{COUNTERS, IMAGE, MASK, shard_place};
+use super::layout::{COUNTERS, IMAGE, MASK, shard_location};
 use super::shard::EpisodeRecord;
 use super::stats::ChannelStats;
 
-/// An episode in its place: its record and where its frames lie.
+/// One row of the table of episodes: the record, the shard and the first frame.
 pub(super) struct EpisodeRow<'a> {
     pub(super) record: &'a EpisodeRecord,
     pub(super) shard: usize,
@@ -24,7 +24,7 @@ pub(super) struct EpisodeRow<'a> {
 }
 
 impl EpisodeRow<'_> {
-    /// The figures of every column; those of the counters follow from the place.
+    /// Statistics of every column. Those of the counters follow from the position.
     fn stats(&self, episode: usize) -> BTreeMap<String, ChannelStats> {
         let mut stats = self.record.stats.clone();
         let starts = [(0, 1), (episode, 0), (self.first_frame, 1), (0, 0)];
@@ -36,7 +36,7 @@ impl EpisodeRow<'_> {
     }
 }
 
-/// A table of one task, laid out as pandas does an index named `task`, since LeRobot looks tasks up by it.
+/// A table with one task, in the format of a pandas index named `task`, because LeRobot uses it to find tasks.
 pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
     let column = |name: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
     let pandas = json!({
@@ -53,7 +53,7 @@ pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
     write(columns, &[("pandas", pandas.to_string())])
 }
 
-/// The table of episodes, with where each lies, the trial's parameters and the figures of every column.
+/// The table of episodes: position, trial parameters and statistics of every column.
 pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
     let counts = |value: &dyn Fn(usize, &EpisodeRow<'_>) -> usize| -> ArrayRef {
         let values = rows.iter().enumerate().map(|(index, row)| value(index, row) as i64);
@@ -72,9 +72,12 @@ pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, P
         ("trial".to_owned(), Arc::new(trials)),
         (
             "data/chunk_index".to_owned(),
-            counts(&|_, row| shard_place(row.shard).0),
+            counts(&|_, row| shard_location(row.shard).0),
         ),
-        ("data/file_index".to_owned(), counts(&|_, row| shard_place(row.shard).1)),
+        (
+            "data/file_index".to_owned(),
+            counts(&|_, row| shard_location(row.shard).1),
+        ),
         ("dataset_from_index".to_owned(), counts(&|_, row| row.first_frame)),
         (
             "dataset_to_index".to_owned(),
@@ -95,14 +98,14 @@ fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {
     let mut columns = Vec::new();
     for key in first.keys() {
         let stats = || all.iter().filter_map(|stats| stats.get(key));
-        for (figure, values) in FIGURES {
+        for (statistic, values) in STATISTICS {
             let lists: Vec<&[f64]> = stats().map(|stats| values(stats).as_slice()).collect();
             let array = if is_image(key) {
                 image_lists(&lists)
             } else {
                 lists_of(&lists)
             };
-            columns.push((format!("stats/{key}/{figure}"), array));
+            columns.push((format!("stats/{key}/{statistic}"), array));
         }
         let mut counts = ListBuilder::new(Int64Array::builder(rows.len()));
         for stats in stats() {
@@ -114,10 +117,10 @@ fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {
     columns
 }
 
-/// A figure's name and where it is found.
+/// Name of a statistic, and how to read it.
 type StatColumn = (&'static str, fn(&ChannelStats) -> &Vec<f64>);
 
-const FIGURES: [StatColumn; 4] = [
+const STATISTICS: [StatColumn; 4] = [
     ("min", |stats| &stats.min),
     ("max", |stats| &stats.max),
     ("mean", |stats| &stats.mean),
@@ -137,7 +140,7 @@ fn lists_of(lists: &[&[f64]]) -> ArrayRef {
     Arc::new(builder.finish())
 }
 
-/// Figures of an image as LeRobot wants them: channels × 1 × 1.
+/// Statistics of an image in LeRobot's shape: channels × 1 × 1.
 fn image_lists(lists: &[&[f64]]) -> ArrayRef {
     let mut builder = ListBuilder::new(ListBuilder::new(ListBuilder::new(Float64Builder::new())));
     for list in lists {
@@ -151,25 +154,25 @@ fn image_lists(lists: &[&[f64]]) -> ArrayRef {
     Arc::new(builder.finish())
 }
 
-/// LeRobot's `stats.json`: the figures of every column over all episodes.
+/// LeRobot's `stats.json`: the statistics of every column over all episodes.
 pub(super) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
     let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
     let mut features = serde_json::Map::new();
     for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
         let parts: Vec<_> = all.iter().filter_map(|stats| stats.get(key)).collect();
         let merged = ChannelStats::merged(&parts);
-        let mut figures = serde_json::Map::new();
-        for (figure, values) in FIGURES {
+        let mut statistics = serde_json::Map::new();
+        for (statistic, values) in STATISTICS {
             let values = values(&merged);
             let value = if is_image(key) {
                 values.iter().map(|value| json!([[value]])).collect()
             } else {
                 json!(values)
             };
-            figures.insert(figure.to_owned(), value);
+            statistics.insert(statistic.to_owned(), value);
         }
-        figures.insert("count".to_owned(), json!([merged.count]));
-        features.insert(key.clone(), Value::Object(figures));
+        statistics.insert("count".to_owned(), json!([merged.count]));
+        features.insert(key.clone(), Value::Object(statistics));
     }
     Value::Object(features)
 }

@@ -1,4 +1,5 @@
-//! Does the action matter? The same weights told true, shuffled and zeroed actions, and an unconditioned twin.
+//! Does the action matter? The same weights with true, shuffled, held and zeroed actions, and twins: models of the same
+//! training budget that lack the action, the state or both.
 
 use rand::Rng;
 use rayon::prelude::*;
@@ -11,6 +12,7 @@ use super::{EvaluationContext, EvaluationError, EvaluationStage};
 use crate::dataset::{Dataset, Window};
 use crate::frame::preprocess::scale;
 use crate::frame::quality;
+use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
 
@@ -18,12 +20,18 @@ use crate::types::Seed;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Variant {
-    /// The actions that were taken.
+    /// The actions that were carried out.
     True,
     /// The actions of another window.
     Shuffled,
+    /// At every step the action that led to the last frame seen.
+    Held,
     /// Zero in every component.
     Zeroed,
+    /// A model with the state but without the action, trained with the same budget.
+    TwinWithoutAction,
+    /// A model with the action but without the state, trained with the same budget.
+    TwinWithoutState,
     /// A model without conditioning, trained with the same budget.
     UnconditionedTwin,
 }
@@ -35,8 +43,47 @@ impl Variant {
         match self {
             Self::True => "true actions",
             Self::Shuffled => "shuffled actions",
+            Self::Held => "held actions",
             Self::Zeroed => "zeroed actions",
+            Self::TwinWithoutAction => "twin without the action",
+            Self::TwinWithoutState => "twin without the state",
             Self::UnconditionedTwin => "unconditioned twin",
+        }
+    }
+
+    /// Whether it is another model, which lacks the action.
+    fn is_twin_without_action(self) -> bool {
+        matches!(self, Self::TwinWithoutAction | Self::UnconditionedTwin)
+    }
+}
+
+/// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, or lacks
+/// neither the action nor the state.
+pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant, EvaluationError> {
+    let (spec, other) = (loaded.model.spec(), twin.model.spec());
+    let refused = |found: String, wanted: String| EvaluationError::Twin {
+        twin: twin.manifest.name.clone(),
+        found,
+        model: loaded.manifest.name.clone(),
+        wanted,
+    };
+    let window = |spec: &ModelSpec| format!("{} context frames and {} to predict", spec.context, spec.horizon);
+    if window(spec) != window(other) {
+        return Err(refused(window(other), window(spec)));
+    }
+    let inputs = |spec: &ModelSpec| (spec.action_inputs().is_some(), spec.state_inputs().is_some());
+    match (inputs(spec), inputs(other)) {
+        (_, (false, false)) => Ok(Variant::UnconditionedTwin),
+        ((_, true), (false, true)) => Ok(Variant::TwinWithoutAction),
+        ((_, true), (true, false)) => Ok(Variant::TwinWithoutState),
+        ((_, takes_state), _) => {
+            let wanted = if takes_state {
+                "conditioning \"none\", \"state\" or \"action\""
+            } else {
+                "conditioning \"none\""
+            };
+            let found = format!("conditioning \"{}\"", other.conditioning);
+            Err(refused(found, wanted.to_owned()))
         }
     }
 }
@@ -44,24 +91,24 @@ impl Variant {
 /// Scores of one variant.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActionRow {
-    /// What the model was told.
+    /// Which actions the model got.
     pub variant: Variant,
     /// Mean squared error per pixel.
     pub mse: StepCurve,
     /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
     pub interval: Option<Interval>,
-    /// 1 − MSE(true) / MSE(this): by how much the true actions lower the error.
+    /// 1 − MSE(true) / MSE(this): the share of this error that the true actions remove.
     pub reduction: f64,
     /// Its 95 % interval, both resampled together.
     pub reduction_interval: Option<Interval>,
 }
 
-/// The table, and what may be said of it.
+/// The table, and the finding from it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActionTable {
     /// True actions first.
     pub rows: Vec<ActionRow>,
-    /// Whether true actions beat all three others with intervals that do not overlap.
+    /// Whether true actions beat all other actions and a twin without the action, with intervals that do not overlap.
     pub conditioning_works: bool,
     /// The finding in a sentence.
     pub finding: String,
@@ -70,7 +117,7 @@ pub struct ActionTable {
 /// A variant's mean squared errors, `[window][step]`.
 pub type VariantErrors = (Variant, Vec<Vec<f64>>);
 
-/// For each of `count` windows another one whose actions it is told: a single cycle through all (Sattolo 1986), so none
+/// For each of `count` windows another one whose actions it gets: a single cycle through all (Sattolo 1986), so none
 /// keeps its own. With a single window there is no other.
 #[must_use]
 pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
@@ -85,7 +132,7 @@ pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
 /// Errors of each variant, per window and step. Errors: those of the network, `NotFinite`.
 pub fn compare(
     loaded: &LoadedModel,
-    twin: Option<&LoadedModel>,
+    twins: &[&LoadedModel],
     dataset: &Dataset,
     windows: &[Window],
     watched: &EvaluationContext,
@@ -97,21 +144,25 @@ pub fn compare(
     let mut variants = vec![
         (Variant::True, loaded),
         (Variant::Shuffled, loaded),
+        (Variant::Held, loaded),
         (Variant::Zeroed, loaded),
     ];
-    variants.extend(twin.map(|twin| (Variant::UnconditionedTwin, twin)));
+    for twin in twins {
+        variants.push((twin_variant(loaded, twin)?, twin));
+    }
     let total = variants.len() * windows.len();
     let mut all = Vec::new();
     for (variant, model) in variants {
         let mut errors = Vec::with_capacity(windows.len());
         for (batch, donors) in windows.chunks(watched.batch).zip(donors.chunks(watched.batch)) {
-            let told = match variant {
-                Variant::Shuffled => ActionSource::Instead(donors),
+            let source = match variant {
+                Variant::Shuffled => ActionSource::OfWindows(donors),
+                Variant::Held => ActionSource::Held,
                 Variant::Zeroed => ActionSource::Zero,
-                Variant::True | Variant::UnconditionedTwin => ActionSource::TargetFrame,
+                _ => ActionSource::Recorded,
             };
-            errors.extend(errors_of(model, dataset, batch, told)?);
-            watched.tell(
+            errors.extend(errors_of(model, dataset, batch, source)?);
+            watched.report(
                 EvaluationStage::Actions,
                 all.len() * windows.len() + errors.len(),
                 total,
@@ -126,10 +177,10 @@ fn errors_of(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
-    told: ActionSource,
+    source: ActionSource,
 ) -> Result<Vec<Vec<f64>>, EvaluationError> {
     let spec = loaded.model.spec();
-    let predicted = inference::predict(loaded, dataset, windows, told)?;
+    let predicted = inference::predict(loaded, dataset, windows, source)?;
     let frames = predicted.par_chunks_exact(spec.horizon * spec.pixels());
     let error = |(frames, window): (&[f32], &Window)| {
         let steps = frames.chunks_exact(spec.pixels()).enumerate();
@@ -193,7 +244,8 @@ fn mean_over(windows: &[Vec<f64>]) -> StepCurve {
     StepCurve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
 }
 
-/// "Works" only where true beats shuffled, zeroed and twin with intervals apart.
+/// Conditioning works only where true actions beat all others and a twin without the action, with intervals apart. A twin
+/// without the state says nothing about the action.
 fn judge(rows: &[ActionRow]) -> (bool, String) {
     let Some((truth, others)) = rows.split_first() else {
         return (false, "Nothing was compared.".to_owned());
@@ -208,22 +260,23 @@ fn judge(rows: &[ActionRow]) -> (bool, String) {
             .collect::<Vec<_>>()
             .join(", ")
     };
-    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others.iter().partition(apart);
+    let others = || others.iter().filter(|row| row.variant != Variant::TwinWithoutState);
+    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others().partition(apart);
     if !unbeaten.is_empty() {
         let finding = format!(
-            "Conditioning is not shown to work: the interval of true actions is not wholly below that of {}.",
+            "Conditioning is not shown to work: the interval of true actions does not lie below that of {}.",
             labels(&unbeaten)
         );
         return (false, finding);
     }
-    if !others.iter().any(|row| row.variant == Variant::UnconditionedTwin) {
+    if !others().any(|row| row.variant.is_twin_without_action()) {
         let finding = format!(
-            "Conditioning is not shown to work yet: true actions beat {} with intervals apart, but no unconditioned twin was compared.",
+            "Conditioning is not shown to work yet: true actions beat {} with intervals apart, but no twin without the action was compared.",
             labels(&beaten)
         );
         return (false, finding);
     }
-    let least = others.iter().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
+    let least = others().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
     let finding = format!(
         "Conditioning works: true actions beat {} with intervals apart, by at least {:.0} % of the MSE.",
         labels(&beaten),
@@ -266,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn conditioning_works_only_where_all_three_are_beaten_apart() {
+    fn conditioning_works_only_where_all_others_are_beaten() {
         let all = [
             (Variant::True, 1.0),
             (Variant::Shuffled, 2.0),

@@ -1,8 +1,22 @@
-//! The trivial predictors that a model must beat, and the names of all that is compared in a table.
+//! The simple predictors that a model must beat, and the names of all that is compared in a table.
+
+mod affine_flow;
+mod cut_out;
+mod ego_motion;
+mod nearest;
 
 use serde::{Deserialize, Serialize};
 
+use self::affine_flow::AffineFlow;
+use self::cut_out::CutOut;
+use self::ego_motion::CameraTurn;
+use self::nearest::TrainingWindows;
+use super::EvaluationError;
 use super::motion::{Shift, phase_correlation, shifted};
+use super::score::{evenly, training_mean};
+use crate::dataset::sampler::{Split, Splits, WindowShape};
+use crate::dataset::{Dataset, DatasetError, Window};
+use crate::frame::preprocess::scale;
 
 /// One row of a table: who made the prediction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,31 +34,37 @@ pub enum Method {
     LinearExtrapolation,
     /// The last frame moved on by the shift between the last two inputs (phase correlation).
     ConstantShift,
-    /// The true future frame through the model's own dense layers: about the best it can draw. It reads them
-    /// smoothed; a prediction that learnt to sharpen can come out better.
+    /// The last frame warped by the camera's own motion, which follows from the commanded actions.
+    EgoMotion,
+    /// The moving object cut out of the last frame and moved on at constant velocity over the background.
+    MovingCutOut,
+    /// The future of the training window whose inputs differ least.
+    NearestWindow,
+    /// The true future frame through the model's own frame encoder and decoder: about the best it can draw. It reads
+    /// them smoothed; a prediction that learnt to sharpen can come out better.
     CodecOnly,
 }
 
 impl Method {
-    /// The trivial baselines, in the order of the tables.
-    pub const BASELINES: [Self; 5] = [
-        Self::CopyLast,
-        Self::MeanOfInputs,
-        Self::MeanTrainingFrame,
-        Self::LinearExtrapolation,
-        Self::ConstantShift,
-    ];
-
     /// All rows, in the order of the tables.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 10] = [
         Self::Model,
         Self::CopyLast,
         Self::MeanOfInputs,
         Self::MeanTrainingFrame,
         Self::LinearExtrapolation,
         Self::ConstantShift,
+        Self::EgoMotion,
+        Self::MovingCutOut,
+        Self::NearestWindow,
         Self::CodecOnly,
     ];
+
+    /// Whether it predicts without a model.
+    #[must_use]
+    pub fn is_baseline(self) -> bool {
+        !matches!(self, Self::Model | Self::CodecOnly)
+    }
 
     /// The row's name in words.
     #[must_use]
@@ -56,37 +76,133 @@ impl Method {
             Self::MeanTrainingFrame => "mean training frame",
             Self::LinearExtrapolation => "linear extrapolation",
             Self::ConstantShift => "constant global shift",
+            Self::EgoMotion => "commanded ego-motion",
+            Self::MovingCutOut => "moving cut-out",
+            Self::NearestWindow => "nearest training window",
             Self::CodecOnly => "codec on the true frame",
         }
     }
 }
 
-/// What a baseline may look at: intensities 0…1 in the camera's space.
-#[derive(Clone, Copy, Debug)]
+/// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
+#[derive(Clone, Debug)]
 pub struct BaselineInput<'a> {
     /// The input frames, oldest first; at least one.
     pub inputs: &'a [Vec<f32>],
-    /// The mean frame of the training split.
-    pub training_mean: &'a [f32],
-    /// Width of a frame in pixels.
-    pub width: usize,
+    /// The action that led to the last input frame; the first of `actions` where only one frame is known.
+    pub previous_action: &'a [f32],
+    /// The actions that lead to each predicted frame.
+    pub actions: Vec<&'a [f32]>,
+    /// The state at the last input frame.
+    pub state: &'a [f32],
 }
 
-/// The frames 1…`horizon` steps ahead as a baseline predicts them; none for [`Method::Model`] and
-/// [`Method::CodecOnly`], which need a model.
-#[must_use]
-pub fn predict(method: Method, seen: &BaselineInput, horizon: usize) -> Vec<Vec<f32>> {
-    let Some(last) = seen.inputs.last() else {
-        return Vec::new();
-    };
-    match method {
-        Method::CopyLast => vec![last.clone(); horizon],
-        Method::MeanOfInputs => vec![mean(seen.inputs); horizon],
-        Method::MeanTrainingFrame => vec![seen.training_mean.to_vec(); horizon],
-        Method::LinearExtrapolation => extrapolate(seen.inputs, horizon),
-        Method::ConstantShift => move_on(seen, last, horizon),
-        Method::Model | Method::CodecOnly => Vec::new(),
+impl<'a> BaselineInput<'a> {
+    /// The input of a window of that shape, whose first frames are `inputs`.
+    #[must_use]
+    pub fn of_window(dataset: &'a Dataset, window: Window, shape: WindowShape, inputs: &'a [Vec<f32>]) -> Self {
+        let last = window.first_frame + shape.context - 1;
+        Self {
+            inputs,
+            previous_action: dataset.action(last.saturating_sub(1).max(window.first_frame)),
+            actions: (last..last + shape.horizon)
+                .map(|frame| dataset.action(frame))
+                .collect(),
+            state: dataset.state(last),
+        }
     }
+}
+
+/// How the camera's motion follows from the actions.
+enum EgoMotion {
+    Turn(CameraTurn),
+    Flow(AffineFlow),
+}
+
+/// The baselines with what they learn from the training split.
+pub struct Baselines {
+    methods: Vec<Method>,
+    width: usize,
+    training_mean: Vec<f32>,
+    ego_motion: Option<EgoMotion>,
+    cut_out: CutOut,
+    nearest: Option<TrainingWindows>,
+}
+
+impl Baselines {
+    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
+    /// training window of that shape exists there is no nearest one. Errors: those of [`Splits::windows`].
+    pub fn fit(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Self, EvaluationError> {
+        let ego_motion = match CameraTurn::of(dataset.info()) {
+            Some(turn) => Some(EgoMotion::Turn(turn)),
+            None => {
+                AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?).map(EgoMotion::Flow)
+            }
+        };
+        let windows = training_windows(dataset, splits, shape)?;
+        let nearest = TrainingWindows::new(dataset, &evenly(&windows, nearest::MAX_WINDOWS), shape);
+        let single = WindowShape { context: 1, horizon: 1 };
+        let frames = training_windows(dataset, splits, single)?;
+        let methods = Method::ALL.into_iter().filter(|method| match method {
+            Method::EgoMotion => ego_motion.is_some(),
+            Method::NearestWindow => nearest.is_some(),
+            _ => true,
+        });
+        Ok(Self {
+            methods: methods.collect(),
+            width: dataset.info().frame_width_px as usize,
+            training_mean: training_mean(dataset, splits)?,
+            cut_out: CutOut::fit(dataset, &frames),
+            ego_motion,
+            nearest,
+        })
+    }
+
+    /// The rows of the tables: the model, the baselines that apply to this data set, the codec.
+    #[must_use]
+    pub fn methods(&self) -> &[Method] {
+        &self.methods
+    }
+
+    /// The frames 1…`horizon` steps ahead as a baseline predicts them; none for a method that is no baseline or that does
+    /// not apply to the data set.
+    #[must_use]
+    pub fn predict(&self, dataset: &Dataset, method: Method, input: &BaselineInput, horizon: usize) -> Vec<Vec<f32>> {
+        let Some(last) = input.inputs.last() else {
+            return Vec::new();
+        };
+        match method {
+            Method::CopyLast => vec![last.clone(); horizon],
+            Method::MeanOfInputs => vec![mean(input.inputs); horizon],
+            Method::MeanTrainingFrame => vec![self.training_mean.clone(); horizon],
+            Method::LinearExtrapolation => extrapolate(input.inputs, horizon),
+            Method::ConstantShift => move_on(input.inputs, self.width, horizon),
+            Method::EgoMotion => match &self.ego_motion {
+                Some(EgoMotion::Turn(turn)) => turn.predict(input, last),
+                Some(EgoMotion::Flow(flow)) => flow.predict(input, last),
+                None => Vec::new(),
+            },
+            Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
+            Method::NearestWindow => match &self.nearest {
+                Some(windows) => windows.predict(dataset, input.inputs, horizon),
+                None => Vec::new(),
+            },
+            Method::Model | Method::CodecOnly => Vec::new(),
+        }
+    }
+}
+
+/// All training windows of that shape; none where none fits.
+fn training_windows(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Vec<Window>, EvaluationError> {
+    match splits.windows(dataset, Split::Train, shape, 1) {
+        Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
+        windows => Ok(windows?),
+    }
+}
+
+/// A frame of a data set, 0…1.
+fn frame_of(dataset: &Dataset, frame: usize) -> Vec<f32> {
+    scale(dataset.pixels(frame))
 }
 
 fn mean(frames: &[Vec<f32>]) -> Vec<f32> {
@@ -127,20 +243,22 @@ fn extrapolate(frames: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
         .collect()
 }
 
-fn move_on(seen: &BaselineInput, last: &[f32], horizon: usize) -> Vec<Vec<f32>> {
-    let before = seen.inputs.iter().rev().nth(1);
-    let shift = before.map(|before| phase_correlation(before, last, seen.width));
+fn move_on(inputs: &[Vec<f32>], width: usize, horizon: usize) -> Vec<Vec<f32>> {
+    let (before, last) = match inputs {
+        [.., before, last] => (before, last),
+        _ => return vec![inputs.last().cloned().unwrap_or_default(); horizon],
+    };
+    let Shift { x_px, y_px } = phase_correlation(before, last, width);
     (1..=horizon)
-        .map(|step| match shift {
-            Some(Shift { x_px, y_px }) if x_px != 0.0 || y_px != 0.0 => shifted(
+        .map(|step| {
+            shifted(
                 last,
-                seen.width,
+                width,
                 Shift {
                     x_px: x_px * step as f32,
                     y_px: y_px * step as f32,
                 },
-            ),
-            _ => last.to_vec(),
+            )
         })
         .collect()
 }
@@ -150,15 +268,69 @@ mod tests {
     use rand::Rng;
 
     use super::*;
+    use crate::dataset::{DatasetInfo, EpisodeData};
     use crate::frame::quality::mse;
-    use crate::types::Seed;
+    use crate::types::{Channel, Seed};
 
-    fn seen<'a>(inputs: &'a [Vec<f32>], training_mean: &'a [f32], width: usize) -> BaselineInput<'a> {
-        BaselineInput {
-            inputs,
-            training_mean,
-            width,
-        }
+    const SIDE: usize = 16;
+
+    /// A data set of one-channel recordings in which every frame is given by time.
+    fn recordings(
+        side: usize,
+        frame: impl Fn(usize, usize) -> Vec<f32>,
+        action: impl Fn(usize, usize) -> f32,
+    ) -> Dataset {
+        let (episodes, frames) = (20, 12);
+        let data = (0..episodes).map(|episode| EpisodeData {
+            timestamps_s: (0..frames).map(|time| time as f64 * 0.2).collect(),
+            pixels: (0..frames)
+                .flat_map(|time| frame(episode, time))
+                .map(|value| (value * 255.0).round() as u8)
+                .collect(),
+            actions: (0..frames).map(|time| action(episode, time)).collect(),
+            ..EpisodeData::default()
+        });
+        let info = DatasetInfo {
+            name: "made-up".to_owned(),
+            frame_width_px: side as u32,
+            frame_height_px: side as u32,
+            frame_period_s: 0.2,
+            action_channels: vec![Channel::new("pan", "px")],
+            ..DatasetInfo::default()
+        };
+        Dataset::from_episodes(info, data.collect()).unwrap()
+    }
+
+    const SHAPE: WindowShape = WindowShape { context: 5, horizon: 3 };
+
+    fn fitted(dataset: &Dataset) -> (Baselines, Splits) {
+        let splits = Splits::new(dataset, Seed(1));
+        (Baselines::fit(dataset, &splits, SHAPE).unwrap(), splits)
+    }
+
+    /// Mean error of a method over the test windows.
+    fn error_of(method: Method, dataset: &Dataset) -> f64 {
+        let (baselines, splits) = fitted(dataset);
+        let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
+        let errors = windows.iter().flat_map(|&window| {
+            let frame = |step: usize| frame_of(dataset, window.first_frame + step);
+            let inputs: Vec<Vec<f32>> = (0..SHAPE.context).map(frame).collect();
+            let input = BaselineInput::of_window(dataset, window, SHAPE, &inputs);
+            let predicted = baselines.predict(dataset, method, &input, SHAPE.horizon);
+            assert_eq!(predicted.len(), SHAPE.horizon, "{method:?}");
+            let errors: Vec<f64> = predicted
+                .iter()
+                .enumerate()
+                .map(|(step, predicted)| mse(predicted, &frame(SHAPE.context + step)))
+                .collect();
+            errors
+        });
+        let errors: Vec<f64> = errors.collect();
+        errors.iter().sum::<f64>() / errors.len() as f64
+    }
+
+    fn still_scene() -> Vec<f32> {
+        (0..SIDE * SIDE).map(|i| (i * 37 % 101) as f32 / 101.0).collect()
     }
 
     #[test]
@@ -166,8 +338,7 @@ mod tests {
         let inputs: Vec<Vec<f32>> = (0..5)
             .map(|t| vec![0.1 + 0.05 * t as f32, 0.9 - 0.1 * t as f32, 0.4])
             .collect();
-        let frames = predict(Method::LinearExtrapolation, &seen(&inputs, &[], 3), 5);
-        for (step, frame) in frames.iter().enumerate() {
+        for (step, frame) in extrapolate(&inputs, 5).iter().enumerate() {
             let time = (5 + step) as f32;
             assert!((frame[0] - (0.1 + 0.05 * time)).abs() < 1e-6);
             assert!((frame[1] - (0.9 - 0.1 * time).max(0.0)).abs() < 1e-6);
@@ -176,13 +347,16 @@ mod tests {
     }
 
     #[test]
-    fn every_baseline_that_sees_the_scene_is_right_on_a_still_one() {
-        let scene: Vec<f32> = (0..256).map(|i| (i * 37 % 101) as f32 / 101.0).collect();
-        let inputs = vec![scene.clone(); 5];
-        for method in Method::BASELINES {
-            for frame in predict(method, &seen(&inputs, &scene, 16), 3) {
-                assert!(mse(&frame, &scene) < 1e-12, "{method:?}");
-            }
+    fn every_baseline_is_right_on_a_still_scene() {
+        let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
+        for method in fitted(&dataset)
+            .0
+            .methods()
+            .iter()
+            .filter(|method| method.is_baseline())
+        {
+            let error = error_of(*method, &dataset);
+            assert!(error < 1e-6, "{method:?} {error}");
         }
     }
 
@@ -196,19 +370,71 @@ mod tests {
                 .collect()
         };
         let inputs: Vec<Vec<f32>> = (0..5).map(at).collect();
-        let moved = predict(Method::ConstantShift, &seen(&inputs, &[], 64), 2);
-        let copied = predict(Method::CopyLast, &seen(&inputs, &[], 64), 2);
+        let moved = move_on(&inputs, 64, 2);
         for step in 0..2 {
             let truth = at(5 + step);
-            assert!(mse(&moved[step], &truth) < 0.3 * mse(&copied[step], &truth));
+            assert!(mse(&moved[step], &truth) < 0.3 * mse(&inputs[4], &truth));
         }
     }
 
     #[test]
     fn one_input_is_enough() {
-        let inputs = vec![vec![0.25; 4]];
-        for method in Method::BASELINES {
-            assert_eq!(predict(method, &seen(&inputs, &[0.25; 4], 2), 1), [vec![0.25; 4]]);
+        let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
+        let shape = WindowShape { context: 1, horizon: 1 };
+        let splits = Splits::new(&dataset, Seed(1));
+        let baselines = Baselines::fit(&dataset, &splits, shape).unwrap();
+        let inputs = [frame_of(&dataset, 0)];
+        let window = Window {
+            episode: 0,
+            first_frame: 0,
+        };
+        let input = BaselineInput::of_window(&dataset, window, shape, &inputs);
+        for method in baselines.methods().iter().filter(|method| method.is_baseline()) {
+            let predicted = baselines.predict(&dataset, *method, &input, 1);
+            assert!(mse(&predicted[0], &inputs[0]) < 1e-6, "{method:?}");
         }
+    }
+
+    /// A smooth texture that moves by as many pixels a frame as the action says.
+    #[test]
+    fn without_a_camera_model_the_flow_is_learned_from_the_actions() {
+        let pan = |episode: usize, time: usize| [-1.5, 2.0, 0.5, -0.5][(episode + time / 3) % 4];
+        let offset = |episode: usize, time: usize| -> f32 { (0..time).map(|t| pan(episode, t)).sum() };
+        let frame = |episode: usize, time: usize| -> Vec<f32> {
+            let at = |i: usize| {
+                let x = (i % 32) as f32 + offset(episode, time) + 11.0 * episode as f32;
+                let y = (i / 32) as f32;
+                0.5 + 0.25 * (x * 0.55).sin() + 0.2 * (y * 0.4 + x * 0.21).cos()
+            };
+            (0..32 * 32).map(at).collect()
+        };
+        let dataset = recordings(32, frame, pan);
+        let (warped, copied) = (error_of(Method::EgoMotion, &dataset), error_of(Method::CopyLast, &dataset));
+        assert!(warped < 0.3 * copied, "{warped} {copied}");
+    }
+
+    #[test]
+    fn a_moving_square_is_cut_out_and_moved_on() {
+        let frame = |episode: usize, time: usize| -> Vec<f32> {
+            let top = episode % 4 * 3;
+            let inside = |i: usize| (time..time + 4).contains(&(i % SIDE)) && (top..top + 4).contains(&(i / SIDE));
+            (0..SIDE * SIDE)
+                .map(|i| if inside(i) { 0.1 } else { 0.6 + 0.01 * (i % 7) as f32 })
+                .collect()
+        };
+        let dataset = recordings(SIDE, frame, |_, _| 0.0);
+        let (moved, copied) = (error_of(Method::MovingCutOut, &dataset), error_of(Method::CopyLast, &dataset));
+        assert!(moved < 0.1 * copied, "{moved} {copied}");
+    }
+
+    #[test]
+    fn a_window_seen_in_training_is_found_again() {
+        let frame = |episode: usize, time: usize| -> Vec<f32> {
+            let mut rng = Seed((episode % 2 * 100 + time) as u64).rng();
+            (0..SIDE * SIDE).map(|_| rng.random()).collect()
+        };
+        let dataset = recordings(SIDE, frame, |_, _| 0.0);
+        assert!(error_of(Method::NearestWindow, &dataset) < 1e-6);
+        assert!(error_of(Method::CopyLast, &dataset) > 0.1);
     }
 }

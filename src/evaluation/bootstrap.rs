@@ -1,14 +1,14 @@
-//! Intervals by bootstrap over trials (Efron 1979, percentiles). Windows overlap and so aren't independent; trials are.
+//! Intervals by bootstrap over trials (Efron 1979, percentiles). Windows overlap, so they are not independent; trials are.
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::types::Seed;
 
-/// How much of the resampled values an [`Interval`] holds.
+/// Share of the resampled values that an [`Interval`] holds.
 pub const CONFIDENCE: f64 = 0.95;
 
-/// The middle [`CONFIDENCE`] of the values that resampled trials gave.
+/// The range of the middle [`CONFIDENCE`] of the values computed from resampled trials.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// Lower end.
@@ -18,7 +18,7 @@ pub struct Interval {
 }
 
 impl Interval {
-    /// Whether all of this interval lies under all of the other.
+    /// Whether this whole interval lies below the other one.
     #[must_use]
     pub fn is_below(&self, other: &Self) -> bool {
         self.high < other.low
@@ -30,11 +30,11 @@ impl Interval {
 pub struct Bootstrap {
     /// Number of resamples.
     pub samples: usize,
-    /// The same seed draws the same trials, so that what is computed apart is resampled alike.
+    /// The same seed draws the same trials, so values computed separately are resampled in the same way.
     pub seed: Seed,
 }
 
-/// Values per window, summed up by trial: all that resampling of trials needs.
+/// Sums of the windows' values for each trial: all that resampling of trials needs.
 #[derive(Clone, Debug)]
 pub struct TrialSums {
     windows: Vec<f64>,

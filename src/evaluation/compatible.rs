@@ -1,16 +1,16 @@
-//! Whether a model and a data set belong together, checked before anything is computed.
+//! Whether a model can run on a data set, checked before anything is computed.
 
 use super::EvaluationError;
 use crate::dataset::{Dataset, DatasetInfo};
+use crate::error_text::comma_separated;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
 use crate::types::Seed;
-use crate::wording::listed;
 
-/// Periods that differ by less than this share of themselves are the same.
+/// Frame periods count as equal if they differ by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.01;
 
-/// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model can't be run on the data set.
+/// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model cannot run on the data set.
 pub fn check(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), EvaluationError> {
     let (spec, info) = (loaded.model.spec(), dataset.info());
     let model = || loaded.manifest.name.clone();
@@ -44,7 +44,7 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
         if used.is_none() {
             continue;
         }
-        let (wanted, found) = (listed(wanted), listed(found));
+        let (wanted, found) = (comma_separated(wanted), comma_separated(found));
         if wanted != found {
             return Err(EvaluationError::Channels {
                 dataset: info.name.clone(),
@@ -58,8 +58,8 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
     Ok(())
 }
 
-/// The seed of the split to test with: that of the model's training unless another is asked for.
-/// Errors: `SplitSeed` where that would test on what was trained on.
+/// The seed of the split to test with: that of the model's training, unless another is asked for.
+/// Errors: `SplitSeed` where that would test on training data.
 pub fn split_seed(loaded: &LoadedModel, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {
     let trained = &loaded.manifest.dataset;
     let seed = asked.unwrap_or(trained.split_seed);
@@ -71,24 +71,4 @@ pub fn split_seed(loaded: &LoadedModel, dataset: &Dataset, asked: Option<Seed>) 
         });
     }
     Ok(seed)
-}
-
-/// Errors: `Twin` where the unconditioned twin takes other windows than the model, or is conditioned.
-pub fn check_twin(loaded: &LoadedModel, twin: &LoadedModel) -> Result<(), EvaluationError> {
-    let (spec, other) = (loaded.model.spec(), twin.model.spec());
-    let refused = |found: String, wanted: String| EvaluationError::Twin {
-        twin: twin.manifest.name.clone(),
-        found,
-        model: loaded.manifest.name.clone(),
-        wanted,
-    };
-    if other.action_inputs().is_some() {
-        let found = format!("conditioning \"{}\"", other.conditioning);
-        return Err(refused(found, "conditioning \"none\"".to_owned()));
-    }
-    let window = |spec: &ModelSpec| format!("{} context frames and {} to predict", spec.context, spec.horizon);
-    if window(spec) != window(other) {
-        return Err(refused(window(other), window(spec)));
-    }
-    Ok(())
 }

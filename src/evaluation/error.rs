@@ -5,9 +5,12 @@ use std::path::PathBuf;
 use crate::dataset::DatasetError;
 use crate::frame::FrameError;
 use crate::nn::NnError;
+use crate::sim::SimError;
+use crate::types::ValueError;
 
 /// What was wrong, and what would be right.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum EvaluationError {
     /// The frames have another size.
     #[error(
@@ -105,10 +108,10 @@ pub enum EvaluationError {
         /// First frame of the window.
         frame: usize,
     },
-    /// It was asked to stop.
+    /// Another thread stopped it.
     #[error("the evaluation was cancelled")]
     Cancelled,
-    /// The output directory holds something, or is a file.
+    /// The output directory is not empty, or is a file.
     #[error("{} exists and is not an empty directory; name a new one", .0.display())]
     OutputExists(PathBuf),
     /// A file could not be written.
@@ -127,12 +130,18 @@ pub enum EvaluationError {
         /// The drawing library's reason.
         reason: String,
     },
-    /// The data set does not serve.
+    /// The data set is not usable.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// A frame does not serve.
+    /// A frame is not usable.
     #[error(transparent)]
     Frame(#[from] FrameError),
+    /// The simulator refused to replay a trial.
+    #[error("could not replay a trial of the data set: {0}")]
+    Replay(#[from] SimError),
+    /// An action of the data set is no action.
+    #[error(transparent)]
+    Action(ValueError),
     /// The network refused its input.
     #[error(transparent)]
     Network(#[from] NnError),

@@ -1,4 +1,4 @@
-//! Pictures of what a model does: panels like the paper's figures 6–8, error by horizon, an animation.
+//! Pictures of a model's predictions: panels like the paper's figures 6–8, error by horizon, an animation.
 
 pub mod animation;
 pub mod chart;
@@ -28,9 +28,9 @@ pub struct FigureFile {
 /// One window in pictures, as the camera would see them.
 #[derive(Clone, Debug, Default)]
 pub struct SampleFigure {
-    /// Goes into the files' names.
+    /// The end of the files' names.
     pub name: String,
-    /// What window it is; empty for none.
+    /// The title above the pictures; may be empty.
     pub note: String,
     /// The frames seen, t−4…t.
     pub inputs: Vec<Frame>,
@@ -38,7 +38,7 @@ pub struct SampleFigure {
     pub reconstructed: Vec<Frame>,
     /// The frames predicted, t+1…
     pub predicted: Vec<Frame>,
-    /// The frames that came; empty where they aren't known.
+    /// The true future frames; empty where they are not known.
     pub truth: Vec<Frame>,
 }
 
@@ -75,7 +75,7 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
     for sample in &inputs.samples {
         let panel = codec::encode_png(&prediction_panel(sample)?)?;
         let caption = format!(
-            "Prediction, truth and inputs (the paper's figure 8), {} window",
+            "Inputs, truth, prediction and error (the paper's figure 8), {} window",
             sample.name
         );
         put(format!("prediction-{}.png", sample.name), caption, &panel)?;
@@ -105,7 +105,7 @@ pub fn write(dir: &Path, inputs: &FigureInputs) -> Result<Vec<FigureFile>, Evalu
     Ok(files)
 }
 
-/// The paper's figure 8: predicted frames above the true ones (where known), the inputs below.
+/// The paper's figure 8, from the top: inputs, true frames and errors (where the truth is known), predicted frames.
 pub fn prediction_panel(sample: &SampleFigure) -> Result<Frame, FrameError> {
     montage::prediction_panel(&sample.note, &sample.inputs, &sample.predicted, &sample.truth)
 }

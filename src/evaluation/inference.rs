@@ -10,18 +10,20 @@ use crate::frame::preprocess::Preprocess;
 use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
 
-/// Which actions the model is told.
+/// Which future actions the model gets.
 #[derive(Clone, Copy, Debug)]
 pub enum ActionSource<'a> {
-    /// Those that were taken.
-    TargetFrame,
-    /// For each window, in the order of the batch, those taken in another one.
-    Instead(&'a [Window]),
+    /// Those that were carried out.
+    Recorded,
+    /// For each window, in the order of the batch, those carried out in another one.
+    OfWindows(&'a [Window]),
+    /// At every step the action that led to the last frame seen.
+    Held,
     /// Zero in every component, in the channels' own units.
     Zero,
 }
 
-/// What a model made of a batch of windows. All frames are `[window][step]`, P values each, one after another, in the
+/// What a model computed from a batch of windows. All frames are `[window][step]`, P values each, one after another, in the
 /// model's space and not clamped.
 #[derive(Clone, Debug)]
 pub struct Predicted {
@@ -29,7 +31,7 @@ pub struct Predicted {
     pub frames: Vec<f32>,
     /// The true frames to come.
     pub truth: Vec<f32>,
-    /// The true frames to come through the dense layers.
+    /// The true frames to come through the frame encoder and decoder.
     pub codec: Vec<f32>,
     /// The frames seen as the model reconstructs them; empty if it does not.
     pub reconstructed: Vec<f32>,
@@ -40,12 +42,12 @@ pub fn predict(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
-    told: ActionSource,
+    source: ActionSource,
 ) -> Result<Vec<f32>, EvaluationError> {
     let spec = loaded.model.spec();
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
     let frames = Tensor::from_vec(inputs, (windows.len(), spec.context, spec.pixels()), &Device::Cpu)?;
-    let condition = condition(spec, dataset, windows, told)?;
+    let condition = condition(spec, dataset, windows, source)?;
     let predicted = values(&loaded.model.predict_frames(&frames, &condition)?)?;
     let window_values = spec.horizon * spec.pixels();
     match predicted.iter().position(|value| !value.is_finite()) {
@@ -59,15 +61,15 @@ pub fn predict(
     }
 }
 
-/// As [`predict`] with the true actions, what the dense layers alone make of the true frames to come, and what the
-/// reconstruction makes of those seen.
+/// As [`predict`] with the true actions, the true frames to come through the frame encoder and decoder, and the
+/// reconstruction of those seen.
 pub fn predict_with_ceiling(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
 ) -> Result<Predicted, EvaluationError> {
     let spec = loaded.model.spec();
-    let frames = predict(loaded, dataset, windows, ActionSource::TargetFrame)?;
+    let frames = predict(loaded, dataset, windows, ActionSource::Recorded)?;
     let truth = model_space(
         dataset,
         spec.preprocess,
@@ -127,26 +129,33 @@ fn model_space(
     Ok(all)
 }
 
-/// Action k of a window is the one taken at the frame before its k-th predicted frame.
+/// Action k of a window is the one recorded at the frame before its k-th predicted frame.
 fn condition(
     spec: &ModelSpec,
     dataset: &Dataset,
     windows: &[Window],
-    told: ActionSource,
+    source: ActionSource,
 ) -> Result<ConditioningTensors, EvaluationError> {
     let batch = windows.len();
     let mut condition = ConditioningTensors::none();
     if let Some(count) = spec.action_inputs() {
-        let taken = |windows: &[Window]| -> Vec<f32> {
+        let recorded = |windows: &[Window]| -> Vec<f32> {
             let frames = windows.iter().flat_map(|window| {
                 let last = window.first_frame + spec.context - 1;
                 last..last + spec.horizon
             });
             frames.flat_map(|frame| dataset.action(frame).iter().copied()).collect()
         };
-        let actions = match told {
-            ActionSource::TargetFrame => taken(windows),
-            ActionSource::Instead(others) => taken(others),
+        let actions = match source {
+            ActionSource::Recorded => recorded(windows),
+            ActionSource::OfWindows(others) => recorded(others),
+            ActionSource::Held => windows
+                .iter()
+                .flat_map(|window| {
+                    let before = window.first_frame + spec.context.saturating_sub(2);
+                    dataset.action(before).repeat(spec.horizon)
+                })
+                .collect(),
             ActionSource::Zero => vec![0.0; batch * spec.horizon * count],
         };
         condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);

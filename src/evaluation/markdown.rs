@@ -2,10 +2,12 @@
 
 use std::fmt::Write;
 
+use super::Purpose;
 use super::actions::ActionTable;
 use super::baselines::Method;
 use super::bootstrap::{CONFIDENCE, Interval};
 use super::metrics::{MethodScores, PSNR_CAP_DB, StepCurve};
+use super::plans::PlanOutcome;
 use super::report::{EvaluationReport, ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 
 /// Squared errors are shown in this unit.
@@ -27,7 +29,7 @@ fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result
     headline(out, report)?;
     for set in &report.sets {
         if let Some(scores) = set.outcome.scores() {
-            writeln!(out, "\n## {}\n", title(&set.split))?;
+            writeln!(out, "\n## {}\n", set_title(&set.split))?;
             set_section(out, scores)?;
         }
     }
@@ -37,36 +39,65 @@ fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result
     stamp(out, &report.stamp)
 }
 
-fn title(split: &str) -> &'static str {
+/// What a set holds, as a heading.
+pub(super) fn set_title(split: &str) -> &'static str {
     match split {
-        "test" => "Trials never seen",
-        _ => "Start/goal pairs and gains never seen",
+        "validation" => "Validation",
+        "unseen-pairs" => "Unseen start/goal pairs",
+        "unseen-gains" => "Unseen gains",
+        _ => "Unseen trials",
     }
 }
 
 fn headline(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     writeln!(
         out,
-        "Skill is 1 − MSE / MSE of the best trivial baseline at each step: 1 is perfect, 0 no better than the best of them.\n"
-    )?;
-    writeln!(
-        out,
-        "| Test set | Windows | Trials | Skill, mean t+1…t+{} | 95 % interval |",
+        "Skill is 1 − MSE / MSE of the strongest baseline at each step: 1 is perfect, 0 is no better than that baseline. All \
+         numbers are means over t+1…t+{}; MSE is in units of 10⁻⁴.\n",
         report.model.horizon
     )?;
-    writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
+    if report.stamp.purpose == Purpose::Validation {
+        writeln!(
+            out,
+            "These are validation scores, for choosing between models and settings. Publish test scores.\n"
+        )?;
+    }
+    writeln!(
+        out,
+        "| Set | Windows | Trials | Skill | 95 % interval | MSE | MSE on moving robots | SSIM | Strongest baseline (MSE) |"
+    )?;
+    writeln!(out, "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")?;
     for SetReport { split, outcome } in &report.sets {
-        write!(out, "| {} (`{split}`) | ", title(split))?;
+        write!(out, "| {} (`{split}`) | ", set_title(split))?;
         match outcome {
             SetOutcome::Scored(scores) => {
                 let interval = interval(scores.skill.mean_interval.as_ref(), |value| format!("{value:.3}"));
                 let (windows, trials, skill) = (scores.windows, scores.trials, scores.skill.skill.mean);
-                writeln!(out, "{windows} | {trials} | **{skill:.3}** | {interval} |")?;
+                write!(out, "{windows} | {trials} | **{skill:.3}** | {interval} |")?;
+                headline_errors(out, scores)?;
             }
-            SetOutcome::Skipped { reason } => writeln!(out, "– | – | skipped: {reason} | – |")?,
+            SetOutcome::Skipped { reason } => writeln!(out, "– | – | skipped: {reason} | – | – | – | – | – |")?,
         }
     }
     Ok(())
+}
+
+fn headline_errors(out: &mut String, scores: &SetScores) -> std::fmt::Result {
+    let row = |wanted| scores.methods.iter().find(|row| row.method == wanted);
+    let best = scores.skill.best_mean_baseline;
+    if let (Some(model), Some(baseline)) = (row(Method::Model), row(best)) {
+        let mover = model.mover_mse.as_ref();
+        write!(
+            out,
+            " {} | {} | {:.3} | {} ({}) |",
+            in_mse_units(model.mse.mean),
+            mover.map_or_else(|| "–".to_owned(), |mse| in_mse_units(mse.mean)),
+            model.ssim.mean,
+            best.label(),
+            in_mse_units(baseline.mse.mean)
+        )?;
+    }
+    writeln!(out)
 }
 
 fn interval(interval: Option<&Interval>, format: impl Fn(f64) -> String) -> String {
@@ -117,23 +148,42 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
     } else {
         writeln!(
             out,
-            "No error inside a mask: the data has no masks, or nobody moves in view.\n"
+            "There is no error on moving robots: the data set has no masks, or no robot is in view.\n"
         )?;
     }
     writeln!(
         out,
-        "The frames seen come out of the reconstruction with an MSE of {} ×10⁻⁴.\n",
+        "The reconstruction of the frames seen has an MSE of {} ×10⁻⁴.\n",
         in_mse_units(scores.reconstruction_mse.mean)
     )?;
     writeln!(
         out,
-        "In the model's own space (smoothed, and inverted where it inverts) its MSE is {} ×10⁻⁴; that number serves no \
-         comparison with models that preprocess differently.",
+        "In the model's own space (smoothed, and inverted if the model inverts) the MSE is {} ×10⁻⁴. Do not compare this \
+         number between models that preprocess differently.",
         in_mse_units(scores.model_space_mse.mean)
     )?;
     match &scores.actions {
-        Some(table) => action_table(out, table),
-        None => writeln!(out, "\nThe model takes no actions, so there is no action table."),
+        Some(table) => action_table(out, table)?,
+        None => writeln!(out, "\nThe model takes no actions, so there is no action table.")?,
+    }
+    scores.plans.as_ref().map_or(Ok(()), |plans| plan_section(out, plans))
+}
+
+fn plan_section(out: &mut String, plans: &PlanOutcome) -> std::fmt::Result {
+    writeln!(out, "\n### Plan identification\n")?;
+    let percent = |value: f64| format!("{:.1} %", 100.0 * value);
+    match plans {
+        PlanOutcome::Measured(plans) => writeln!(
+            out,
+            "The simulator carried out {} plans from each of {} contexts. The true future of a plan is nearest to the \
+             model's prediction for that plan in **{}** of the cases (95 % interval: {}; guessing gives {}).",
+            plans.plans,
+            plans.contexts,
+            percent(plans.rate),
+            interval(plans.interval.as_ref(), percent),
+            percent(plans.chance)
+        ),
+        PlanOutcome::Skipped { reason } => writeln!(out, "Not measured: {reason}."),
     }
 }
 
@@ -196,7 +246,7 @@ fn action_table(out: &mut String, table: &ActionTable) -> std::fmt::Result {
     writeln!(out, "{}\n", table.finding)?;
     writeln!(
         out,
-        "| Told | MSE, ×10⁻⁴ | 95 % interval | True actions lower it by | 95 % interval |"
+        "| Actions or model | MSE, ×10⁻⁴ | 95 % interval | True actions lower it by | 95 % interval |"
     )?;
     writeln!(out, "| --- | ---: | ---: | ---: | ---: |")?;
     let percent = |value: f64| format!("{:.1} %", 100.0 * value);
@@ -227,7 +277,7 @@ fn figures(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     writeln!(out, "\n## Pictures\n")?;
     writeln!(
         out,
-        "Windows are chosen by the model's error alone: the median, the best and the worst."
+        "The windows are those with the median, the least and the greatest error of the model in each set."
     )?;
     for figure in &report.figures {
         writeln!(out, "\n![{0}]({1})\n\n{0}.", figure.caption, figure.file)?;
@@ -239,14 +289,47 @@ fn how(out: &mut String) -> std::fmt::Result {
     writeln!(out, "\n## How this was measured\n")?;
     writeln!(
         out,
-        "Frames are compared as the camera saw them, 0…1, neither inverted nor smoothed. PSNR is the mean over frames of each \
-         frame's own, at most {PSNR_CAP_DB:.0} dB (the error of rounding to 8 bits). SSIM has an 11-tap Gaussian window, \
-         sigma 1.5. The mean training frame knows the training split alone. Linear extrapolation is the least-squares line \
-         through each pixel's inputs. The constant global shift is that between the last two inputs, by phase correlation. \
-         \"Codec only\" puts the true future frame through the model's dense layers. Intervals hold {:.0} % of bootstrap \
-         resamples of whole trials; the best baseline is chosen anew at each step and in each resample.",
+        "Frames are compared as the camera saw them: intensities 0…1, neither inverted nor smoothed. PSNR is the mean of the \
+         frames' PSNR, each at most {PSNR_CAP_DB:.0} dB (the error of rounding to 8 bits). SSIM uses an 11-tap Gaussian \
+         window, sigma 1.5. Intervals hold {:.0} % of the bootstrap resamples of whole trials. The strongest baseline is \
+         chosen at each step, and again in each resample.\n",
         100.0 * CONFIDENCE
-    )
+    )?;
+    for (method, how) in [
+        (Method::CopyLast, "the last input frame, repeated"),
+        (Method::MeanOfInputs, "the mean of the input frames"),
+        (Method::MeanTrainingFrame, "the mean frame of the training split"),
+        (
+            Method::LinearExtrapolation,
+            "the least-squares line through each pixel's inputs, continued",
+        ),
+        (
+            Method::ConstantShift,
+            "the last frame moved on by the shift between the last two inputs (phase correlation)",
+        ),
+        (
+            Method::EgoMotion,
+            "the last frame warped by the commanded rotation of the camera, through the data set's camera model; without \
+             a camera model, by an affine motion that depends linearly on the actions, fitted to the training split",
+        ),
+        (
+            Method::MovingCutOut,
+            "the largest connected group of pixels that differ from the background, moved on at constant velocity over \
+             the background; the background is the temporal median of the training split, or of the inputs where the \
+             camera looks elsewhere; the true mask is not used",
+        ),
+        (
+            Method::NearestWindow,
+            "the future of the training window (one of at most 15,000) whose inputs have the least MSE",
+        ),
+        (
+            Method::CodecOnly,
+            "the true future frame through the model's frame encoder and decoder; this is no prediction",
+        ),
+    ] {
+        writeln!(out, "- {}: {how}.", method.label())?;
+    }
+    Ok(())
 }
 
 fn model(out: &mut String, model: &ModelSummary) -> std::fmt::Result {
@@ -300,8 +383,8 @@ fn stamp(out: &mut String, stamp: &ReportStamp) -> std::fmt::Result {
     )?;
     writeln!(out, "| split seed | {} |", stamp.split_seed.0)?;
     writeln!(out, "| model | `{}`, weights `{}` |", stamp.model, stamp.model_sha256)?;
-    if let Some((name, hash)) = &stamp.twin {
-        writeln!(out, "| unconditioned twin | `{name}`, weights `{hash}` |")?;
+    for (name, hash) in &stamp.twins {
+        writeln!(out, "| twin | `{name}`, weights `{hash}` |")?;
     }
     writeln!(
         out,
@@ -311,17 +394,17 @@ fn stamp(out: &mut String, stamp: &ReportStamp) -> std::fmt::Result {
     writeln!(out, "| command | `{}` |", stamp.command)?;
     writeln!(
         out,
-        "| windows | every {}; {} resamples, seed {} |",
+        "| windows | {}; {} resamples, seed {} |",
         match stamp.stride {
-            1 => "frame starts one".to_owned(),
-            stride => format!("{stride} frames one starts"),
+            1 => "one starts at every frame".to_owned(),
+            stride => format!("one starts every {stride} frames"),
         },
         stamp.bootstrap_samples,
         stamp.seed.0
     )?;
     writeln!(
         out,
-        "| took | {:.1} s on {}, {} threads |",
+        "| time | {:.1} s on {}, {} threads |",
         stamp.wall_time_s, stamp.cpu, stamp.threads
     )
 }

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use super::baselines::Method;
 use crate::frame::quality;
 
-/// The PSNR of a frame counts as at most this, in dB: it is the error that rounding to 8 bits makes, and a still
-/// scene without noise must not make a mean infinite.
+/// The greatest PSNR of a frame, in dB: that of rounding to 8 bits. Without it, one perfect frame would make a mean
+/// infinite.
 pub const PSNR_CAP_DB: f64 = 59.0;
 
 /// Scores of one predicted frame against the true one, intensities 0…1.
@@ -24,12 +24,12 @@ pub struct FrameScore {
     pub mover_pixels: usize,
 }
 
-/// A true frame and whose its pixels are.
+/// A true frame and the mask of its movers.
 #[derive(Clone, Copy, Debug)]
 pub struct TargetFrame<'a> {
     /// Intensities 0…1.
     pub pixels: &'a [f32],
-    /// 0 where the scene is, other values where a mover is; absent for recordings.
+    /// 0 for pixels of the scene, other values for pixels of movers; absent for recordings.
     pub mask: Option<&'a [u8]>,
     /// Width in pixels.
     pub width: usize,
@@ -81,7 +81,7 @@ pub struct WindowScores {
     pub episode: usize,
     /// Its first frame in the data set.
     pub first_frame: usize,
-    /// `frames[row][step]`, rows as in [`Method::ALL`].
+    /// `frames[row][step]`, one row for each method that was scored.
     pub frames: Vec<Vec<FrameScore>>,
     /// Mean squared error of the model in its own space, per step.
     pub model_space_mse: Vec<f64>,
@@ -101,7 +101,7 @@ impl WindowScores {
 /// One row of a test set's tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MethodScores {
-    /// Who predicted.
+    /// The method.
     pub method: Method,
     /// Mean squared error per pixel.
     pub mse: StepCurve,
@@ -109,17 +109,17 @@ pub struct MethodScores {
     pub psnr_db: StepCurve,
     /// Structural similarity: mean over frames.
     pub ssim: StepCurve,
-    /// Mean squared error over all pixels of movers; absent where the data has no masks or nobody moved in view.
+    /// Mean squared error over all pixels of movers; absent where the data set has no masks or no mover is in view.
     pub mover_mse: Option<StepCurve>,
 }
 
-/// The tables' rows from the windows' scores.
+/// The tables' rows from the windows' scores of these methods.
 #[must_use]
-pub fn summarize(windows: &[WindowScores]) -> Vec<MethodScores> {
-    Method::ALL
-        .into_iter()
+pub fn summarize(methods: &[Method], windows: &[WindowScores]) -> Vec<MethodScores> {
+    methods
+        .iter()
         .enumerate()
-        .map(|(row, method)| MethodScores {
+        .map(|(row, &method)| MethodScores {
             method,
             mse: mean_curve(windows, row, |score| score.mse),
             psnr_db: mean_curve(windows, row, |score| score.psnr_db),
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn the_psnr_of_a_set_is_the_mean_of_its_frames_and_not_of_its_error() {
+    fn the_psnr_of_a_set_is_the_mean_of_its_frames() {
         let window = |psnr_db, mover_pixels| WindowScores {
             episode: 0,
             first_frame: 0,
@@ -195,7 +195,7 @@ mod tests {
             model_space_mse: vec![0.0],
             reconstruction_mse: vec![0.0],
         };
-        let rows = summarize(&[window(20.0, 1), window(40.0, 3)]);
+        let rows = summarize(&Method::ALL, &[window(20.0, 1), window(40.0, 3)]);
         assert_eq!(rows[0].psnr_db.mean, 30.0);
         assert_eq!(rows[0].mover_mse.as_ref().unwrap().mean, 0.5);
     }

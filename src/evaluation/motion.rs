@@ -1,6 +1,10 @@
 //! How far a whole image moved between two frames, by phase correlation (Kuglin & Hines 1975), and moving one.
 
 use std::f32::consts::PI;
+use std::sync::Arc;
+
+use rustfft::num_complex::Complex32;
+use rustfft::{Fft, FftPlanner};
 
 /// A shift of the image content in pixels: positive is right and down.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,46 +15,8 @@ pub struct Shift {
     pub y_px: f32,
 }
 
-#[derive(Clone, Copy)]
-struct Complex {
-    re: f32,
-    im: f32,
-}
-
-impl Complex {
-    const ZERO: Self = Self { re: 0.0, im: 0.0 };
-
-    fn times(self, other: Self) -> Self {
-        Self {
-            re: self.re * other.re - self.im * other.im,
-            im: self.re * other.im + self.im * other.re,
-        }
-    }
-
-    fn conjugate(self) -> Self {
-        Self {
-            re: self.re,
-            im: -self.im,
-        }
-    }
-
-    fn plus(self, other: Self) -> Self {
-        Self {
-            re: self.re + other.re,
-            im: self.im + other.im,
-        }
-    }
-
-    fn minus(self, other: Self) -> Self {
-        Self {
-            re: self.re - other.re,
-            im: self.im - other.im,
-        }
-    }
-}
-
-/// The global shift that leads from `before` to `after`, both `width` pixels wide, to a fraction of a pixel.
-/// Zero where the images say nothing (flat or equal).
+/// The global shift from `before` to `after`, both `width` pixels wide, to a fraction of a pixel.
+/// Zero where the images are flat or equal.
 #[must_use]
 pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
     const STILL: Shift = Shift { x_px: 0.0, y_px: 0.0 };
@@ -61,16 +27,12 @@ pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
     let (columns, rows) = (width.next_power_of_two(), height.next_power_of_two());
     let spectrum_before = spectrum(before, width, columns, rows);
     let spectrum_after = spectrum(after, width, columns, rows);
-    let mut cross: Vec<Complex> = spectrum_after
+    let mut cross: Vec<Complex32> = spectrum_after
         .iter()
         .zip(&spectrum_before)
-        .map(|(&after, &before)| normalized(after.times(before.conjugate())))
+        .map(|(after, before)| normalized(after * before.conj()))
         .collect();
-    // The transform of the conjugate gives the inverse transform up to conjugation, and the surface is real.
-    for value in &mut cross {
-        *value = value.conjugate();
-    }
-    transform_2d(&mut cross, columns);
+    transform_2d(&mut cross, columns, FftPlanner::plan_fft_inverse);
     let surface: Vec<f32> = cross.iter().map(|value| value.re).collect();
     let Some(peak) = (0..surface.len()).max_by(|&a, &b| surface[a].total_cmp(&surface[b])) else {
         return STILL;
@@ -86,7 +48,7 @@ pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
     }
 }
 
-/// The image moved by the shift; what comes into view repeats the edge pixel, fractions are interpolated bilinearly.
+/// The image moved by the shift, bilinear; new parts repeat the edge pixel.
 #[must_use]
 pub fn shifted(image: &[f32], width: usize, shift: Shift) -> Vec<f32> {
     if width == 0 || image.is_empty() {
@@ -116,7 +78,7 @@ fn mix(a: f32, b: f32, weight: f32) -> f32 {
     a + (b - a) * weight
 }
 
-/// The second half of a periodic axis are negative shifts.
+/// Positions in the second half of a periodic axis are negative shifts.
 fn signed(position: usize, len: usize) -> f32 {
     if position > len / 2 {
         position as f32 - len as f32
@@ -125,7 +87,7 @@ fn signed(position: usize, len: usize) -> f32 {
     }
 }
 
-/// Where between −½ and ½ the parabola through three neighbours peaks.
+/// The place of the peak, −½ to ½, of the parabola through three neighbours.
 fn vertex(before: f32, peak: f32, after: f32) -> f32 {
     let curvature = before - 2.0 * peak + after;
     if curvature < -1e-9 {
@@ -135,29 +97,23 @@ fn vertex(before: f32, peak: f32, after: f32) -> f32 {
     }
 }
 
-fn normalized(value: Complex) -> Complex {
-    let length = value.re.hypot(value.im);
-    if length < 1e-6 {
-        return Complex::ZERO;
-    }
-    Complex {
-        re: value.re / length,
-        im: value.im / length,
-    }
+fn normalized(value: Complex32) -> Complex32 {
+    let length = value.norm();
+    if length < 1e-6 { Complex32::ZERO } else { value / length }
 }
 
-/// Spectrum of the image without its mean, faded out at the border (Hann) so that the border isn't what correlates.
-fn spectrum(image: &[f32], width: usize, columns: usize, rows: usize) -> Vec<Complex> {
+/// Spectrum of the image without its mean, faded out at the border (Hann) so that the border does not correlate.
+fn spectrum(image: &[f32], width: usize, columns: usize, rows: usize) -> Vec<Complex32> {
     let height = image.len() / width;
     let mean = image.iter().sum::<f32>() / image.len().max(1) as f32;
     let (across, down) = (hann(width), hann(height));
-    let mut values = vec![Complex::ZERO; columns * rows];
+    let mut values = vec![Complex32::ZERO; columns * rows];
     for (y, row) in image.chunks_exact(width).enumerate() {
         for (x, pixel) in row.iter().enumerate() {
             values[y * columns + x].re = (pixel - mean) * across[x] * down[y];
         }
     }
-    transform_2d(&mut values, columns);
+    transform_2d(&mut values, columns, FftPlanner::plan_fft_forward);
     values
 }
 
@@ -167,62 +123,17 @@ fn hann(len: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Discrete Fourier transform of rows, then columns; both sides are powers of two.
-fn transform_2d(values: &mut [Complex], columns: usize) {
+/// Discrete Fourier transform of rows, then columns, in one direction; not scaled.
+fn transform_2d(values: &mut [Complex32], columns: usize, plan: fn(&mut FftPlanner<f32>, usize) -> Arc<dyn Fft<f32>>) {
     let rows = values.len() / columns;
-    let twiddles = twiddles(columns);
-    for row in values.chunks_exact_mut(columns) {
-        transform(row, &twiddles);
-    }
-    let twiddles = self::twiddles(rows);
-    let mut column = vec![Complex::ZERO; rows];
-    for x in 0..columns {
-        for (y, value) in column.iter_mut().enumerate() {
-            *value = values[y * columns + x];
-        }
-        transform(&mut column, &twiddles);
-        for (y, value) in column.iter().enumerate() {
-            values[y * columns + x] = *value;
-        }
-    }
-}
-
-fn twiddles(len: usize) -> Vec<Complex> {
-    (0..len / 2)
-        .map(|i| {
-            let angle = -2.0 * PI * i as f32 / len as f32;
-            Complex {
-                re: angle.cos(),
-                im: angle.sin(),
-            }
-        })
-        .collect()
-}
-
-/// Radix-2 transform in place (Cooley & Tukey 1965).
-fn transform(values: &mut [Complex], twiddles: &[Complex]) {
-    let len = values.len();
-    if len < 2 {
-        return;
-    }
-    let bits = len.trailing_zeros();
-    for i in 0..len {
-        let j = i.reverse_bits() >> (usize::BITS - bits);
-        if i < j {
-            values.swap(i, j);
-        }
-    }
-    let mut half = 1;
-    while half < len {
-        let stride = len / (2 * half);
-        for block in values.chunks_exact_mut(2 * half) {
-            let (even, odd) = block.split_at_mut(half);
-            for (i, (even, odd)) in even.iter_mut().zip(odd).enumerate() {
-                let turned = odd.times(twiddles[i * stride]);
-                (*even, *odd) = (even.plus(turned), even.minus(turned));
-            }
-        }
-        half *= 2;
+    let mut planner = FftPlanner::new();
+    plan(&mut planner, columns).process(values);
+    let mut turned: Vec<Complex32> = (0..values.len())
+        .map(|place| values[place % rows * columns + place / rows])
+        .collect();
+    plan(&mut planner, rows).process(&mut turned);
+    for (place, value) in turned.into_iter().enumerate() {
+        values[place % rows * columns + place / rows] = value;
     }
 }
 
@@ -263,20 +174,20 @@ mod tests {
     }
 
     #[test]
-    fn the_transform_is_the_sum_of_its_definition() {
-        let signal: Vec<f32> = vec![0.3, -1.0, 2.5, 0.0, 0.7, 1.1, -0.4, 0.9];
-        let mut fast: Vec<Complex> = signal.iter().map(|&re| Complex { re, im: 0.0 }).collect();
-        transform(&mut fast, &twiddles(8));
-        for (k, value) in fast.iter().enumerate() {
-            let angle = |n: usize| -2.0 * PI * (k * n) as f32 / 8.0;
-            let re: f32 = signal.iter().enumerate().map(|(n, s)| s * angle(n).cos()).sum();
-            let im: f32 = signal.iter().enumerate().map(|(n, s)| s * angle(n).sin()).sum();
-            assert!((value.re - re).abs() < 1e-5 && (value.im - im).abs() < 1e-5);
+    fn a_transform_and_its_inverse_give_back_the_image() {
+        let image = textured(8, 4);
+        let mut values: Vec<Complex32> = image.iter().map(|&value| value.into()).collect();
+        transform_2d(&mut values, 8, FftPlanner::plan_fft_forward);
+        let sum: f32 = image.iter().sum();
+        assert!((values[0].re - sum).abs() < 1e-4, "the first coefficient is the sum");
+        transform_2d(&mut values, 8, FftPlanner::plan_fft_inverse);
+        for (value, pixel) in values.iter().zip(&image) {
+            assert!((value.re / 32.0 - pixel).abs() < 1e-5);
         }
     }
 
     #[test]
-    fn what_comes_into_view_repeats_the_edge() {
+    fn new_parts_of_a_shifted_image_repeat_the_edge() {
         let moved = shifted(&[1.0, 2.0, 3.0, 4.0], 4, Shift { x_px: 1.5, y_px: 0.0 });
         assert_eq!(moved, [1.0, 1.0, 1.5, 2.5]);
     }

@@ -1,4 +1,4 @@
-//! The directory that an evaluation leaves: figures first, the report last, each file whole or absent.
+//! Writes an evaluation's directory: the figures, then the report. Each file is complete or absent.
 
 use std::path::{Path, PathBuf};
 
@@ -6,7 +6,7 @@ use super::figures::{self, FigureInputs};
 use super::{EvaluationError, EvaluationReport};
 use crate::files::write_atomically;
 
-/// Makes the output directory, to be called before anything is computed.
+/// Creates the output directory. Call it before the evaluation, so that a wrong path is refused at once.
 /// Errors: `OutputExists` if there is something in it or it is no directory, `Io`.
 pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
     let failed = |source| EvaluationError::Io {
@@ -23,7 +23,7 @@ pub fn prepare(dir: &Path) -> Result<(), EvaluationError> {
     }
 }
 
-/// Writes the figures, `report.md` and, last, `report.json`; gives the paths of both reports. The figures' names go into
+/// Writes the figures, `report.md` and, last, `report.json`; returns the paths of both reports. The figures' names go into
 /// the report. Errors: `Io`, `Chart`, `Frame`.
 pub fn write(
     dir: &Path,

@@ -1,4 +1,4 @@
-//! What an evaluation found: `report.json` as it is, `report.md` by [`EvaluationReport::to_markdown`].
+//! The result of an evaluation. `report.json` holds it as it is, `report.md` by [`EvaluationReport::to_markdown`].
 
 use std::time::Duration;
 
@@ -6,25 +6,27 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
+use super::baselines::Method;
 use super::bootstrap::{Bootstrap, TrialSums};
 use super::figures::FigureFile;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
+use super::plans::PlanOutcome;
 use super::skill::{Skill, skill};
-use super::{EvaluateConfig, markdown};
-use crate::dataset::Dataset;
+use super::{EvaluateConfig, Purpose, markdown};
+use crate::dataset::{Dataset, Window};
 use crate::registry::{DatasetStamp, LoadedModel, ProgramStamp};
 use crate::types::Seed;
 
-/// All that an evaluation found, and how to find it again.
+/// The result of an evaluation, and how to repeat it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationReport {
-    /// What was tested, with what, where.
+    /// What was evaluated, how and where.
     pub stamp: ReportStamp,
     /// The model's sizes.
     pub model: ModelSummary,
-    /// Both test sets.
+    /// The test sets, or the validation split.
     pub sets: Vec<SetReport>,
-    /// The pictures beside the report; filled in when they are written.
+    /// The pictures in the same directory; filled in when they are written.
     pub figures: Vec<FigureFile>,
 }
 
@@ -35,13 +37,13 @@ impl EvaluationReport {
         markdown::render(self)
     }
 
-    /// The scores of a test set, `test` or `test-unseen`, unless it was skipped.
+    /// The scores of a set by its split's name, unless it was skipped.
     #[must_use]
     pub fn scores(&self, split: &str) -> Option<&SetScores> {
         self.sets.iter().find(|set| set.split == split)?.outcome.scores()
     }
 
-    /// The scores in a few numbers for each test set, for the model's manifest.
+    /// The scores in a few numbers for each set, for the model's manifest.
     #[must_use]
     pub fn headline(&self) -> Value {
         let mut headline = Map::new();
@@ -51,10 +53,13 @@ impl EvaluationReport {
             let interval = scores.skill.mean_interval.as_ref();
             let summary = json!({
                 "skill": scores.skill.skill.mean,
+                "strongest_baseline": scores.skill.best_mean_baseline,
                 "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
                 "mse": model.mse.mean,
                 "psnr_db": model.psnr_db.mean,
                 "ssim": model.ssim.mean,
+                "mover_mse": model.mover_mse.as_ref().map(|mse| mse.mean),
+                "plan_identification": scores.plan_rate(),
                 "windows": scores.windows,
                 "trials": scores.trials,
                 "dataset_content_hash": self.stamp.dataset_content_hash,
@@ -65,7 +70,7 @@ impl EvaluationReport {
     }
 }
 
-/// What was tested, with what, where.
+/// What was evaluated, how and where.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReportStamp {
     /// The data set's name.
@@ -78,8 +83,12 @@ pub struct ReportStamp {
     pub model: String,
     /// SHA-256 of its weights' file.
     pub model_sha256: String,
-    /// Name and SHA-256 of the unconditioned twin, if one was compared.
-    pub twin: Option<(String, String)>,
+    /// Name and SHA-256 of each twin that was compared.
+    #[serde(default)]
+    pub twins: Vec<(String, String)>,
+    /// Whether the validation split or the test sets were scored.
+    #[serde(default)]
+    pub purpose: Purpose,
     /// The program's version and the commit it was built from.
     pub program: ProgramStamp,
     /// The command line.
@@ -90,11 +99,11 @@ pub struct ReportStamp {
     pub bootstrap_samples: usize,
     /// Seed of the resamples and of the shuffled actions.
     pub seed: Seed,
-    /// Time that it took in seconds.
+    /// Duration in seconds.
     pub wall_time_s: f64,
     /// The processor's name.
     pub cpu: String,
-    /// Threads that it was given.
+    /// Threads of the computation.
     pub threads: usize,
 }
 
@@ -114,7 +123,8 @@ impl ReportStamp {
             split_seed,
             model,
             model_sha256,
-            twin: config.twin.map(named),
+            twins: config.twins.iter().map(|twin| named(twin)).collect(),
+            purpose: config.purpose,
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,
@@ -127,10 +137,11 @@ impl ReportStamp {
     }
 }
 
-/// As Linux tells it; elsewhere the architecture.
+/// From `/proc/cpuinfo`; the architecture where that does not exist.
 fn cpu_name() -> String {
-    let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    told.lines()
+    let listed = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    listed
+        .lines()
         .find(|line| line.starts_with("model name"))
         .and_then(|line| line.split_once(':'))
         .map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
@@ -151,9 +162,9 @@ pub struct ModelSummary {
     pub horizon: usize,
     /// What it is conditioned on.
     pub conditioning: String,
-    /// Whether it sees inverted intensities.
+    /// Whether its inputs have inverted intensities.
     pub inverted: bool,
-    /// Trained numbers.
+    /// Number of trained values.
     pub parameters: u64,
     /// Multiply–adds to predict one frame.
     pub multiply_adds_per_frame: u64,
@@ -182,7 +193,7 @@ impl ModelSummary {
 /// One test set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SetReport {
-    /// `test` or `test-unseen`.
+    /// `test`, `unseen-pairs`, `unseen-gains` or `validation`.
     pub split: String,
     /// Its scores, or why there are none.
     #[serde(flatten)]
@@ -218,45 +229,53 @@ impl SetOutcome {
 pub struct SetScores {
     /// Windows tested.
     pub windows: usize,
-    /// Windows that there are at that stride.
+    /// Windows available at that stride.
     pub windows_available: usize,
     /// Trials that they come from.
     pub trials: usize,
     /// The headline.
     pub skill: Skill,
-    /// Model, baselines and ceiling.
+    /// Model, baselines and codec.
     pub methods: Vec<MethodScores>,
-    /// Mean squared error of the model in its own space (smoothed, inverted where it inverts): not comparable between
-    /// models that preprocess differently.
+    /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
+    /// between models that preprocess differently.
     pub model_space_mse: StepCurve,
     /// Mean squared error of the reconstruction of the frames seen, the oldest first.
     pub reconstruction_mse: StepCurve,
     /// Does the action matter? Absent for a model that takes none.
     pub actions: Option<ActionTable>,
+    /// How often plans are identified by their predictions. Absent for a model that takes no actions.
+    #[serde(default)]
+    pub plans: Option<PlanOutcome>,
     /// The windows that the figures show.
     pub samples: Vec<SampleWindow>,
 }
 
 impl SetScores {
-    pub(super) fn new(
-        windows: &[WindowScores],
-        windows_available: usize,
-        actions: Option<ActionTable>,
-        bootstrap: &Bootstrap,
-    ) -> Self {
+    /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
+    pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
         let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
         let own_space = by_trial(|window| &window.model_space_mse);
         Self {
             windows: windows.len(),
-            windows_available,
+            windows_available: windows.len(),
             trials: own_space.count(),
-            skill: skill(windows, bootstrap),
-            methods: summarize(windows),
+            skill: skill(methods, windows, bootstrap),
+            methods: summarize(methods, windows),
             model_space_mse: StepCurve::new(own_space.means()),
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
-            actions,
+            actions: None,
+            plans: None,
             samples: SampleWindow::choose(windows),
+        }
+    }
+
+    /// Share of the plans that were identified, where that was measured.
+    fn plan_rate(&self) -> Option<f64> {
+        match &self.plans {
+            Some(PlanOutcome::Measured(plans)) => Some(plans.rate),
+            _ => None,
         }
     }
 }
@@ -275,6 +294,14 @@ pub struct SampleWindow {
 }
 
 impl SampleWindow {
+    /// The window in the data set.
+    pub(super) fn window(&self) -> Window {
+        Window {
+            episode: self.episode,
+            first_frame: self.first_frame,
+        }
+    }
+
     fn choose(windows: &[WindowScores]) -> Vec<Self> {
         let mut ranked: Vec<&WindowScores> = windows.iter().collect();
         ranked.sort_by(|a, b| a.model_mse().total_cmp(&b.model_mse()));

@@ -1,35 +1,44 @@
-//! What the figures show: frames of the chosen windows, the curves of the tables, an animation over a trial.
+//! The content of the figures: frames of the chosen windows, the curves of the tables, an animation of a trial.
 
 use super::EvaluationError;
 use super::baselines::Method;
 use super::figures::animation::{Animation, AnimationFrame};
 use super::figures::{Chart, FigureInputs, SampleFigure};
 use super::inference::{ActionSource, predict, reconstruct};
+use super::markdown::set_title;
 use super::report::{EvaluationReport, SampleWindow, SetScores};
+use crate::dataset::Dataset;
 use crate::dataset::sampler::{Split, Splits, WindowShape};
-use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
 use crate::registry::LoadedModel;
 
-/// Moments of the animation at most.
-const MAX_MOMENTS: usize = 80;
+/// Frames of the animation at most.
+const MAX_MOMENTS: usize = 40;
 
-/// The figures' content: windows and animation of the first test set that was scored, a chart of each.
-/// Errors: those of the network.
+/// The figures' content: median, best and worst window and a chart of each set that was scored; reconstruction and
+/// animation of the first. Errors: those of the network.
 pub fn figure_inputs(
     loaded: &LoadedModel,
     dataset: &Dataset,
     report: &EvaluationReport,
 ) -> Result<FigureInputs, EvaluationError> {
     let mut inputs = FigureInputs::default();
-    for split in [Split::Test, Split::TestUnseen] {
+    for &split in report.stamp.purpose.splits() {
         let Some(scores) = report.scores(split.name()) else {
             continue;
         };
-        if inputs.charts.is_empty() {
-            for sample in &scores.samples {
-                inputs.samples.push(show(loaded, dataset, sample)?);
+        let is_first = inputs.charts.is_empty();
+        for sample in &scores.samples {
+            let mut figure = show(loaded, dataset, sample)?;
+            if is_first {
+                let window = [sample.window()];
+                figure.reconstructed = frames(loaded, &reconstruct(loaded, dataset, &window)?)?;
+            } else {
+                figure.name = format!("{}-{split}", figure.name);
             }
+            inputs.samples.push(figure);
+        }
+        if is_first {
             inputs.animation = animate(loaded, dataset, (report, split), scores)?;
         }
         inputs.charts.push(chart(split, scores));
@@ -39,21 +48,13 @@ pub fn figure_inputs(
 
 fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Result<SampleFigure, EvaluationError> {
     let spec = loaded.model.spec();
-    let window = [Window {
-        episode: sample.episode,
-        first_frame: sample.first_frame,
-    }];
+    let window = [sample.window()];
     let seen = sample.first_frame..sample.first_frame + spec.context;
     Ok(SampleFigure {
         name: sample.rank.clone(),
-        note: format!(
-            "{} window of {} by error: MSE {:.1}e-4",
-            sample.rank,
-            dataset.info().name,
-            sample.mse * 1e4
-        ),
-        reconstructed: frames(loaded, &reconstruct(loaded, dataset, &window)?)?,
-        predicted: frames(loaded, &predict(loaded, dataset, &window, ActionSource::TargetFrame)?)?,
+        note: format!("{} window by error: MSE {:.1}e-4", sample.rank, sample.mse * 1e4),
+        reconstructed: Vec::new(),
+        predicted: frames(loaded, &predict(loaded, dataset, &window, ActionSource::Recorded)?)?,
         truth: camera_frames(dataset, seen.end..seen.end + spec.horizon)?,
         inputs: camera_frames(dataset, seen)?,
     })
@@ -82,19 +83,19 @@ fn camera_frames(dataset: &Dataset, frames: std::ops::Range<usize>) -> Result<Ve
 }
 
 fn chart(split: Split, scores: &SetScores) -> Chart {
-    let (file, what) = match split {
-        Split::TestUnseen => ("error-by-horizon-unseen.svg", "start/goal pairs and gains never seen"),
-        _ => ("error-by-horizon.svg", "trials never seen"),
+    let file = match split {
+        Split::Test | Split::Validation => "error-by-horizon.svg".to_owned(),
+        other => format!("error-by-horizon-{other}.svg"),
     };
     let series = scores.methods.iter().map(|row| (row.method, row.mse.per_step.clone()));
     Chart {
-        file: file.to_owned(),
-        caption: format!("Error by horizon against the baselines, {what}"),
+        file,
+        caption: format!("Error by horizon against the baselines: {}", set_title(split.name())),
         series: series.collect(),
     }
 }
 
-/// The trial of the median window from its start to its end, as far ahead as the model sees.
+/// The trial of the median window from its start to its end, each frame predicted at the greatest horizon.
 fn animate(
     loaded: &LoadedModel,
     dataset: &Dataset,
@@ -113,7 +114,7 @@ fn animate(
     let mut windows = splits.windows(dataset, split, shape, 1)?;
     windows.retain(|window| window.episode == median.episode);
     windows.truncate(MAX_MOMENTS);
-    let predicted = frames(loaded, &predict(loaded, dataset, &windows, ActionSource::TargetFrame)?)?;
+    let predicted = frames(loaded, &predict(loaded, dataset, &windows, ActionSource::Recorded)?)?;
     let last_steps = predicted.into_iter().skip(spec.horizon - 1).step_by(spec.horizon);
     let moments = windows.iter().zip(last_steps).map(|(window, predicted)| {
         let now = window.first_frame + spec.context - 1;

@@ -1,8 +1,8 @@
-//! Scores of a test set's windows: the model, the trivial baselines and the ceiling on the same frames.
+//! Scores of a test set's windows: the model, the baselines and the codec on the same frames.
 
 use rayon::prelude::*;
 
-use super::baselines::{self, BaselineInput, Method};
+use super::baselines::{BaselineInput, Baselines, Method};
 use super::inference::{Predicted, predict_with_ceiling};
 use super::metrics::{FrameScore, TargetFrame, WindowScores};
 use super::{EvaluationContext, EvaluationError, EvaluationStage};
@@ -22,7 +22,7 @@ pub fn evenly(windows: &[Window], count: usize) -> Vec<Window> {
     (0..count).map(|i| windows[i * windows.len() / count]).collect()
 }
 
-/// The mean frame, 0…1, of the training split: of every frame that another one of the split follows.
+/// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
 /// Errors: those of [`Splits::windows`].
 pub fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
     let pair = WindowShape { context: 1, horizon: 1 };
@@ -42,7 +42,7 @@ pub fn score(
     loaded: &LoadedModel,
     dataset: &Dataset,
     windows: &[Window],
-    training_mean: &[f32],
+    baselines: &Baselines,
     watched: &EvaluationContext,
 ) -> Result<Vec<WindowScores>, EvaluationError> {
     let spec = loaded.model.spec();
@@ -52,9 +52,9 @@ pub fn score(
         let scored = batch
             .par_iter()
             .enumerate()
-            .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, training_mean));
+            .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, baselines));
         scores.par_extend(scored);
-        watched.tell(EvaluationStage::Scores, scores.len(), windows.len())?;
+        watched.report(EvaluationStage::Scores, scores.len(), windows.len())?;
     }
     Ok(scores)
 }
@@ -64,7 +64,7 @@ fn score_window(
     dataset: &Dataset,
     (place, window): (usize, Window),
     predicted: &Predicted,
-    training_mean: &[f32],
+    baselines: &Baselines,
 ) -> WindowScores {
     let (pixels, horizon) = (spec.pixels(), spec.horizon);
     let width = spec.frame_width_px as usize;
@@ -76,23 +76,24 @@ fn score_window(
     let frame = |step: usize| scale(dataset.pixels(window.first_frame + step));
     let inputs: Vec<Vec<f32>> = (0..spec.context).map(frame).collect();
     let truth: Vec<Vec<f32>> = (spec.context..spec.context + horizon).map(frame).collect();
-    let seen = BaselineInput {
-        inputs: &inputs,
-        training_mean,
-        width,
+    let shape = WindowShape {
+        context: spec.context,
+        horizon,
     };
-    let frames = Method::ALL
-        .into_iter()
-        .map(|method| {
-            let guesses = match method {
+    let seen = BaselineInput::of_window(dataset, window, shape, &inputs);
+    let frames = baselines
+        .methods()
+        .iter()
+        .map(|&method| {
+            let predictions = match method {
                 Method::Model => camera_space(&predicted.frames),
                 Method::CodecOnly => camera_space(&predicted.codec),
-                baseline => baselines::predict(baseline, &seen, horizon),
+                baseline => baselines.predict(dataset, baseline, &seen, horizon),
             };
-            let compared = guesses.iter().zip(&truth).enumerate();
-            let score = compared.map(|(step, (guess, pixels))| {
+            let compared = predictions.iter().zip(&truth).enumerate();
+            let score = compared.map(|(step, (prediction, pixels))| {
                 let mask = dataset.mask(window.first_frame + spec.context + step);
-                FrameScore::of(guess, &TargetFrame { pixels, mask, width })
+                FrameScore::of(prediction, &TargetFrame { pixels, mask, width })
             });
             score.collect()
         })

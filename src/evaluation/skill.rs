@@ -1,4 +1,4 @@
-//! The headline: how much of the best trivial baseline's error the model takes away.
+//! The headline: the share of the strongest baseline's error that the model removes.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,8 +6,8 @@ use super::baselines::Method;
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
 use super::metrics::{StepCurve, WindowScores};
 
-/// skill = 1 − MSE / MSE(best trivial baseline): 1 is perfect, 0 is no better than the best of them, and below 0 is worse.
-/// The best baseline is chosen anew at each step ahead (and in each resample), so the model meets the hardest there is.
+/// skill = 1 − MSE / MSE of the strongest baseline: 1 is perfect, 0 is no better than that baseline, below 0 is worse.
+/// The strongest baseline is chosen at each step ahead, and again in each resample.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Skill {
     /// At each step ahead, and their mean.
@@ -16,48 +16,56 @@ pub struct Skill {
     pub per_step_interval: Vec<Interval>,
     /// 95 % bootstrap interval of the mean; absent with fewer than two trials.
     pub mean_interval: Option<Interval>,
-    /// The best trivial baseline at each step.
+    /// The strongest baseline at each step.
     pub best_baseline: Vec<Method>,
+    /// The baseline with the least mean MSE over all steps.
+    pub best_mean_baseline: Method,
+    /// 1 − mean MSE / mean MSE of that one baseline.
+    pub against_best_mean: f64,
 }
 
-/// The skill of the model over these windows.
+/// The skill of the model over these windows, whose rows are the model, the baselines and perhaps the codec.
 #[must_use]
-pub fn skill(windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
+pub fn skill(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
+    let baselines: Vec<Method> = methods.iter().copied().filter(|method| method.is_baseline()).collect();
+    let rows = 1 + baselines.len();
+    let errors_by_row = |window: &WindowScores| -> Vec<f64> {
+        let rows = window.frames.iter().take(rows);
+        rows.flat_map(|steps| steps.iter().map(|score| score.mse)).collect()
+    };
     let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
     let trials = TrialSums::group(&trial_of, windows.iter().map(errors_by_row));
     let means = trials.means();
     let mut intervals = trials
         .intervals(bootstrap, |means| {
-            let per_step = skills(means);
+            let per_step = skills(&baselines, means);
             let mean = StepCurve::new(per_step.clone()).mean;
             per_step.into_iter().chain([mean]).collect()
         })
         .unwrap_or_default();
     let mean_interval = intervals.pop();
+    let steps = means.len() / rows;
+    let mean_errors: Vec<f64> = means
+        .chunks(steps.max(1))
+        .map(|steps| steps.iter().sum::<f64>() / steps.len() as f64)
+        .collect();
+    let (best_mean_baseline, least) = best(&baselines, &mean_errors, 0);
     Skill {
-        skill: StepCurve::new(skills(&means)),
+        skill: StepCurve::new(skills(&baselines, &means)),
         per_step_interval: intervals,
         mean_interval,
-        best_baseline: (0..step_count(&means)).map(|step| best(&means, step).0).collect(),
+        best_baseline: (0..steps).map(|step| best(&baselines, &means, step).0).collect(),
+        best_mean_baseline,
+        against_best_mean: mean_errors.first().map_or(0.0, |&model| share_removed(model, least)),
     }
 }
 
-/// The rows that skill compares: the model, then the baselines.
-const ROWS: usize = 1 + Method::BASELINES.len();
-
-fn errors_by_row(window: &WindowScores) -> Vec<f64> {
-    let rows = window.frames.iter().take(ROWS);
-    rows.flat_map(|steps| steps.iter().map(|score| score.mse)).collect()
-}
-
-fn step_count(means: &[f64]) -> usize {
-    means.len() / ROWS
-}
-
-fn best(means: &[f64], step: usize) -> (Method, f64) {
+/// The strongest baseline at a step and its error. `means` holds the model's steps, then those of each baseline.
+fn best(baselines: &[Method], means: &[f64], step: usize) -> (Method, f64) {
+    let steps = means.len() / (1 + baselines.len());
     let mut best = (Method::CopyLast, f64::INFINITY);
-    for (row, method) in Method::BASELINES.into_iter().enumerate() {
-        let error = means[(1 + row) * step_count(means) + step];
+    for (row, &method) in baselines.iter().enumerate() {
+        let error = means[(1 + row) * steps + step];
         if error < best.1 {
             best = (method, error);
         }
@@ -65,14 +73,16 @@ fn best(means: &[f64], step: usize) -> (Method, f64) {
     best
 }
 
-fn skills(means: &[f64]) -> Vec<f64> {
-    (0..step_count(means))
-        .map(|step| {
-            let (model, baseline) = (means[step], best(means, step).1);
-            // Where a baseline makes no error at all there is none to take away.
-            if baseline > 0.0 { 1.0 - model / baseline } else { 0.0 }
-        })
+fn skills(baselines: &[Method], means: &[f64]) -> Vec<f64> {
+    let steps = means.len() / (1 + baselines.len());
+    (0..steps)
+        .map(|step| share_removed(means[step], best(baselines, means, step).1))
         .collect()
+}
+
+/// Where a baseline makes no error at all, there is none to remove.
+fn share_removed(model: f64, baseline: f64) -> f64 {
+    if baseline > 0.0 { 1.0 - model / baseline } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -86,6 +96,8 @@ mod tests {
         seed: Seed(5),
     };
 
+    const BASELINES: i32 = 8;
+
     /// Two steps; every baseline errs by 0.1 · (1 + its row), times the trial's difficulty.
     fn windows(model: impl Fn(f64) -> f64) -> Vec<WindowScores> {
         (0..30)
@@ -93,7 +105,7 @@ mod tests {
                 let difficulty = 1.0 + (i % 7) as f64;
                 let errors = [model(difficulty)]
                     .into_iter()
-                    .chain((1..7).map(|row| 0.1 * f64::from(row) * difficulty));
+                    .chain((1..=BASELINES).map(|row| 0.1 * f64::from(row) * difficulty));
                 WindowScores {
                     episode: i / 3,
                     first_frame: i,
@@ -117,7 +129,7 @@ mod tests {
 
     #[test]
     fn a_perfect_model_has_skill_1() {
-        let skill = skill(&windows(|_| 0.0), &BOOTSTRAP);
+        let skill = skill(&Method::ALL, &windows(|_| 0.0), &BOOTSTRAP);
         assert_eq!(skill.skill, StepCurve::new(vec![1.0; 2]));
         assert_eq!(skill.mean_interval, Some(Interval { low: 1.0, high: 1.0 }));
         assert_eq!(skill.best_baseline, [Method::CopyLast; 2]);
@@ -125,19 +137,19 @@ mod tests {
 
     #[test]
     fn a_model_that_copies_the_last_frame_has_none() {
-        assert!(
-            skill(&windows(|difficulty| 0.1 * difficulty), &BOOTSTRAP)
-                .skill
-                .mean
-                .abs()
-                < 1e-12
-        );
-        assert!(skill(&windows(|difficulty| 0.2 * difficulty), &BOOTSTRAP).skill.mean < 0.0);
+        let same = skill(&Method::ALL, &windows(|difficulty| 0.1 * difficulty), &BOOTSTRAP);
+        assert!(same.skill.mean.abs() < 1e-12 && same.against_best_mean.abs() < 1e-12);
+        let worse = skill(&Method::ALL, &windows(|difficulty| 0.2 * difficulty), &BOOTSTRAP);
+        assert!(worse.skill.mean < 0.0);
     }
 
     #[test]
     fn the_interval_holds_the_estimate() {
-        let skill = skill(&windows(|difficulty| 0.02 * difficulty * difficulty), &BOOTSTRAP);
+        let skill = skill(
+            &Method::ALL,
+            &windows(|difficulty| 0.02 * difficulty * difficulty),
+            &BOOTSTRAP,
+        );
         let interval = skill.mean_interval.unwrap();
         assert!(interval.low < skill.skill.mean && skill.skill.mean < interval.high);
         assert_eq!(skill.per_step_interval.len(), 2);

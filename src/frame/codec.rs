@@ -1,21 +1,22 @@
-//! Frames to and from PNG, JPEG and animated GIF. Sizes are checked before pixels are allocated.
+//! Reads PNG and JPEG images; writes PNG images and animated GIFs. Sizes are checked before pixels are allocated.
 
 use std::io::Cursor;
 
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage};
+use image::{DynamicImage, ExtendedColorType, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage};
 
 use super::{Frame, FrameError, MAX_SIDE_PX};
 
-/// Weights of red, green and blue in gray, ITU-R BT.601, in thousandths.
+/// Weights of red, green and blue for conversion to gray (ITU-R BT.601), in thousandths.
 const GRAY_FROM_RGB: [u32; 3] = [299, 587, 114];
 
-/// Bytes that what an image says beside its pixels may take, unpacked: colour profiles and the like.
+/// Limit for an image's metadata after decompression, in bytes: colour profiles and similar.
 const MAX_METADATA_BYTES: u64 = 1 << 20;
-/// Bytes of a pixel at most: four channels of 16 bits.
+/// Largest pixel format, in bytes: four channels of 16 bits.
 const MAX_PIXEL_BYTES: u64 = 8;
 
-/// Reads a PNG or JPEG image as gray. Errors: `Decode` if the bytes are neither or a side is over [`MAX_SIDE_PX`].
+/// Reads a PNG or JPEG image and converts it to gray. Errors: `Decode` if the bytes are not PNG or JPEG, or if a side is
+/// larger than [`MAX_SIDE_PX`].
 pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
     let (width, height) = dimensions(bytes)?;
     let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
@@ -26,11 +27,20 @@ pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
     gray_from_image(&reader(bytes, limits)?.decode().map_err(FrameError::Decode)?)
 }
 
-/// Width and height that a PNG or JPEG image states, without decoding its pixels. Errors: `Decode` if the bytes are neither.
+/// Reads width and height of a PNG or JPEG image without decoding its pixels. Errors: `Decode` if the bytes are not PNG
+/// or JPEG.
 pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
     let mut limits = Limits::default();
     limits.max_alloc = Some(MAX_METADATA_BYTES);
     reader(bytes, limits)?.into_dimensions().map_err(FrameError::Decode)
+}
+
+/// Whether a PNG or JPEG image has color channels, without decoding its pixels. Errors: `Decode` if the bytes are neither.
+pub fn is_color(bytes: &[u8]) -> Result<bool, FrameError> {
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(MAX_METADATA_BYTES);
+    let decoder = reader(bytes, limits)?.into_decoder().map_err(FrameError::Decode)?;
+    Ok(decoder.color_type().has_color())
 }
 
 fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {
@@ -53,7 +63,7 @@ fn gray_from_image(image: &DynamicImage) -> Result<Frame, FrameError> {
     Frame::new(width, height, pixels)
 }
 
-/// Gray intensities of interleaved red, green and blue bytes (ITU-R BT.601).
+/// Converts interleaved red, green and blue bytes to gray intensities (ITU-R BT.601).
 #[must_use]
 pub fn gray_from_rgb(rgb: &[u8]) -> Vec<u8> {
     rgb.as_chunks::<3>()
@@ -70,7 +80,7 @@ pub fn gray_from_rgb(rgb: &[u8]) -> Vec<u8> {
         .collect()
 }
 
-/// The frame as a gray PNG.
+/// Encodes the frame as a gray PNG. Errors: `Encode`.
 pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
     let mut bytes = Vec::new();
     image::codecs::png::PngEncoder::new(&mut bytes)
@@ -79,7 +89,7 @@ pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
     Ok(bytes)
 }
 
-/// The frames as an endless GIF, `delay_ms` apart.
+/// Encodes the frames as a GIF that repeats forever, with `delay_ms` between two frames. Errors: `Encode`.
 pub fn encode_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
     let mut bytes = Vec::new();
     let mut encoder = GifEncoder::new(&mut bytes);
@@ -111,7 +121,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_png_gives_back_every_pixel(width in 1u32..40, height in 1u32..40, seed in any::<u8>()) {
+        fn a_png_restores_every_pixel(width in 1u32..40, height in 1u32..40, seed in any::<u8>()) {
             let pixels = (0..width * height).map(|i| (i * 31 + u32::from(seed)) as u8).collect();
             let frame = Frame::new(width, height, pixels).unwrap();
             let png = encode_png(&frame).unwrap();

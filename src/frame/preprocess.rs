@@ -1,6 +1,6 @@
-//! From a frame to the model's space and back: Gaussian smoothing, inversion I = 255 − I, scaling to 0…1 (paper,
-//! Experimental Setup). Smoothing is not undone; the other two are.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Converts frames to the model's value range and back: Gaussian smoothing, inversion I = 255 − I, scaling to 0…1 (paper,
+//! Experimental Setup). The way back undoes scaling and inversion, but not smoothing.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use pulp::Arch;
@@ -8,11 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::{Frame, FrameError};
 
-/// How frames enter the model's space.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// How frames are converted to the model's value range.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Preprocess {
-    /// Standard deviation of the Gaussian, in pixels; 0 leaves the image sharp.
+    /// Standard deviation of the Gaussian smoothing, in pixels; 0 means no smoothing.
     pub blur_sigma_px: f32,
     /// Whether intensities are inverted, I = 255 − I.
     pub invert: bool,
@@ -28,7 +29,7 @@ impl Default for Preprocess {
 }
 
 impl Preprocess {
-    /// The frame's values in the model's space, 0…1, row by row.
+    /// The frame in the model's value range, 0…1, row by row.
     #[must_use]
     pub fn forward(&self, frame: &Frame) -> Vec<f32> {
         let scaled = scale(frame.pixels());
@@ -44,7 +45,7 @@ impl Preprocess {
         values
     }
 
-    /// Values in the model's space back to intensities 0…1 of the camera's space, clamped.
+    /// Converts values of the model back to camera intensities, clamped to 0…1.
     #[must_use]
     pub fn inverse(&self, values: &[f32]) -> Vec<f32> {
         let mut restored: Vec<f32> = values.iter().map(|value| value.clamp(0.0, 1.0)).collect();
@@ -54,14 +55,11 @@ impl Preprocess {
         restored
     }
 
-    /// Values in the model's space back to a frame. Errors: `NotFinite` at a NaN or infinity, `PixelCount`.
+    /// Converts values of the model back to a frame. Errors: `NotFinite` at a NaN or infinity, `PixelCount`, `Size`.
     pub fn frame_from(&self, values: &[f32], width: u32, height: u32) -> Result<Frame, FrameError> {
-        // Without a way out of the loop, it can be done in vectors.
-        if !values
-            .iter()
-            .fold(true, |are_finite, value| are_finite & value.is_finite())
-        {
-            let index = values.iter().position(|value| !value.is_finite()).unwrap_or_default();
+        // `fold` has no early exit, so the compiler can vectorize it. The search by index runs only after a failure.
+        let all_finite = values.iter().fold(true, |all, value| all & value.is_finite());
+        if !all_finite && let Some(index) = values.iter().position(|value| !value.is_finite()) {
             return Err(FrameError::NotFinite {
                 index,
                 value: values[index],
@@ -74,7 +72,7 @@ impl Preprocess {
                 for (pixel, value) in pixels.iter_mut().zip(values) {
                     let value = value.clamp(0.0, 1.0);
                     let intensity = if self.invert { 1.0 - value } else { value };
-                    // The cast cuts off.
+                    // The cast truncates, so adding 0.5 rounds.
                     *pixel = (intensity * 255.0 + 0.5) as u8;
                 }
             },
@@ -83,20 +81,20 @@ impl Preprocess {
     }
 }
 
-/// 8-bit intensities to 0…1.
+/// Scales 8-bit intensities to 0…1.
 #[must_use]
 pub fn scale(pixels: &[u8]) -> Vec<f32> {
     pixels.iter().map(|&value| f32::from(value) / 255.0).collect()
 }
 
-/// I = 255 − I on intensities scaled to 0…1.
+/// Inverts intensities that are scaled to 0…1: I = 1 − I.
 pub fn invert_intensity(values: &mut [f32]) {
     for value in values {
         *value = 1.0 - *value;
     }
 }
 
-/// A normalized Gaussian of `2 · radius + 1` taps.
+/// A normalized Gaussian kernel of `2 · radius + 1` weights.
 pub(super) fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
     let mut kernel: Vec<f32> = (0..=2 * radius)
         .map(|i| {
@@ -105,13 +103,13 @@ pub(super) fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
         })
         .collect();
     let sum: f32 = kernel.iter().sum();
-    for tap in &mut kernel {
-        *tap /= sum;
+    for weight in &mut kernel {
+        *weight /= sum;
     }
     kernel
 }
 
-/// Convolves rows, then columns, with one odd kernel; the border repeats the edge pixel.
+/// Convolves rows, then columns, with the same kernel of odd length. Outside the image, the edge pixel is repeated.
 pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
     let height = values.len() / width;
     let radius = kernel.len() / 2;
@@ -167,13 +165,13 @@ mod tests {
     }
 
     #[test]
-    fn black_becomes_white_in_the_models_space() {
+    fn black_becomes_one_after_inversion() {
         let frame = Frame::new(1, 1, vec![0]).unwrap();
         assert_eq!(Preprocess::default().forward(&frame), [1.0]);
     }
 
     #[test]
-    fn a_point_spreads_as_the_gaussian_says() {
+    fn a_point_is_smoothed_to_a_gaussian() {
         let mut pixels = vec![0; 49];
         pixels[24] = 255;
         let frame = Frame::new(7, 7, pixels).unwrap();
@@ -187,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nan_is_refused_with_its_place() {
+    fn a_nan_is_refused_with_its_position() {
         let error = Preprocess::default().frame_from(&[0.5, f32::NAN], 2, 1).unwrap_err();
         assert!(error.to_string().starts_with("pixel 1 is NaN"));
     }

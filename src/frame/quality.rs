@@ -1,4 +1,4 @@
-//! How alike two images are. All take intensities 0…1, row by row, of equal length.
+//! Measures of the similarity of two images. All functions take intensities 0…1, row by row, of equal length.
 
 use super::preprocess::{convolve_separable, gaussian_kernel};
 
@@ -16,13 +16,14 @@ pub fn mse(a: &[f32], b: &[f32]) -> f64 {
     sum / a.len().max(1) as f64
 }
 
-/// Peak signal-to-noise ratio in dB for a mean squared error, peak 1; infinite at 0.
+/// Peak signal-to-noise ratio in dB of a mean squared error, for a peak of 1. It is infinite for an error of 0.
 #[must_use]
 pub fn psnr_db(mse: f64) -> f64 {
     -10.0 * mse.log10()
 }
 
-/// Structural similarity, −1…1, mean over all pixels (Wang et al. 2004); the border repeats the edge pixel.
+/// Structural similarity, −1…1, averaged over all pixels (Wang et al. 2004). Outside the image, the edge pixel is
+/// repeated.
 #[must_use]
 pub fn ssim(a: &[f32], b: &[f32], width: usize) -> f64 {
     let kernel = gaussian_kernel(SSIM_SIGMA_PX, SSIM_RADIUS_PX);
@@ -55,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_is_wholly_like_itself() {
+    fn an_image_is_identical_to_itself() {
         assert_eq!(mse(&ramp(), &ramp()), 0.0);
         assert!((ssim(&ramp(), &ramp(), 16) - 1.0).abs() < 1e-6);
     }
@@ -67,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn ssim_of_two_flat_images_is_the_closed_form() {
+    fn ssim_of_flat_images_matches_the_formula() {
         let (a, b) = (vec![0.2; 256], vec![0.6; 256]);
         let expected = (2.0 * 0.12 + 1e-4) / (0.04 + 0.36 + 1e-4);
         assert!((ssim(&a, &b, 16) - expected).abs() < 1e-3);

@@ -12,7 +12,8 @@ use super::FrameError;
 const MIN_DEPTH: f32 = 1e-3;
 
 /// How a pinhole camera with square pixels projects. It looks ahead of the robot, tilted down.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(try_from = "UncheckedCameraModel")]
 pub struct CameraModel {
     /// Angle between the left and the right edge of the image, in radians: above 0, below π.
@@ -155,7 +156,11 @@ mod tests {
     fn a_turn_to_the_left_shows_what_was_further_left() {
         let grid = rotation_grid(CAMERA, 8, 6, 0.3);
         let (columns, inside) = (grid.iter().map(|point| point[0]), inside(8, 6, &grid));
-        assert!(columns.zip(0..).all(|(column, index)| column < (index % 8) as f32 + 0.5));
+        assert!(
+            columns
+                .zip(0..)
+                .all(|(column, index)| column < (index % 8) as f32 + 0.5)
+        );
         assert!(!inside[0] && inside[7]);
     }
 
@@ -173,10 +178,17 @@ mod tests {
 
     #[test]
     fn an_impossible_camera_is_refused_in_one_sentence() {
-        for (fov, tilt) in [(0.0, 0.2), (3.2, 0.2), (f32::NAN, 0.2), (1.0, -1.6), (1.0, f32::INFINITY)] {
+        for (fov, tilt) in [
+            (0.0, 0.2),
+            (3.2, 0.2),
+            (f32::NAN, 0.2),
+            (1.0, -1.6),
+            (1.0, f32::INFINITY),
+        ] {
             assert!(CameraModel::new(fov, tilt).is_err(), "{fov} {tilt}");
         }
-        let error = serde_json::from_str::<CameraModel>(r#"{"horizontal_fov_rad": 4, "tilt_down_rad": 0.2}"#).unwrap_err();
+        let error =
+            serde_json::from_str::<CameraModel>(r#"{"horizontal_fov_rad": 4, "tilt_down_rad": 0.2}"#).unwrap_err();
         assert_eq!(
             error.to_string(),
             "the camera model has a field of view of 4 rad and a tilt of 0.2 rad; the field of view must be above 0 and \

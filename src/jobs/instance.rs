@@ -1,39 +1,38 @@
-//! Who a runner is: an id that it finds again at its next start, in a file that it keeps locked while it lives. The lock
-//! goes with the process however that ends, so whoever holds it knows that nobody else works under that id.
+//! The id of a runner. It is stored in a file, so that the runner has the same id after a restart. The runner locks the
+//! file while it lives; the lock ends with the process, so no two processes have the same id at the same time.
 
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, TryLockError};
 use std::io::{Read as _, Write as _};
 use std::path::Path;
 
 use super::JobError;
+use crate::files::open_lock;
 
-/// Runners in one data directory at most.
+/// The maximum number of runners in one data directory.
 const MAX_RUNNERS: usize = 64;
 
 /// A runner's identity.
 pub(super) struct Instance {
-    /// Random when it was made, and the same ever after.
+    /// Random, and stable over restarts.
     pub(super) id: String,
     _lock: File,
 }
 
 impl Instance {
-    /// The first identity of the data directory that nobody uses. Errors: `Instance`.
+    /// Locks the first free id of the data directory. Errors: `Instance`.
     pub(super) fn claim(data_dir: &Path) -> Result<Self, JobError> {
         let dir = data_dir.join("runners");
         std::fs::create_dir_all(&dir).map_err(JobError::Instance)?;
         for slot in 0..MAX_RUNNERS {
             let path = dir.join(format!("{slot}.lock"));
-            let mut options = OpenOptions::new();
-            let file = options.create(true).truncate(false).read(true).write(true).open(path);
-            let file = file.map_err(JobError::Instance)?;
+            let file = open_lock(&path).map_err(JobError::Instance)?;
             match file.try_lock() {
                 Ok(()) => return Self::read(file).map_err(JobError::Instance),
                 Err(TryLockError::WouldBlock) => {}
                 Err(TryLockError::Error(error)) => return Err(JobError::Instance(error)),
             }
         }
-        let reason = format!("{MAX_RUNNERS} processes work in {} already", data_dir.display());
+        let reason = format!("{MAX_RUNNERS} processes already run jobs in {}", data_dir.display());
         Err(JobError::Instance(std::io::Error::other(reason)))
     }
 
@@ -55,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_identity_is_found_again_when_its_holder_is_gone_and_never_shared() {
+    fn a_runner_id_is_reused_after_its_holder_is_gone() {
         let dir = tempfile::tempdir().unwrap();
         let first = Instance::claim(dir.path()).unwrap();
         let second = Instance::claim(dir.path()).unwrap();

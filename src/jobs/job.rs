@@ -1,8 +1,8 @@
-//! A job as it is told, from the row that the store keeps.
+//! A job as the API returns it, made from its row in the store.
 
 use serde::Serialize;
 
-use super::notes::StoredProgress;
+use super::progress::StoredProgress;
 use super::{JobError, JobProgress, JobSpec, JobState, Losses};
 use crate::store::{JobPage, JobRow};
 
@@ -11,42 +11,41 @@ use crate::store::{JobPage, JobRow};
 pub struct Job {
     /// Its id.
     pub id: String,
-    /// Where it is on its way.
+    /// Its state.
     pub state: JobState,
-    /// What was asked for.
+    /// What it does.
     pub spec: JobSpec,
-    /// How far it is.
+    /// How much of the work is done.
     pub progress: JobProgress,
-    /// The latest losses, of a training.
+    /// The latest losses of a training.
     pub losses: Losses,
     /// Why it failed.
     pub error: Option<String>,
-    /// What came of it: a data set's size, a model's version, an evaluation's scores and files.
+    /// The result: the size of a data set, the version of a model, or the scores and files of an evaluation.
     #[schema(value_type = Option<Object>)]
     pub result: Option<serde_json::Value>,
-    /// Whether it was asked to stop and has not yet.
+    /// Whether it is running and was asked to stop.
     pub cancelling: bool,
-    /// How often it was taken up: more than once after a server ended in its midst, or after it was resumed.
+    /// How often a worker claimed it: more than once after a server was killed, or after the job was resumed.
     pub attempts: i64,
-    /// When it was asked for, in seconds since 1970.
+    /// When it was submitted, in seconds since 1970.
     pub queued_unix_s: f64,
-    /// When it was taken up first, in seconds since 1970.
+    /// When its first attempt started, in seconds since 1970.
     pub started_unix_s: Option<f64>,
     /// When it ended, in seconds since 1970.
     pub ended_unix_s: Option<f64>,
 }
 
 impl Job {
-    /// Errors: `Record` if the row was written by a program that knows other jobs.
+    /// Errors: `Record` if the row was written by an incompatible version of the program.
     pub(super) fn of(row: &JobRow) -> Result<Self, JobError> {
         let record = |reason: String| JobError::Record {
             id: id_of(row.number),
             reason,
         };
         let state: JobState = row.state.parse().map_err(record)?;
-        let standing: StoredProgress =
-            serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
-        let mut progress = standing.progress;
+        let stored: StoredProgress = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
+        let mut progress = stored.progress;
         if state != JobState::Running {
             progress.remaining_s = None;
         }
@@ -56,7 +55,7 @@ impl Job {
             state,
             spec: serde_json::from_str(&row.spec).map_err(|error| record(error.to_string()))?,
             progress,
-            losses: standing.losses,
+            losses: stored.losses,
             error: row.error.clone(),
             result: outcome.map_err(|error| record(error.to_string()))?,
             cancelling: row.cancelling,
@@ -75,21 +74,21 @@ pub struct JobFilter {
     pub kind: Option<String>,
     /// Only in that state.
     pub state: Option<JobState>,
-    /// Only those asked for before the job of that id.
+    /// Only those submitted before the job of that id.
     pub before: Option<String>,
-    /// At most so many.
+    /// The maximum number of jobs.
     pub limit: usize,
 }
 
 impl JobFilter {
-    /// Errors: `Invalid` if a field names nothing there can be.
+    /// Errors: `Invalid` if a field is not valid.
     pub(super) fn page(self) -> Result<JobPage, JobError> {
         let kinds = JobSpec::KINDS;
         if let Some(kind) = self.kind.as_deref().filter(|kind| !kinds.contains(kind)) {
             return Err(JobError::Invalid {
                 field: "kind",
                 reason: format!(
-                    "\"{}\" is no kind; there are: {}",
+                    "there is no kind \"{}\"; there are: {}",
                     kind.escape_default(),
                     kinds.join(", ")
                 ),
@@ -98,7 +97,10 @@ impl JobFilter {
         let before = self.before.map(|id| {
             number_of(&id).ok_or_else(|| JobError::Invalid {
                 field: "before",
-                reason: format!("\"{}\" is no job's id; one is job-12", id.escape_default()),
+                reason: format!(
+                    "\"{}\" is not a job id; an example of one is job-12",
+                    id.escape_default()
+                ),
             })
         });
         Ok(JobPage {

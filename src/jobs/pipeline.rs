@@ -1,5 +1,5 @@
-//! The work itself, below the data directory: collections into `datasets/NAME`, trainings in `runs/JOB`, whose model
-//! becomes the next version of its name, evaluations into `reports/JOB`.
+//! The work of jobs, below the data directory: a collection writes `datasets/NAME`; a training works in `runs/JOB` and
+//! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
 use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,51 +10,60 @@ use serde_json::json;
 use tokio::runtime::Handle;
 
 use super::checkpoints::{self, CheckpointSync};
-use super::runner::{JobExecutor, JobFailure, JobReporter, JobResult};
+use super::report::JobReporter;
+use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets};
+use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets, memory};
 use crate::dataset::{self, Dataset, DatasetError};
+use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
-use crate::store::{LossRow, Store};
+use crate::store::{LossRow, ModelMetrics, Store};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
-use crate::wording;
 
-/// The file of a report that is written last.
+/// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
-/// Points of a stage's training loss, besides those of its validations.
+/// How many points of the training loss are stored for each stage, besides those of its validations.
 const CURVE_POINTS: usize = 500;
-/// How long a job waits for a process that was taken for dead to let go of the directory.
-const BUSY_PATIENCE: Duration = Duration::from_mins(1);
-/// How often it looks whether that has.
+/// How long a job waits for another process, whose lease has expired, to unlock the directory.
+const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
+/// How often it tries.
 const BUSY_POLL: Duration = Duration::from_millis(200);
 
-/// What works on jobs.
+/// Runs jobs in this process.
 pub struct Pipeline {
     store: Store,
     versions: Versions,
     threads: usize,
+    memory_mb: u64,
     runtime: Handle,
 }
 
 impl Pipeline {
-    /// One that collects on so many threads. To be called within a tokio runtime.
+    /// A pipeline that collects on `threads` threads. Needs a tokio runtime.
     #[must_use]
     pub fn new(store: Store, versions: Versions, threads: usize) -> Self {
         Self {
             store,
             versions,
             threads,
+            memory_mb: 0,
             runtime: Handle::current(),
         }
+    }
+
+    /// Refuses trainings that need more memory, in MiB. 0 means no limit.
+    #[must_use]
+    pub fn with_memory_limit(self, memory_mb: u64) -> Self {
+        Self { memory_mb, ..self }
     }
 }
 
 impl JobExecutor for Pipeline {
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
-        Box::pin(self.look_over(spec.clone()))
+        Box::pin(self.check_spec(spec.clone()))
     }
 
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
@@ -71,11 +80,15 @@ impl JobExecutor for Pipeline {
 }
 
 impl Pipeline {
-    async fn look_over(&self, spec: JobSpec) -> Result<(), JobError> {
+    async fn check_spec(&self, spec: JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
         let data_dir = objects.data_dir().to_owned();
-        // It looks at the disk, and must wait for nothing that needs a thread of the same kind: there are only so many.
+        let training = match &spec {
+            JobSpec::Train(spec) => Some(spec.clone()),
+            JobSpec::Collect(_) | JobSpec::Evaluate(_) => None,
+        };
+        // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
         let checked = tokio::task::spawn_blocking(move || {
             spec.check(AvailableInputs {
                 data_dir: &data_dir,
@@ -83,7 +96,27 @@ impl Pipeline {
                 models: &models,
             })
         });
-        checked.await.unwrap_or(Err(JobError::Stopping))
+        checked.await.unwrap_or(Err(JobError::Stopping))?;
+        match training {
+            Some(spec) => self.check_memory(&spec).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Refuses a training that certainly needs more memory than a job can use. Errors: `Invalid`, `Dataset`, `Store`.
+    async fn check_memory(&self, spec: &TrainSpec) -> Result<(), JobError> {
+        let (allowed, config) = (self.memory_mb, spec.config()?);
+        let needed = memory::training_mb(&config, &datasets::describe(self.store.objects(), &spec.dataset).await?);
+        if allowed == 0 || needed <= allowed {
+            return Ok(());
+        }
+        Err(JobError::Invalid {
+            field: "settings",
+            reason: format!(
+                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mb); \
+                 use a smaller model, batch or data set"
+            ),
+        })
     }
 
     fn collect(
@@ -95,13 +128,17 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
-        let making_way = datasets::make_way(self.store.objects(), &spec.name, &config);
-        self.runtime.block_on(making_way).map_err(|error| failed(&error))?;
+        let clearing = datasets::clear_stale(self.store.objects(), &spec.name, &config);
+        self.runtime.block_on(clearing).map_err(|error| failed(&error))?;
         let on_progress =
             |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
+        // Whole shards are saved; a new attempt continues after them.
+        if let Ok(dataset::CollectionStatus::Unfinished { trials }) = dataset::CollectionStatus::of(&config) {
+            report.checkpoint(trials);
+        }
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
-        let info = once_free(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
+        let info = retry_while_busy(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
         self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
         Ok(JobResult {
             result: json!({
@@ -109,6 +146,7 @@ impl Pipeline {
                 "content_hash": info.content_hash,
             }),
             published: None,
+            measured: None,
         })
     }
 
@@ -125,24 +163,24 @@ impl Pipeline {
             run_dir: &run_dir,
             command: &command(spec),
         };
-        let mut watch = TrainingReporter {
+        let mut reporter = TrainingReporter {
             report,
             steps: [config.pretrain.steps, config.fit.steps],
             train_loss: None,
         };
-        let mut keeping = CheckpointSync::default();
+        let mut sync = CheckpointSync::default();
         let mut observer = |event: TrainingEvent| {
-            watch.on_event(event);
+            reporter.on_event(event);
             if matches!(event, TrainingEvent::Checkpointed { .. }) {
                 let pushing = self.store.objects().push(&run, CHECKPOINT_FILE);
-                if let Some(line) = keeping.note(self.runtime.block_on(pushing)) {
+                if let Some(line) = sync.record(self.runtime.block_on(pushing)) {
                     report.line(line);
                 }
             }
         };
         let train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
-        match once_free(train, is_busy, cancelled).map_err(|error| failed(&error))? {
+        match retry_while_busy(train, is_busy, cancelled).map_err(|error| failed(&error))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
@@ -154,19 +192,20 @@ impl Pipeline {
                 Ok(JobResult {
                     result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
                     published: Some((spec.name.clone(), version, activates)),
+                    measured: None,
                 })
             }
         }
     }
 
-    /// Has the run's directory hold its last checkpoint, and at its first taking up nothing.
+    /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
     fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), JobFailure> {
         let objects = self.store.objects();
         let prepared = self.runtime.block_on(async {
             if report.lease().token == 1 {
                 return objects.delete(run).await;
             }
-            checkpoints::recall(objects, run).await
+            checkpoints::fetch_latest(objects, run).await
         });
         prepared.map_err(|error| failed(&error))
     }
@@ -185,22 +224,19 @@ impl Pipeline {
             max_windows: spec.windows,
             bootstrap_samples: spec.resamples,
             seed: Seed(spec.seed),
-            twin: twin.as_ref(),
-            command: posted(&JobSpec::Evaluate(spec.clone())),
+            twins: twin.iter().collect(),
+            command: request_line(&JobSpec::Evaluate(spec.clone())),
             cancelled: Some(cancelled),
             ..EvaluateConfig::default()
         };
         let found = evaluation::run(&loaded, &dataset, &config, &|now| {
-            let what = match now.stage {
-                evaluation::EvaluationStage::Scores => "scores",
-                evaluation::EvaluationStage::Actions => "actions",
-            };
-            report.progress(now.done as u64, now.total as u64, &format!("{} {what}", now.split));
+            let stage = now.stage.name();
+            report.progress(now.done as u64, now.total as u64, &format!("{} {stage}", now.split));
         });
         let mut found = found.map_err(|error| failed(&error))?;
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let dir = report_key(&report.id());
-        // What an attempt that broke off left is of no use.
+        // An earlier attempt may have left an incomplete report.
         let cleared = self.runtime.block_on(self.store.objects().delete(&dir));
         cleared.map_err(|error| failed(&error))?;
         let out = self.store.objects().data_dir().join(&dir);
@@ -218,6 +254,12 @@ impl Pipeline {
                 "model": spec.model, "version": loaded.manifest.version, "scores": found.headline(), "files": files,
             }),
             published: None,
+            measured: Some(ModelMetrics {
+                model: spec.model.clone(),
+                version: loaded.manifest.version,
+                weights_sha256: loaded.manifest.weights_sha256.clone(),
+                metrics: found.headline().to_string(),
+            }),
         })
     }
 
@@ -242,8 +284,8 @@ impl Pipeline {
     }
 }
 
-/// Tries until nobody else works in the directory, for so long at most, or until it is cancelled.
-fn once_free<T, E>(
+/// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
+fn retry_while_busy<T, E>(
     mut work: impl FnMut() -> Result<T, E>,
     is_busy: impl Fn(&E) -> bool,
     cancelled: &AtomicBool,
@@ -251,7 +293,7 @@ fn once_free<T, E>(
     let began = Instant::now();
     loop {
         let done = work();
-        let may_wait = began.elapsed() < BUSY_PATIENCE && !cancelled.load(Ordering::Acquire);
+        let may_wait = began.elapsed() < BUSY_TIMEOUT && !cancelled.load(Ordering::Acquire);
         match done {
             Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
             done => return done,
@@ -259,16 +301,16 @@ fn once_free<T, E>(
     }
 }
 
-/// The directory of a job's report among the objects.
+/// The key of the directory of a job's report.
 #[must_use]
 pub fn report_key(id: &str) -> String {
     format!("reports/{id}")
 }
 
-/// Writes a training's events down.
+/// Turns a training's events into the job's report.
 struct TrainingReporter<'a> {
     report: &'a JobReporter,
-    /// Of each stage.
+    /// The steps of each stage.
     steps: [usize; 2],
     train_loss: Option<f64>,
 }
@@ -278,11 +320,12 @@ impl TrainingReporter<'_> {
         match event {
             TrainingEvent::Started { stage, step, windows } => {
                 self.progress(stage, step);
+                self.report.checkpoint(self.done(stage, step));
                 self.report
                     .line(format!("{stage} from step {step}, on {windows} windows"));
             }
-            // What was not written before the process died must be in the curves all the same.
-            TrainingEvent::Recalled {
+            // A point that the last attempt did not write before it was killed must also be in the curves.
+            TrainingEvent::Restored {
                 stage,
                 step,
                 train_loss,
@@ -325,18 +368,30 @@ impl TrainingReporter<'_> {
                 self.report
                     .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
             }
-            TrainingEvent::Checkpointed { .. } => {}
+            TrainingEvent::CheckpointDamaged { is_previous } => self.report.line(
+                if is_previous {
+                    "the previous checkpoint is damaged too; starting from the beginning"
+                } else {
+                    "the latest checkpoint is damaged; resuming from the previous one"
+                }
+                .to_owned(),
+            ),
+            TrainingEvent::Checkpointed { stage, step } => self.report.checkpoint(self.done(stage, step)),
         }
     }
 
     fn progress(&self, stage: TrainingStage, step: usize) {
-        let [pretrain, fit] = self.steps;
-        let done = match stage {
-            TrainingStage::Pretrain => step,
-            TrainingStage::Fit => pretrain + step,
-        };
-        self.report
-            .progress(done as u64, (pretrain + fit) as u64, &stage.to_string());
+        let total = self.steps.iter().sum::<usize>() as u64;
+        self.report.progress(self.done(stage, step), total, &stage.to_string());
+    }
+
+    /// The steps of both stages that are done.
+    fn done(&self, stage: TrainingStage, step: usize) -> u64 {
+        let [pretrain, _] = self.steps;
+        match stage {
+            TrainingStage::Pretrain => step as u64,
+            TrainingStage::Fit => (pretrain + step) as u64,
+        }
     }
 
     fn point(&self, stage: TrainingStage, step: usize, validation: Option<f64>) {
@@ -349,36 +404,36 @@ impl TrainingReporter<'_> {
     }
 }
 
-/// What the manifest tells of how the model was made.
+/// The command that the manifest records.
 fn command(spec: &TrainSpec) -> String {
-    posted(&JobSpec::Train(spec.clone()))
+    request_line(&JobSpec::Train(spec.clone()))
 }
 
-fn posted(spec: &JobSpec) -> String {
+fn request_line(spec: &JobSpec) -> String {
     format!("POST /v1/jobs {}", serde_json::to_string(spec).unwrap_or_default())
 }
 
 fn failed(error: &dyn Error) -> JobFailure {
-    JobFailure::Failed(wording::sentence(error))
+    JobFailure::Failed(error_text::with_causes(error))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Tries work that is busy that often; says what came of it and how often it was tried.
+    /// Retries work that is busy `busy` times. Returns its result and the number of tries.
     fn tried(busy: u32, cancelled: bool) -> (Result<(), bool>, u32) {
         let mut tries = 0;
         let work = || {
             tries += 1;
             if tries > busy { Ok(()) } else { Err(true) }
         };
-        let done = once_free(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
+        let done = retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
         (done, tries)
     }
 
     #[test]
-    fn work_begins_once_the_directory_is_free_or_never_if_it_is_cancelled() {
+    fn work_starts_once_the_directory_is_free_unless_cancelled() {
         assert_eq!(tried(2, false), (Ok(()), 3));
         assert_eq!(tried(2, true), (Err(true), 1));
     }
@@ -390,7 +445,10 @@ mod tests {
             tries += 1;
             Err(false)
         };
-        assert_eq!(once_free(work, |is_busy| *is_busy, &AtomicBool::new(false)), Err(false));
+        assert_eq!(
+            retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(false)),
+            Err(false)
+        );
         assert_eq!(tries, 1);
     }
 }

@@ -1,14 +1,14 @@
-//! The threads of jobs stand back: where all cores are wanted, serving goes first. On Linux a thread has a priority of its
-//! own, which those that it starts inherit; elsewhere nothing changes.
+//! On Linux, jobs run at lower priority, so that they do not delay predictions. There, each thread has its own priority,
+//! and the threads that it starts inherit it. On other systems nothing changes.
 
-/// Added to a thread's niceness: it then gets about a tenth of a core that another thread wants too.
+/// Added to a thread's niceness: it then gets about a tenth of a core that another thread also needs.
 #[cfg(target_os = "linux")]
 const NICENESS: i32 = 10;
 
-/// Lowers the priority of the thread that calls, for good.
+/// Lowers the priority of the calling thread permanently.
 pub(super) fn lower() {
     #[cfg(target_os = "linux")]
     if let Err(error) = rustix::process::nice(NICENESS) {
-        tracing::warn!(%error, "a job's thread keeps the priority of those that serve");
+        tracing::warn!(%error, "could not lower the priority of a job's thread");
     }
 }

@@ -1,4 +1,4 @@
-//! The handle to the jobs: enqueues them, tells of them, asks them to stop or to go on.
+//! The handle to the jobs: submits, reads, cancels and resumes them.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -9,26 +9,30 @@ use tracing::{info, warn};
 
 use super::instance::Instance;
 use super::job::{id_of, number_of};
-use super::notes::StoredProgress;
+use super::progress::StoredProgress;
 use super::runner::{self, JobExecutor};
 use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition, unix_s};
 use crate::store::{EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
 
-/// An idempotency key's characters at most.
+/// The maximum length of an idempotency key.
 const MAX_KEY_LENGTH: usize = 128;
 
-/// The bounds of jobs.
+/// The limits of jobs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct JobLimits {
-    /// Jobs that may wait.
+    /// How many jobs can wait.
     pub queued: usize,
-    /// Ended jobs that are remembered; the oldest is forgotten first.
+    /// How many ended jobs are kept; the oldest are deleted first.
     pub ended: usize,
-    /// Lines of a job's log that are kept.
+    /// How many lines of a job's log are kept.
     pub log_lines: usize,
-    /// Threads that the work of jobs may use.
+    /// How many threads a job uses.
     pub threads: usize,
-    /// How long a runner may be silent before others take its job.
+    /// After this many attempts in a row that ended abnormally without progress, a job fails.
+    pub max_attempts: u32,
+    /// How long one attempt can run.
+    pub time_limit: Option<Duration>,
+    /// After this time without a sign of life from the runner, another runner can claim its job.
     pub lease: Duration,
 }
 
@@ -36,9 +40,9 @@ pub(super) struct JobsInner {
     pub(super) store: Store,
     pub(super) limits: JobLimits,
     pub(super) execute: Arc<dyn JobExecutor>,
-    /// A job may be there to be taken up.
+    /// A job may be waiting.
     pub(super) wake: Notify,
-    /// A job has ended here.
+    /// A job has ended in this process.
     pub(super) ended: Notify,
     pub(super) stop: watch::Sender<bool>,
 }
@@ -51,7 +55,7 @@ pub struct Jobs {
 }
 
 impl Jobs {
-    /// A handle to the store's jobs; with `runs`, also takes them up, one at a time. To be called within a tokio runtime.
+    /// A handle to the store's jobs. With `runs`, this process also runs them, one at a time. Needs a tokio runtime.
     /// Errors: `Instance`, `Threads`.
     pub fn start(store: Store, limits: JobLimits, execute: Arc<dyn JobExecutor>, runs: bool) -> Result<Self, JobError> {
         let shared = Arc::new(JobsInner {
@@ -75,7 +79,7 @@ impl Jobs {
         })
     }
 
-    /// Takes a job; asked again with the same key, tells of the one it took then.
+    /// Enqueues a job. If a job was enqueued with the same key before, returns that job.
     /// Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `Taken`, `Stopping`, `Invalid`, `Store`.
     pub async fn submit(&self, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
@@ -91,7 +95,7 @@ impl Jobs {
         shared.execute.check(&spec).await?;
         let new = NewJob {
             kind: spec.kind().to_owned(),
-            makes: spec.makes().map(|(kind, name)| format!("{kind} {name}")),
+            exclusive_output: spec.exclusive_output().map(|(kind, name)| format!("{kind} {name}")),
             spec: json(&spec)?,
             progress: json(&StoredProgress::default())?,
             idempotency_key: key,
@@ -109,11 +113,11 @@ impl Jobs {
     }
 
     fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
-        match (enqueued, spec.makes()) {
+        match (enqueued, spec.exclusive_output()) {
             (EnqueueResult::Taken, Some((kind, name))) => JobError::Taken {
                 kind,
                 name: name.to_owned(),
-                why: "is being made by another job",
+                why: "is the output of another job that has not ended",
             },
             _ => JobError::QueueFull {
                 limit: self.shared.limits.queued,
@@ -127,7 +131,7 @@ impl Jobs {
         rows.iter().map(Job::of).collect()
     }
 
-    /// Every job that has not ended. Errors: `Record`, `Store`.
+    /// All queued and running jobs. Errors: `Record`, `Store`.
     pub async fn open(&self) -> Result<Vec<Job>, JobError> {
         let mut open = Vec::new();
         for state in [JobState::Queued, JobState::Running] {
@@ -146,7 +150,7 @@ impl Jobs {
         Job::of(&self.row(id).await?)
     }
 
-    /// Lines of a job's log after that number, the oldest first. Errors: `Unknown`, `Store`.
+    /// The lines of a job's log after a line number, the oldest first. Errors: `Unknown`, `Store`.
     pub async fn log(&self, id: &str, after: i64, limit: usize) -> Result<Vec<LogRow>, JobError> {
         let row = self.row(id).await?;
         Ok(self.shared.store.job_log(row.number, after, limit as i64).await?)
@@ -158,11 +162,11 @@ impl Jobs {
         Ok(self.shared.store.job_losses(row.number).await?)
     }
 
-    /// Asks a job to stop: one that waits ends now, one that runs at its next checkpoint.
+    /// Cancels a job: a queued job ends at once, a running one as soon as its work has stopped.
     /// Errors: `Unknown`, `IllegalTransition` if it has ended, `Store`.
     pub async fn cancel(&self, id: &str) -> Result<Job, JobError> {
         let store = &self.shared.store;
-        // Its state may change between looking and asking; it changes only so often.
+        // Repeats if the state changes between the read and the write; that can happen only a few times.
         loop {
             let row = self.row(id).await?;
             let state = Job::of(&row)?.state;
@@ -179,7 +183,7 @@ impl Jobs {
         }
     }
 
-    /// Puts a job that failed or was cancelled back among those that wait; it goes on from where it was.
+    /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
     /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
     pub async fn resume(&self, id: &str) -> Result<Job, JobError> {
         if *self.shared.stop.borrow() {
@@ -201,23 +205,23 @@ impl Jobs {
         }
     }
 
-    /// Completes when a job has ended in this process since the last call.
-    pub async fn ended(&self) {
+    /// Completes when a job has ended in this process after the last call.
+    pub async fn job_ended(&self) {
         self.shared.ended.notified().await;
     }
 
-    /// Takes no more jobs and asks the one that runs to write its checkpoint and go back among those that wait.
+    /// Claims no more jobs. The running job writes its checkpoint and goes back to the queue.
     pub fn begin_stop(&self) {
         self.shared.stop.send_replace(true);
     }
 
-    /// Waits until the runner has ended, at most until `deadline`; says whether it has.
+    /// Waits until the runner has stopped, at most until `deadline`. Returns whether it has stopped.
     pub async fn finish_stop(&self, deadline: Instant) -> bool {
         let runner = self.runner.lock().unwrap_or_else(PoisonError::into_inner).take();
         let Some(runner) = runner else { return true };
         let ended = tokio::time::timeout_at(deadline.into(), runner).await.is_ok();
         if !ended {
-            warn!("a job did not reach its checkpoint within the deadline; it goes on from the last one");
+            warn!("a job did not stop before the deadline; its next attempt resumes from its last checkpoint");
         }
         ended
     }
@@ -232,16 +236,16 @@ impl Jobs {
 }
 
 impl JobsInner {
-    /// What ended jobs leave is deleted with the last memory of them.
+    /// Deletes the oldest ended jobs with their files.
     pub(super) async fn forget_oldest(&self) {
         let forgotten = match self.store.forget_ended(self.limits.ended as i64).await {
             Ok(forgotten) => forgotten,
-            Err(error) => return warn!(%error, "could not forget old jobs"),
+            Err(error) => return warn!(%error, "could not delete old jobs"),
         };
         for id in forgotten.into_iter().map(id_of) {
             for dir in ["runs", "reports"] {
                 if let Err(error) = self.store.objects().delete(&format!("{dir}/{id}")).await {
-                    warn!(job.id = %id, %error, "could not delete what a job left");
+                    warn!(job.id = %id, %error, "could not delete the files of an old job");
                 }
             }
         }
@@ -266,7 +270,7 @@ fn check_key(key: &str) -> Result<(), JobError> {
     })
 }
 
-/// The job of an idempotency key, if it is the one asked for.
+/// The job of an idempotency key. Errors: `Invalid` if its spec is a different one.
 fn same(row: &JobRow, spec: &JobSpec) -> Result<Job, JobError> {
     let job = Job::of(row)?;
     if job.spec == *spec {
@@ -274,7 +278,10 @@ fn same(row: &JobRow, spec: &JobSpec) -> Result<Job, JobError> {
     }
     Err(JobError::Invalid {
         field: "Idempotency-Key",
-        reason: format!("it was used for another job, {}; use a new key for a new job", job.id),
+        reason: format!(
+            "it was used for a different job, {}; use a new key for a new job",
+            job.id
+        ),
     })
 }
 

@@ -1,115 +1,66 @@
-//! Takes jobs up one after another: works on them on threads of their own, renews the lease meanwhile, writes what they
-//! say of themselves, and ends them.
+//! Claims jobs one after another. Runs each on its own threads, renews its lease, writes its reports, and records its
+//! outcome.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::future::BoxFuture;
-use metrics::{counter, gauge};
+use metrics::counter;
 use rayon::ThreadPool;
+use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, watch};
 use tracing::{info, warn};
 
 use super::instance::Instance;
-use super::job::id_of;
-use super::notes::{JobProgressLog, StoredProgress};
+use super::progress::{ReportBuffer, StoredProgress};
 use super::queue::JobsInner;
-use super::{Job, JobError, JobSpec, JobState, JobTransition, Losses, priority, unix_s};
-use crate::store::{JobOutcome, JobRow, JobUpdate, Lease, LossRow};
+use super::report::JobReporter;
+use super::{Job, JobError, JobSpec, JobState, JobTransition, priority, unix_s};
+use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics};
 use crate::telemetry::names;
 
-/// How often a job's standing is written, unless the lease asks for more.
+/// How often a job's report is written, unless the lease needs it more often.
 const WRITE_EVERY: Duration = Duration::from_millis(500);
-/// How often the store is asked for jobs of other processes.
+/// How often the store is asked for jobs that other processes submitted.
 const POLL_EVERY: Duration = Duration::from_secs(1);
-/// How often it is tried to write how a job ended.
+/// How often the runner tries to write a job's outcome.
 const END_ATTEMPTS: u32 = 5;
 
-/// How a job's work ended without what was asked for.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// Why a job's work ended without a result.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum JobFailure {
-    /// It was asked to stop and did, or its lease was lost.
+    /// It was asked to stop, or its lease was lost.
     Cancelled,
-    /// What went wrong, in a sentence.
+    /// The work failed. One sentence says why.
     Failed(String),
+    /// The job's process ended abnormally, so another attempt can succeed. One sentence says how.
+    Crashed(String),
 }
 
-/// What came of a job.
-#[derive(Clone, Debug, Default, PartialEq)]
+/// The result of a job that succeeded.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct JobResult {
-    /// What is told of it.
+    /// The result in the API.
     pub result: serde_json::Value,
-    /// A model's name and version, and whether that is to serve unless another does.
+    /// The name and version of a published model, and whether it becomes active if no version is.
     pub published: Option<(String, u32, bool)>,
+    /// What an evaluation measured.
+    pub measured: Option<ModelMetrics>,
 }
 
-/// What does the work of a job.
+/// Does the work of jobs.
 pub trait JobExecutor: Send + Sync + 'static {
-    /// Checks what is asked for before it is taken. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and what keeps it
-    /// from looking.
+    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading
+    /// data sets and models.
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 
-    /// Does the work, or goes on with it; returns `Cancelled` soon after `cancelled` is raised.
+    /// Does the work, or resumes it. Returns `Cancelled` soon after `cancelled` becomes true. Blocks.
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
 }
 
-/// Where a job's work says how far it is.
-#[derive(Clone)]
-pub struct JobReporter {
-    notes: Arc<Mutex<JobProgressLog>>,
-    lease: Lease,
-}
-
-impl JobReporter {
-    fn notes(&self) -> MutexGuard<'_, JobProgressLog> {
-        self.notes.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The job's id.
-    #[must_use]
-    pub fn id(&self) -> String {
-        id_of(self.lease.number)
-    }
-
-    /// The right to work on the job.
-    #[must_use]
-    pub fn lease(&self) -> Lease {
-        self.lease
-    }
-
-    /// Notes units done of a total, and what is being done.
-    pub fn progress(&self, done: u64, total: u64, message: &str) {
-        self.notes().progress((done, total), message, unix_s());
-    }
-
-    /// Measures the rate anew, for a stage whose units take another time.
-    pub fn stage(&self) {
-        self.notes().stage();
-    }
-
-    /// Notes the latest losses.
-    pub fn losses(&self, losses: Losses) {
-        for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
-            if let Some(loss) = loss {
-                gauge!(names::TRAINING_LOSS, "split" => split).set(loss);
-            }
-        }
-        self.notes().losses(losses);
-    }
-
-    /// Adds a line to the job's log.
-    pub fn line(&self, line: String) {
-        self.notes().line(line, unix_s());
-    }
-
-    /// Adds a point to the loss curves.
-    pub fn point(&self, point: LossRow) {
-        self.notes().point(point);
-    }
-}
-
-/// The threads that jobs work on, and no others: what predicts has its own, and goes first. Errors: `Threads`.
+/// The threads for jobs, separate from those for predictions and with lower priority. Errors: `Threads`.
 pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -122,18 +73,20 @@ pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
 pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: ThreadPool) {
     let pool = Arc::new(pool);
     let mut stop = shared.stop.subscribe();
-    // Nobody else holds this identity, so what runs under it is what this process's predecessor left.
+    // This process holds the lock of the id, so all leases under the id are of an earlier process that has ended.
     if let Err(error) = shared.store.release_leases(&instance.id).await {
-        warn!(%error, "jobs of an earlier run are taken up when their leases have run out");
+        warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     while !*stop.borrow() {
-        let now_s = unix_s();
-        let until_s = now_s + shared.limits.lease.as_secs_f64();
-        match shared.store.claim(&instance.id, now_s, until_s).await {
+        match shared
+            .store
+            .claim(&instance.id, shared.limits.lease.as_secs_f64())
+            .await
+        {
             Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
-                warn!(%error, "could not ask for jobs");
+                warn!(%error, "could not claim a job");
                 pause(&shared, &mut stop).await;
             }
         }
@@ -144,26 +97,32 @@ async fn pause(shared: &JobsInner, stop: &mut watch::Receiver<bool>) {
     tokio::select! {
         () = shared.wake.notified() => {}
         () = tokio::time::sleep(POLL_EVERY) => {}
-        () = told(stop) => {}
+        () = stop_requested(stop) => {}
     }
 }
 
-async fn told(stop: &mut watch::Receiver<bool>) {
+async fn stop_requested(stop: &mut watch::Receiver<bool>) {
     // The sender lives as long as the jobs' handle does.
     let _ = stop.wait_for(|stop| *stop).await;
 }
 
-/// One taking up of a job.
+/// One attempt of a job.
 struct JobRun<'a> {
     shared: &'a JobsInner,
     report: JobReporter,
     cancelled: Arc<AtomicBool>,
-    /// Whether the row says that someone asked it to stop.
-    asked: bool,
-    lost: bool,
+    /// Whether the job was cancelled by request.
+    cancel_requested: bool,
+    lease_lost: bool,
+    /// How many attempts before this one ended abnormally without progress.
+    stalled_attempts: i64,
+    /// The units that were saved when this attempt started.
+    claimed_checkpoint: i64,
+    /// When the time limit is reached.
+    deadline: Option<Instant>,
 }
 
-/// Stops the work when the one who watches it goes, whatever the reason.
+/// Stops the work when its supervision ends, for whatever reason.
 impl Drop for JobRun<'_> {
     fn drop(&mut self) {
         self.cancelled.store(true, Ordering::Release);
@@ -172,44 +131,56 @@ impl Drop for JobRun<'_> {
 
 impl<'a> JobRun<'a> {
     fn new(shared: &'a JobsInner, row: &JobRow, lease: Lease) -> Self {
-        let standing: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
+        let stored: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
         Self {
             shared,
-            report: JobReporter {
-                notes: Arc::new(Mutex::new(JobProgressLog::new(standing))),
-                lease,
-            },
+            report: JobReporter::to_buffer(lease, ReportBuffer::new(stored)),
+            stalled_attempts: row.stalled_attempts,
+            claimed_checkpoint: row.checkpoint,
+            deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
             cancelled: Arc::new(AtomicBool::new(false)),
-            asked: row.cancelling,
-            lost: false,
+            cancel_requested: row.cancelling,
+            lease_lost: false,
         }
     }
 
     async fn run(mut self, row: &JobRow, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
-        let id = self.report.id();
+        let (id, stopping) = (self.report.id(), stop.clone());
         info!(job.id = %id, job.attempt = row.token, "job started");
         self.report.line(match row.token {
             1 => "started".to_owned(),
-            attempt => format!("taken up again, for the {attempt}. time"),
+            attempt => format!("attempt {attempt}: resuming from the last checkpoint"),
         });
         let result = match Job::of(row) {
-            Ok(_) if self.asked => Err(JobFailure::Cancelled),
-            Ok(job) => self.watch(job.spec, pool, stop).await,
+            Ok(_) if self.cancel_requested => Err(JobFailure::Cancelled),
+            Ok(_) if self.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
+            Ok(job) => self.supervise(job.spec, pool, stop).await,
             Err(error) => Err(JobFailure::Failed(error.to_string())),
         };
-        if result == Err(JobFailure::Cancelled) && !self.asked {
-            // Someone may have asked since the last renewal, and must not be forgotten.
+        if result == Err(JobFailure::Cancelled) && !self.cancel_requested {
+            // The job may have been cancelled since the last renewal.
             self.renew().await;
         }
-        if self.lost {
-            warn!(job.id = %id, "the job's lease was lost; another goes on with it");
+        if self.lease_lost {
+            warn!(job.id = %id, "the job's lease was lost; another worker continues it");
             return;
         }
+        let is_stopping = *stopping.borrow();
+        let result = match result {
+            Err(JobFailure::Cancelled) if !self.cancel_requested && self.is_over_time() && !is_stopping => {
+                let limit_s = self.shared.limits.time_limit.unwrap_or_default().as_secs();
+                Err(JobFailure::Failed(format!(
+                    "the attempt reached the time limit of {limit_s} s (setting job_time_limit_s); a resumed job continues \
+                     from its last checkpoint"
+                )))
+            }
+            result => self.check_attempts(result),
+        };
         self.end(&row.kind, result).await;
     }
 
-    /// Works on threads of its own and writes how far it is, until the work returns.
-    async fn watch(
+    /// Runs the work on its own thread, and writes its report until the work returns.
+    async fn supervise(
         &mut self,
         spec: JobSpec,
         pool: &Arc<ThreadPool>,
@@ -221,7 +192,7 @@ impl<'a> JobRun<'a> {
         let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
             priority::lower();
             let result = pool.install(|| execute.execute(&spec, &report, &cancelled));
-            // Nobody waits for it if the runner is gone.
+            // The receiver is gone if the runner has stopped.
             let _ = sender.send(result);
         });
         if let Err(error) = thread {
@@ -229,95 +200,156 @@ impl<'a> JobRun<'a> {
         }
         let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut is_told = false;
+        let mut is_stopping = false;
         loop {
             tokio::select! {
                 result = &mut result => {
-                    let panicked = || JobFailure::Failed("the work broke off; the server's log says why".to_owned());
+                    let panicked = || JobFailure::Failed("the job panicked; the server's log says why".to_owned());
                     return result.unwrap_or_else(|_| Err(panicked()));
                 }
-                () = told(&mut stop), if !is_told => {
-                    is_told = true;
+                () = stop_requested(&mut stop), if !is_stopping => {
+                    is_stopping = true;
                     self.cancelled.store(true, Ordering::Release);
+                    // If the process ends before the work has stopped, that is no failure of the job.
+                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                        warn!(%error, "could not mark an attempt as stopped");
+                    }
                 }
-                _ = ticks.tick() => self.renew().await,
+                _ = ticks.tick() => {
+                    self.renew().await;
+                    self.check_deadline();
+                }
             }
         }
     }
 
-    /// Renews the lease and writes what the work said since the last time.
+    /// Renews the lease and writes the report since the last call.
     async fn renew(&mut self) {
-        let account = self.account();
-        let (lines, losses) = (account.lines.clone(), account.losses.clone());
-        let until_s = unix_s() + self.shared.limits.lease.as_secs_f64();
-        match self.shared.store.renew(self.report.lease, until_s, account).await {
-            Ok(Some(cancelling)) => self.asked |= cancelling,
-            Ok(None) => self.lost = true,
+        let report = self.take_report();
+        let (lines, losses) = (report.lines.clone(), report.losses.clone());
+        let lease_s = self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease(), lease_s, report).await {
+            Ok(Some(cancelling)) => self.cancel_requested |= cancelling,
+            Ok(None) => self.lease_lost = true,
             Err(error) => {
                 warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
-                self.report.notes().restore_unwritten(lines, losses);
+                if let Some(mut buffer) = self.report.buffer() {
+                    buffer.restore_unwritten(lines, losses);
+                }
             }
         }
-        if self.asked || self.lost {
+        if self.cancel_requested || self.lease_lost {
             self.cancelled.store(true, Ordering::Release);
         }
     }
 
-    fn account(&self) -> JobUpdate {
-        let mut notes = self.report.notes();
-        let (lines, losses) = notes.take();
-        JobUpdate {
-            // A standing is two structs of numbers and texts: it is always writable.
-            progress: serde_json::to_string(notes.standing()).unwrap_or_default(),
+    fn take_report(&self) -> JobReport {
+        let max_lines = self.shared.limits.log_lines as i64;
+        let Some(mut buffer) = self.report.buffer() else {
+            return JobReport::default();
+        };
+        let (lines, losses) = buffer.drain();
+        JobReport {
+            // Two structs of numbers and strings always serialize.
+            progress: serde_json::to_string(buffer.stored()).unwrap_or_default(),
             lines,
             losses,
-            max_lines: self.shared.limits.log_lines as i64,
+            max_lines,
+            checkpoint: buffer.saved() as i64,
         }
+    }
+
+    fn max_attempts(&self) -> i64 {
+        i64::from(self.shared.limits.max_attempts)
+    }
+
+    fn give_up(&self, how: &str) -> JobFailure {
+        JobFailure::Failed(format!(
+            "{} attempts in a row ended without progress (setting job_max_attempts); the last one: {how}",
+            self.max_attempts()
+        ))
+    }
+
+    /// Turns a crash into a failure if too many attempts in a row made no progress.
+    fn check_attempts(&self, result: Result<JobResult, JobFailure>) -> Result<JobResult, JobFailure> {
+        let Err(JobFailure::Crashed(reason)) = &result else {
+            return result;
+        };
+        let saved = self.report.buffer().map_or(0, |buffer| buffer.saved() as i64);
+        let is_stalled = saved <= self.claimed_checkpoint;
+        if is_stalled && self.stalled_attempts + 1 >= self.max_attempts() {
+            return Err(self.give_up(reason));
+        }
+        result
+    }
+
+    /// Stops the work when the time limit is reached.
+    fn check_deadline(&self) {
+        if self.is_over_time() {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    fn is_over_time(&self) -> bool {
+        self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
     }
 
     async fn end(&self, kind: &str, result: Result<JobResult, JobFailure>) {
         let id = self.report.id();
+        let crash = match &result {
+            Err(JobFailure::Crashed(reason)) => Some(reason.clone()),
+            _ => None,
+        };
         let (event, error, outcome) = match result {
             Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
-            Err(JobFailure::Cancelled) if self.asked => (JobTransition::Cancel, None, None),
-            Err(JobFailure::Cancelled) => (JobTransition::Leave, None, None),
+            Err(JobFailure::Cancelled) if self.cancel_requested => (JobTransition::Cancel, None, None),
+            Err(JobFailure::Crashed(_)) if self.cancel_requested => (JobTransition::Cancel, None, None),
+            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) => (JobTransition::Release, None, None),
             Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
         };
-        // A running job can do all of these.
+        // All of these transitions are legal for a running job.
         let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
-        let outcome_name = if state.is_final() { state.name() } else { "left" };
+        let outcome_name = if state.is_final() { state.name() } else { "released" };
         counter!(names::JOBS_ENDED, "kind" => kind.to_owned(), "outcome" => outcome_name).increment(1);
         match &error {
             None => info!(job.id = %id, job.outcome = ?event, "job ended"),
             Some(reason) => warn!(job.id = %id, reason, "job failed"),
         }
+        if let Some(reason) = &crash {
+            warn!(job.id = %id, reason, "an attempt of a job crashed");
+        }
         self.report.line(match &error {
-            None if state == JobState::Queued => "left, to be gone on with".to_owned(),
+            None if state == JobState::Queued && crash.is_some() => {
+                format!("the attempt crashed: {}", crash.as_deref().unwrap_or_default())
+            }
+            None if state == JobState::Queued => "stopped with the server; the next attempt resumes it".to_owned(),
             None => state.name().to_owned(),
             Some(reason) => format!("failed: {reason}"),
         });
-        let ending = JobOutcome {
+        let outcome = JobOutcome {
             state: state.name(),
             error,
             outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
             ended_s: state.is_final().then(unix_s),
-            published: outcome.and_then(|outcome| outcome.published),
+            published: outcome.as_ref().and_then(|outcome| outcome.published.clone()),
+            measured: outcome.and_then(|outcome| outcome.measured),
+            crashed: crash.is_some(),
         };
-        self.write_end(&id, ending).await;
+        self.write_outcome(&id, outcome).await;
         self.shared.ended.notify_one();
     }
 
-    async fn write_end(&self, id: &str, ending: JobOutcome) {
-        let account = self.account();
+    async fn write_outcome(&self, id: &str, outcome: JobOutcome) {
+        let report = self.take_report();
         for attempt in 1..=END_ATTEMPTS {
             let written = self
                 .shared
                 .store
-                .end(self.report.lease, ending.clone(), account.clone());
+                .end(self.report.lease(), outcome.clone(), report.clone());
             match written.await {
                 Ok(true) => return self.shared.forget_oldest().await,
-                Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its end was written"),
-                Err(error) => warn!(job.id = %id, %error, attempt, "could not write how a job ended"),
+                Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),
+                Err(error) => warn!(job.id = %id, %error, attempt, "could not write a job's outcome"),
             }
             tokio::time::sleep(POLL_EVERY).await;
         }

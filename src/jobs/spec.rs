@@ -1,4 +1,4 @@
-//! What a job is asked to do, checked when it is posted so that mistakes come to light at once.
+//! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -8,22 +8,22 @@ use serde::{Deserialize, Serialize};
 
 use super::JobError;
 use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
+use crate::error_text;
 use crate::evaluation::EvaluateConfig;
 use crate::registry;
 use crate::sim::Scenario;
 use crate::training::{TrainConfig, TrainError};
 use crate::types::Seed;
-use crate::wording;
 
-/// Trials of one collection at most.
+/// The maximum number of trials of one collection.
 pub const MAX_TRIALS: u64 = 1_000_000;
 
-/// Windows of each test set of an evaluation at most.
+/// The maximum number of windows of each test set of an evaluation.
 pub const MAX_WINDOWS: usize = 100_000;
-/// Resamples of an evaluation at most.
+/// The maximum number of bootstrap resamples of an evaluation.
 pub const MAX_RESAMPLES: usize = 10_000;
 
-/// What to do. The import of recordings will be a variant beside these.
+/// What a job does.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum JobSpec {
@@ -35,8 +35,8 @@ pub enum JobSpec {
     Evaluate(EvaluateSpec),
 }
 
-/// A collection: writes the data set `name`. A collection that was cancelled goes on where it was when it is resumed, or
-/// when the same is asked again.
+/// A collection: writes the data set `name`. A cancelled collection continues where it stopped when it is resumed, or when
+/// the same collection is submitted again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CollectSpec {
@@ -48,14 +48,13 @@ pub struct CollectSpec {
     /// Trials, 1 to 1,000,000.
     #[schema(minimum = 1, maximum = 1_000_000)]
     pub trials: u64,
-    /// The seed all randomness comes from.
+    /// The random seed.
     #[serde(default = "default_seed")]
     #[schema(default = 1)]
     pub seed: u64,
 }
 
-/// A training: publishes the next version of the model `name`. One that was cancelled goes on from its checkpoint when it
-/// is resumed.
+/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
@@ -66,35 +65,35 @@ pub struct TrainSpec {
     pub preset: String,
     /// Name of a data set in the data directory.
     pub dataset: String,
-    /// Fields of the preset to set otherwise.
+    /// Settings that replace those of the preset.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
     pub settings: serde_json::Map<String, serde_json::Value>,
 }
 
-/// An evaluation: leaves a report with figures, to be had from the job.
+/// An evaluation: writes a report with figures, which the job's files contain.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluateSpec {
     /// The model's name.
     pub model: String,
-    /// Its version; the active one where none is given.
+    /// Its version; the active one by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u32>,
     /// Name of a data set in the data directory.
     pub dataset: String,
-    /// A model without conditioning, of the same budget, for the table that tells whether the action matters.
+    /// A model of the same size without conditioning. The report then shows what the actions are worth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub twin: Option<String>,
-    /// Windows of each test set at most, 1 to 100,000.
+    /// The maximum number of windows of each test set, 1 to 100,000.
     #[serde(default = "default_windows")]
     #[schema(minimum = 1, maximum = 100_000)]
     pub windows: usize,
-    /// Resamples of the trials for the intervals, 100 to 10,000.
+    /// Bootstrap resamples for the intervals, 100 to 10,000.
     #[serde(default = "default_resamples")]
     #[schema(minimum = 100, maximum = 10_000)]
     pub resamples: usize,
-    /// Seed of the resamples and the shuffled actions.
+    /// The random seed of the resamples and of the shuffled actions.
     #[serde(default)]
     pub seed: u64,
 }
@@ -111,7 +110,7 @@ fn default_resamples() -> usize {
     EvaluateConfig::default().bootstrap_samples
 }
 
-/// What there is that jobs can start from.
+/// The data sets and models that jobs can use.
 #[derive(Clone, Copy, Debug)]
 pub struct AvailableInputs<'a> {
     /// The data directory.
@@ -123,7 +122,7 @@ pub struct AvailableInputs<'a> {
 }
 
 impl JobSpec {
-    /// The kinds there are.
+    /// All kinds.
     pub const KINDS: [&'static str; 3] = ["collect", "train", "evaluate"];
 
     /// Its kind.
@@ -136,16 +135,16 @@ impl JobSpec {
         }
     }
 
-    /// Kind and name of what no other job may make at the same time. Versions and reports never meet.
+    /// Kind and name of the output, if only one job at a time can make it. Versions and reports have unique names.
     #[must_use]
-    pub fn makes(&self) -> Option<(&'static str, &str)> {
+    pub fn exclusive_output(&self) -> Option<(&'static str, &str)> {
         match self {
             Self::Collect(spec) => Some(("data set", &spec.name)),
             Self::Train(_) | Self::Evaluate(_) => None,
         }
     }
 
-    /// The data set that it makes or reads.
+    /// The data set that it writes or reads.
     #[must_use]
     pub fn dataset(&self) -> &str {
         match self {
@@ -155,31 +154,31 @@ impl JobSpec {
         }
     }
 
-    /// Checks all that can be known before the work begins. Errors: `Invalid` and `NotFound`, which name the field; `Taken`,
-    /// `Occupied`, `Dataset`.
-    pub fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
+    /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
+    /// `Taken`, `Occupied`, `Dataset`.
+    pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         match self {
-            Self::Collect(spec) => spec.check(ground),
-            Self::Train(spec) => spec.check(ground.datasets),
-            Self::Evaluate(spec) => spec.check(ground),
+            Self::Collect(spec) => spec.check(available),
+            Self::Train(spec) => spec.check(available.datasets),
+            Self::Evaluate(spec) => spec.check(available),
         }
     }
 }
 
 impl EvaluateSpec {
-    fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
-        check_dataset(&self.dataset, ground.datasets)?;
-        check_model("model", &self.model, ground.models)?;
+    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        check_dataset(&self.dataset, available.datasets)?;
+        check_model("model", &self.model, available.models)?;
         if let Some(twin) = &self.twin {
-            check_model("twin", twin, ground.models)?;
+            check_model("twin", twin, available.models)?;
         }
-        let versions = ground.models.get(&self.model).map_or(&[][..], Vec::as_slice);
+        let versions = available.models.get(&self.model).map_or(&[][..], Vec::as_slice);
         if let Some(version) = self.version.filter(|version| !versions.contains(version)) {
             return Err(JobError::NotFound {
                 field: "version",
                 kind: "version",
                 name: version.to_string(),
-                known: versions.iter().map(u32::to_string).collect(),
+                available: versions.iter().map(u32::to_string).collect(),
             });
         }
         check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
@@ -188,7 +187,7 @@ impl EvaluateSpec {
 }
 
 impl CollectSpec {
-    fn check(&self, ground: AvailableInputs<'_>) -> Result<(), JobError> {
+    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         check_name("name", &self.name)?;
         if !(1..=MAX_TRIALS).contains(&self.trials) {
             return Err(JobError::Invalid {
@@ -199,24 +198,24 @@ impl CollectSpec {
                 ),
             });
         }
-        let config = self.config(&ground.data_dir.join("datasets"))?;
-        let is_there = ground.datasets.contains(&self.name);
-        // Where objects are shared, a set that is finished here alone was deleted elsewhere, or could not be pushed.
+        let config = self.config(&available.data_dir.join("datasets"))?;
+        let is_there = available.datasets.contains(&self.name);
+        // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
         if !is_there && dataset::is_finished(&config.out) {
             return Ok(());
         }
         match CollectionStatus::of(&config) {
-            Ok(CollectionStatus::New | CollectionStatus::PendingStep { .. }) if !is_there => Ok(()),
+            Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
             Ok(_) => Err(JobError::Taken {
                 kind: "data set",
                 name: self.name.clone(),
                 why: "exists",
             }),
             Err(DatasetError::OutExists { .. }) => {
-                Err(self.occupied("has its place taken by other files; move them".to_owned()))
+                Err(self.occupied("cannot be written because other files are in its directory; move them".to_owned()))
             }
             Err(DatasetError::OtherArguments { differences, .. }) => Err(self.occupied(format!(
-                "was begun with other arguments ({differences}); use those to go on"
+                "was started with other arguments ({differences}); use those to continue it"
             ))),
             Err(error) => Err(error.into()),
         }
@@ -227,13 +226,13 @@ impl CollectSpec {
         JobError::Occupied { name, why }
     }
 
-    /// What to collect into a directory of that name below `datasets`. Errors: `Invalid`, which names the scenarios.
+    /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
     pub(super) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
         let out = datasets.join(&self.name);
         Ok(CollectConfig::new(self.scenario()?, self.trials, Seed(self.seed), &out))
     }
 
-    /// The scenario by its name. Errors: `Invalid`, which names those there are.
+    /// The scenario. Errors: `Invalid`, which names the scenarios.
     fn scenario(&self) -> Result<Scenario, JobError> {
         self.scenario
             .parse()
@@ -251,7 +250,7 @@ impl TrainSpec {
         check_dataset(&self.dataset, datasets)
     }
 
-    /// The preset with the settings laid over it. Errors: `Invalid`, which names the presets or the setting.
+    /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
     pub(super) fn config(&self) -> Result<TrainConfig, JobError> {
         let settings = |reason: String| JobError::Invalid {
             field: "settings",
@@ -259,7 +258,7 @@ impl TrainSpec {
         };
         let text = toml::to_string(&self.settings).map_err(|error| {
             settings(format!(
-                "{error}; a setting is a number, a text or true or false, not null"
+                "{error}; a setting is a number, a string, true or false, not null"
             ))
         })?;
         let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
@@ -268,7 +267,7 @@ impl TrainSpec {
                 field: "preset",
                 reason: error.to_string(),
             },
-            other => settings(wording::sentence(&other)),
+            other => settings(error_text::with_causes(&other)),
         })?;
         Ok(TrainConfig {
             name: self.name.clone(),
@@ -277,7 +276,7 @@ impl TrainSpec {
     }
 }
 
-/// Names become directories, so nothing but small letters, digits and `-` is taken: no name can leave the data directory.
+/// Names become directories. Only small letters, digits and `-` are allowed, so no name can leave the data directory.
 fn check_name(field: &'static str, name: &str) -> Result<(), JobError> {
     if registry::is_valid_name(name) {
         return Ok(());
@@ -285,37 +284,37 @@ fn check_name(field: &'static str, name: &str) -> Result<(), JobError> {
     Err(JobError::Invalid {
         field,
         reason: format!(
-            "\"{}\" is no name; a name is 1 to 64 of a to z, 0 to 9 and -, and does not start with -",
+            "\"{}\" is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -",
             name.escape_default()
         ),
     })
 }
 
-fn check_dataset(name: &str, known: &[String]) -> Result<(), JobError> {
+fn check_dataset(name: &str, available: &[String]) -> Result<(), JobError> {
     check_name("dataset", name)?;
-    check_known("dataset", "data set", name, known.iter())
+    check_exists("dataset", "data set", name, available.iter())
 }
 
-fn check_model(field: &'static str, name: &str, known: &BTreeMap<String, Vec<u32>>) -> Result<(), JobError> {
+fn check_model(field: &'static str, name: &str, available: &BTreeMap<String, Vec<u32>>) -> Result<(), JobError> {
     check_name(field, name)?;
-    check_known(field, "model", name, known.keys())
+    check_exists(field, "model", name, available.keys())
 }
 
-fn check_known<'a>(
+fn check_exists<'a>(
     field: &'static str,
     kind: &'static str,
     name: &str,
-    mut known: impl Iterator<Item = &'a String> + Clone,
+    mut available: impl Iterator<Item = &'a String> + Clone,
 ) -> Result<(), JobError> {
-    let all = known.clone();
-    if known.any(|known| known == name) {
+    let all = available.clone();
+    if available.any(|other| other == name) {
         return Ok(());
     }
     Err(JobError::NotFound {
         field,
         kind,
         name: name.to_owned(),
-        known: all.cloned().collect(),
+        available: all.cloned().collect(),
     })
 }
 
@@ -353,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_preset_is_refused_with_those_there_are() {
+    fn an_unknown_preset_is_refused_with_the_available_ones() {
         let spec = TrainSpec {
             name: "a".to_owned(),
             preset: "papr".to_owned(),

@@ -1,40 +1,40 @@
-//! The states of a job and the steps between them, as a pure function.
+//! The states of a job and the transitions between them, as a pure function.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// Where a job is on its way.
+/// The state of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
-    /// Waits for the jobs before it.
+    /// Waits for a worker.
     Queued,
-    /// Is being worked on.
+    /// A worker runs it.
     Running,
-    /// Ended with what was asked for.
+    /// Ended with its result.
     Succeeded,
     /// Ended with an error.
     Failed,
-    /// Ended because someone asked it to.
+    /// Ended by request.
     Cancelled,
 }
 
-/// What can happen to a job.
+/// An event that changes a job's state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JobTransition {
-    /// A runner takes it up.
+    /// A runner claims it.
     Start,
     /// The work is done.
     Succeed,
-    /// The work ended with an error.
+    /// The work failed.
     Fail,
-    /// The work ended before its end because that was asked.
+    /// The work was stopped by request.
     Cancel,
-    /// The runner stopped; another, or the same at its next start, goes on.
-    Leave,
-    /// Someone wants it to go on after all.
+    /// The runner stopped before the work was done; the job goes back to the queue.
+    Release,
+    /// The job is enqueued again by request.
     Resume,
 }
 
@@ -48,7 +48,7 @@ impl JobState {
         Self::Cancelled,
     ];
 
-    /// The state after the event, or `None` where the event cannot happen in this state.
+    /// The state after the event, or `None` if the event is not legal in this state.
     #[must_use]
     pub fn after(self, event: JobTransition) -> Option<Self> {
         match (self, event) {
@@ -56,14 +56,14 @@ impl JobState {
             (Self::Running, JobTransition::Succeed) => Some(Self::Succeeded),
             (Self::Running, JobTransition::Fail) => Some(Self::Failed),
             (Self::Queued | Self::Running, JobTransition::Cancel) => Some(Self::Cancelled),
-            (Self::Running, JobTransition::Leave) | (Self::Failed | Self::Cancelled, JobTransition::Resume) => {
+            (Self::Running, JobTransition::Release) | (Self::Failed | Self::Cancelled, JobTransition::Resume) => {
                 Some(Self::Queued)
             }
             _ => None,
         }
     }
 
-    /// Whether nothing more happens to it by itself.
+    /// Whether the job has ended.
     #[must_use]
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
@@ -83,14 +83,14 @@ impl JobState {
 }
 
 impl JobTransition {
-    /// Of which jobs it may be said.
+    /// The states in which it is legal, for error messages.
     #[must_use]
-    pub fn whose(self) -> &'static str {
+    pub fn allowed_states(self) -> &'static str {
         match self {
-            Self::Start => "waits",
-            Self::Succeed | Self::Fail | Self::Leave => "runs",
-            Self::Cancel => "waits or runs",
-            Self::Resume => "failed or was cancelled",
+            Self::Start => "queued",
+            Self::Succeed | Self::Fail | Self::Release => "running",
+            Self::Cancel => "queued or running",
+            Self::Resume => "failed or cancelled",
         }
     }
 }
@@ -101,20 +101,14 @@ impl FromStr for JobState {
     fn from_str(text: &str) -> Result<Self, String> {
         Self::ALL.into_iter().find(|state| state.name() == text).ok_or_else(|| {
             let known = Self::ALL.map(Self::name).join(", ");
-            format!("\"{}\" is no state; there are: {known}", text.escape_default())
+            format!("there is no state \"{}\"; there are: {known}", text.escape_default())
         })
     }
 }
 
 impl fmt::Display for JobState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Self::Queued => "not started",
-            Self::Running => "started",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelled => "been cancelled",
-        })
+        f.pad(self.name())
     }
 }
 
@@ -125,7 +119,7 @@ impl fmt::Display for JobTransition {
             Self::Succeed => "succeed",
             Self::Fail => "fail",
             Self::Cancel => "be cancelled",
-            Self::Leave => "be left",
+            Self::Release => "be released",
             Self::Resume => "be resumed",
         })
     }
@@ -142,13 +136,13 @@ mod tests {
         JobTransition::Succeed,
         JobTransition::Fail,
         JobTransition::Cancel,
-        JobTransition::Leave,
+        JobTransition::Release,
         JobTransition::Resume,
     ];
 
     proptest! {
         #[test]
-        fn success_is_for_ever_and_only_a_resume_leaves_another_end(events in proptest::collection::vec(0usize..6, 0..24)) {
+        fn only_a_resume_leaves_a_final_state(events in proptest::collection::vec(0usize..6, 0..24)) {
             let (mut state, mut started) = (JobState::Queued, false);
             for event in events.into_iter().map(|i| EVENTS[i]) {
                 if let Some(next) = state.after(event) {
@@ -168,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_state_is_read_by_the_name_it_is_written_with() {
+    fn a_state_is_parsed_from_its_name() {
         for state in JobState::ALL {
             assert_eq!(state.name().parse(), Ok(state));
             assert_eq!(serde_json::to_value(state).unwrap(), state.name());

@@ -1,4 +1,4 @@
-//! The dense network: frames to features and back, what has been seen to what will be, and what has been seen again.
+//! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
 
 use candle_core::Tensor;
 
@@ -8,16 +8,17 @@ use super::lstm::{Decoder, unroll};
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::{ModelSpec, NnError, Parameters, Reconstruction};
 
-/// What the predictor takes as its own last frame.
+/// What the predictor gets as the previous frame in each step.
 #[derive(Clone, Copy, Debug)]
 pub enum Feedback<'a> {
-    /// The features it predicted: how it is used.
+    /// The features that it predicted itself, as in use (autoregressive).
     Prediction,
-    /// The true features `[B, horizon, F]` of the frames to come ("teacher forcing"); the last of them is not used.
+    /// The true features `[B, horizon, F]` of the frames to predict ("teacher forcing"). The last one is not used.
     TeacherForcing(&'a Tensor),
 }
 
-/// The network: a frame codec, an LSTM encoder and two LSTM decoders. Holds weights only, so one model serves many.
+/// The network: a frame codec, an LSTM encoder and two LSTM decoders. It holds only weights and no stream state, so many
+/// streams can share one model.
 #[derive(Clone, Debug)]
 pub(super) struct DenseModel {
     spec: ModelSpec,
@@ -37,7 +38,11 @@ impl DenseModel {
         spec.validate()?;
         let shapes = spec.tensor_shapes();
         let tensor = |name: String| {
-            let expected = shapes.get(&name).cloned().unwrap_or_default();
+            #[expect(clippy::expect_used, reason = "the specification names every tensor of the model")]
+            let expected = shapes
+                .get(&name)
+                .cloned()
+                .expect("a model tensor that tensor_shapes() does not list is a bug");
             match parameters.get(&name) {
                 None => Err(NnError::TensorMissing { name, expected }),
                 Some(var) if var.dims() != expected => {
@@ -73,21 +78,21 @@ impl DenseModel {
         })
     }
 
-    /// Features `[N, F]` of frames `[N, P]` in the model's space. Errors: `Shape`.
+    /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`. Errors: `Shape`.
     pub(super) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
         self.frame_encoder.forward(frames)
     }
 
-    /// Frames `[N, P]` in the model's space, not clamped, of features `[N, F]`. Errors: `Shape`.
+    /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped. Errors: `Shape`.
     pub(super) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", features, &[None, Some(self.spec.features)])?;
         self.frame_decoder.forward(features)
     }
 
-    /// Features `[B, horizon, F]` of the frames that follow those with `features` [B, context, F]. The predictor starts
-    /// from the encoder's last state; step k takes the features of frame k, the action that leads to frame k + 1 and the
-    /// state, and adds a change to the features. Errors: `Shape`, `Missing`.
+    /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The
+    /// predictor starts from the encoder's last state. Step k gets the features of frame k, the action that leads to frame
+    /// k + 1, and the state; its output is added to the features. Errors: `Shape`, `Missing`.
     pub(super) fn predict(
         &self,
         features: &Tensor,
@@ -95,33 +100,31 @@ impl DenseModel {
         feedback: Feedback,
     ) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
-        if let Feedback::TeacherForcing(truth) = feedback {
-            self.check(
-                "true features",
-                truth,
-                &[Some(batch), Some(self.spec.horizon), Some(self.spec.features)],
-            )?;
-        }
-        let truth = match feedback {
-            Feedback::TeacherForcing(truth) => truth,
+        let target = match feedback {
+            Feedback::TeacherForcing(target) => target,
             Feedback::Prediction => return self.run_predictor(features, None, condition),
         };
+        self.check(
+            "true features",
+            target,
+            &[Some(batch), Some(self.spec.horizon), Some(self.spec.features)],
+        )?;
         let conditions = condition.inputs(&self.spec, batch)?;
         let (_, state) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
-        let before = Tensor::cat(&[&last.unsqueeze(1)?, &truth.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
+        let previous = Tensor::cat(&[&last.unsqueeze(1)?, &target.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
         let inputs = match &conditions {
-            Some(conditions) => Tensor::cat(&[&before, conditions], 2)?,
-            None => before.clone(),
+            Some(conditions) => Tensor::cat(&[&previous, conditions], 2)?,
+            None => previous.clone(),
         };
         let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
         let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
-        Ok((before + changes.reshape(truth.dims())?)?)
+        Ok((previous + changes.reshape(target.dims())?)?)
     }
 
-    /// Features `[N, horizon, F]` of N futures of B windows with `features` [B, context, F]: future n follows the window
-    /// `windows[n]` under the condition's row n. A window is encoded once, however many futures it has.
-    /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    /// Predicts the features `[N, horizon, F]` of N rollouts from B windows with `features` `[B, context, F]`. Rollout n
+    /// starts from window `windows[n]` and uses row n of `condition`. Each window is encoded once, also if it has many
+    /// rollouts. Errors: `Shape`, `Missing`, `Tensor` if a window index is out of range.
     pub(super) fn predict_futures(
         &self,
         features: &Tensor,
@@ -157,9 +160,9 @@ impl DenseModel {
         decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
     }
 
-    /// The features [B, context, F] again, from what the encoder kept of them. Approach 1 (sequence): from the encoder's
-    /// last state, the first input zeros, then the decoder's own output. Approach 2 (stepwise): after each frame, from
-    /// the encoder's output there. Errors: `Shape`.
+    /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
+    /// the encoder's last state; its first input is zero, then it gets its own output. Approach 2 (stepwise): after each
+    /// frame, the decoder gets the encoder's output at that frame. Errors: `Shape`.
     pub(super) fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
         let (outputs, state) = self.encode(features)?;
@@ -181,7 +184,7 @@ impl DenseModel {
         }
     }
 
-    /// The encoder's outputs [B, context, H] and its last state.
+    /// The encoder's outputs `[B, context, H]` and its last state.
     fn encode(&self, features: &Tensor) -> Result<(Tensor, LstmState), NnError> {
         unroll(&self.encoder, features, &self.encoder.zero_state(features.dim(0)?)?)
     }
@@ -194,20 +197,20 @@ impl DenseModel {
         )
     }
 
-    /// Checks a shape, `None` for any size but 0; gives the first side.
+    /// Checks the shape of a tensor; `None` stands for any size except 0. Returns the first dimension.
     fn check(&self, what: &'static str, tensor: &Tensor, shape: &[Option<usize>]) -> Result<usize, NnError> {
-        let fits = |(&side, &wanted): (&usize, &Option<usize>)| wanted.map_or(side > 0, |wanted| side == wanted);
+        let fits = |(&size, &wanted): (&usize, &Option<usize>)| wanted.map_or(size > 0, |wanted| size == wanted);
         if tensor.rank() == shape.len() && tensor.dims().iter().zip(shape).all(fits) {
             return Ok(tensor.dims()[0]);
         }
-        let sides: Vec<String> = shape
+        let sizes: Vec<String> = shape
             .iter()
-            .map(|side| side.map_or("any".to_owned(), |side| side.to_string()))
+            .map(|size| size.map_or("any".to_owned(), |size| size.to_string()))
             .collect();
         let spec = &self.spec;
         let expected = format!(
             "[{}] ({}×{} px frames, {} in, {} out, {} features)",
-            sides.join(", "),
+            sizes.join(", "),
             spec.frame_width_px,
             spec.frame_height_px,
             spec.context,

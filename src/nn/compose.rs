@@ -88,8 +88,10 @@ impl Composition {
             None => turned,
         };
         let around = [
-            self.size.around(room[0] + FLOW_PX * head[0], room[1] + FLOW_PX * head[1]),
-            self.size.around(turned[0] + FLOW_PX * head[2], turned[1] + FLOW_PX * head[3]),
+            self.size
+                .around(room[0] + FLOW_PX * head[0], room[1] + FLOW_PX * head[1]),
+            self.size
+                .around(turned[0] + FLOW_PX * head[2], turned[1] + FLOW_PX * head[3]),
         ];
         let logits = [
             head[4] + ROOM_LOGIT - self.outside(room),
@@ -209,7 +211,12 @@ impl PixelParts {
             let slopes = self.around[flow].slopes(frame);
             slopes.map(|slope| gradient * self.mask[flow] * slope)
         });
-        let mixed: f32 = self.values.iter().zip(self.mask).map(|(value, share)| value * share).sum();
+        let mixed: f32 = self
+            .values
+            .iter()
+            .zip(self.mask)
+            .map(|(value, share)| value * share)
+            .sum();
         for_head[0] = FLOW_PX * first[0];
         for_head[1] = FLOW_PX * first[1];
         for_head[2] = FLOW_PX * second[0];
@@ -264,7 +271,10 @@ mod tests {
         let places = super::super::rays::own_places(composition.size);
         let places = Tensor::from_vec(places.repeat(3), (3, 24, 2), &candle_core::Device::Cpu).unwrap();
         let zeros = |last| Tensor::zeros((3, 2, 3, last), candle_core::DType::F32, places.device()).unwrap();
-        let frames = composition.clone().compose(&zeros(32), &zeros(SCENE_CHANNELS), &places).unwrap();
+        let frames = composition
+            .clone()
+            .compose(&zeros(32), &zeros(SCENE_CHANNELS), &places)
+            .unwrap();
         let share = (1.5f32.exp() + 1.0) / (1.5f32.exp() + 2.0);
         let first = frames.get(0).unwrap().to_vec1::<f32>().unwrap();
         for (found, value) in first.iter().zip(&composition.frames) {

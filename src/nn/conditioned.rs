@@ -1,4 +1,4 @@
-//! The state and the action tuple that the prediction is conditioned on (paper, "Proposed Action and State Conditioned
+//! Conditioning inputs: the state and the future actions of a prediction (paper, "Proposed Action and State Conditioned
 //! LSTM Autoencoder Model"), scaled to the network's range.
 
 use candle_core::{Device, Tensor};
@@ -6,11 +6,11 @@ use candle_core::{Device, Tensor};
 use super::spec::MIN_CHANNEL_STD;
 use super::{ChannelScale, ModelSpec, NnError};
 
-/// What a prediction is conditioned on, in the channels' own units. What the model's conditioning doesn't take is
-/// ignored; what it takes and isn't there is an error.
+/// The conditioning inputs of a batch, in the units of the channels. An input that the model does not use is ignored; an
+/// input that the model needs but that is missing is an error.
 #[derive(Clone, Debug, Default)]
 pub struct ConditioningTensors {
-    /// Actions to come `[B, horizon, A]`; action k leads to predicted frame k.
+    /// Future actions `[B, horizon, A]`; action k leads to predicted frame k.
     pub actions: Option<Tensor>,
     /// State at the last context frame `[B, S]`.
     pub state: Option<Tensor>,
@@ -23,29 +23,31 @@ impl ConditioningTensors {
         Self::default()
     }
 
-    /// The inputs that follow the features in each step of the predictor [B, horizon, A + S], scaled; `None` if the
+    /// The scaled inputs that the predictor gets after the features in each step, `[B, horizon, A + S]`; `None` if the
     /// conditioning is none. Errors: `Missing`, `Shape`.
     pub(super) fn inputs(&self, spec: &ModelSpec, batch: usize) -> Result<Option<Tensor>, NnError> {
         let horizon = spec.horizon;
-        let Some(count) = spec.action_inputs() else {
-            return Ok(None);
-        };
-        let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
-        let actions = scaled(actions, &spec.actions)?;
-        let Some(count) = spec.state_inputs() else {
-            return Ok(Some(actions));
-        };
-        let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
-        let state = scaled(state, &spec.states)?
-            .unsqueeze(1)?
-            .expand((batch, horizon, count))?;
-        Ok(Some(Tensor::cat(&[&actions, &state], 2)?))
+        let mut inputs = Vec::new();
+        if let Some(count) = spec.action_inputs() {
+            let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
+            inputs.push(scaled(actions, &spec.actions)?);
+        }
+        if let Some(count) = spec.state_inputs() {
+            let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+            let state = scaled(state, &spec.states)?.unsqueeze(1)?;
+            inputs.push(state.expand((batch, horizon, count))?.contiguous()?);
+        }
+        Ok(match inputs.as_slice() {
+            [] => None,
+            [only] => Some(only.clone()),
+            several => Some(Tensor::cat(several, 2)?),
+        })
     }
 }
 
 impl ConditioningTensors {
-    /// Actions `[B, horizon, A]` and state `[B, S]` as plain values in their own units, empty where the conditioning takes
-    /// none. Errors: `Missing`, `Shape`.
+    /// Actions `[B, horizon, A]` and state `[B, S]` as plain values in the channels' units, empty if the conditioning does
+    /// not include them. Errors: `Missing`, `Shape`.
     pub(super) fn raw(&self, spec: &ModelSpec, batch: usize) -> Result<(Vec<f32>, Vec<f32>), NnError> {
         let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
         let actions = match spec.action_inputs() {
@@ -60,7 +62,7 @@ impl ConditioningTensors {
     }
 }
 
-/// The tensor, if it is there and has that shape.
+/// The tensor, if it is given and has the expected shape. Errors: `Missing`, `Shape`.
 fn checked<'a>(
     spec: &ModelSpec,
     what: &'static str,

@@ -26,16 +26,10 @@ pub(super) struct ConvShape {
 
 impl ConvShape {
     /// Every place, neighbours side by side.
-    pub(super) const PLAIN: Self = Self {
-        stride: 1,
-        dilation: 1,
-    };
+    pub(super) const PLAIN: Self = Self { stride: 1, dilation: 1 };
 
     /// Every second place: half the sides.
-    pub(super) const HALVING: Self = Self {
-        stride: 2,
-        dilation: 1,
-    };
+    pub(super) const HALVING: Self = Self { stride: 2, dilation: 1 };
 
     /// Every place, neighbours `dilation` places apart.
     pub(super) const fn dilated(dilation: usize) -> Self {
@@ -176,7 +170,11 @@ impl CustomOp3 for Convolution {
         let image = ImageGeometry::of(dims, self.shape);
         let (rows, outputs) = weight_layout.shape().dims2()?;
         if rows != image.columns() {
-            bail!("a convolution of {} channels takes {} weights, got {rows}", image.channels, image.columns());
+            bail!(
+                "a convolution of {} channels takes {} weights, got {rows}",
+                image.channels,
+                image.columns()
+            );
         }
         let (values, bias) = (slice(x, x_layout)?, slice(bias, bias_layout)?);
         let mut sums = Vec::with_capacity(dims.0 * image.places() * outputs);
@@ -233,7 +231,9 @@ impl CustomOp3 for Convolution {
         with_values(x, |values| {
             with_values(&gradient, |gradient| -> Result<()> {
                 add_all_columns(&mut for_bias, gradient);
-                let images = values.chunks_exact(image.inputs()).zip(gradient.chunks_exact(places * outputs));
+                let images = values
+                    .chunks_exact(image.inputs())
+                    .zip(gradient.chunks_exact(places * outputs));
                 for (index, (values, gradient)) in images.enumerate() {
                     let gradient = CpuStorage::F32(gradient.to_vec());
                     unfold_into(&mut matrix, image, values);
@@ -332,7 +332,11 @@ impl CustomOp1 for PixelShuffle {
             let block = (fine / (columns * rows) * (rows / 2) + row / 2) * (columns / 2) + column / 2;
             let coarse = (block * 4 + row % 2 * 2 + column % 2) * depth;
             let fine = fine * depth;
-            let (from, to) = if self.is_inverse { (fine, coarse) } else { (coarse, fine) };
+            let (from, to) = if self.is_inverse {
+                (fine, coarse)
+            } else {
+                (coarse, fine)
+            };
             out[to..to + depth].copy_from_slice(&values[from..from + depth]);
         }
         let shape = if self.is_inverse {
@@ -367,7 +371,13 @@ mod tests {
             let kernel = weight.reshape((3, 3, 3, 4)).unwrap().permute((3, 2, 0, 1)).unwrap();
             let image = x.permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
             let theirs = image
-                .conv2d(&kernel.contiguous().unwrap(), shape.dilation, shape.stride, shape.dilation, 1)
+                .conv2d(
+                    &kernel.contiguous().unwrap(),
+                    shape.dilation,
+                    shape.stride,
+                    shape.dilation,
+                    1,
+                )
                 .unwrap();
             let theirs = theirs.permute((0, 2, 3, 1)).unwrap().broadcast_add(&bias).unwrap();
             assert_eq!(ours.dims(), theirs.dims());
@@ -380,7 +390,9 @@ mod tests {
     fn convolution_gradients_agree_with_differences() {
         for shape in SHAPES {
             let inputs = [noise(&[2, 5, 6, 3], 1), noise(&[27, 4], 2), noise(&[4], 3)];
-            assert_gradients(&inputs, 1e-2, |inputs| convolve(&inputs[0], &inputs[1], &inputs[2], shape));
+            assert_gradients(&inputs, 1e-2, |inputs| {
+                convolve(&inputs[0], &inputs[1], &inputs[2], shape)
+            });
         }
     }
 
@@ -390,7 +402,10 @@ mod tests {
         let fine = pixel_shuffle(&x).unwrap();
         assert_eq!(fine.dims(), [2, 6, 4, 2]);
         let back = pixel_unshuffle(&fine).unwrap();
-        assert_eq!(back.flatten_all().unwrap().to_vec1::<f32>().unwrap(), x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        assert_eq!(
+            back.flatten_all().unwrap().to_vec1::<f32>().unwrap(),
+            x.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        );
         assert_gradients(&[x], 1e-2, |inputs| pixel_shuffle(&inputs[0]));
     }
 }

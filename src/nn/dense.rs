@@ -1,5 +1,5 @@
-//! The dense layers: the frame codec (paper, "pre-trained layers") and the LSTMs' outputs.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Dense layers: the frame codec (paper, "pre-trained layers") and the output layers of the LSTMs.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use candle_core::backend::BackendStorage;
@@ -10,10 +10,10 @@ use super::NnError;
 use super::activation::tanh;
 use super::tensors::{add_columns, matrix, slice, with_values};
 
-/// What follows a dense layer's sum.
+/// The activation function of a dense layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
-    /// Nothing.
+    /// No activation function.
     Linear,
     /// tanh.
     Tanh,
@@ -60,7 +60,7 @@ impl Dense {
     }
 }
 
-/// The f32 layer with sum, bias and activation in one pass, and no gradient for an input that needs none.
+/// The f32 layer: sum, bias and activation in one pass. It computes the input's gradient only if it is needed.
 struct FusedDense {
     activation: Activation,
     wants_input_gradient: bool,

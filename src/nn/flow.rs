@@ -261,9 +261,13 @@ impl FlowModel {
         let coarse_viewer = Viewer::new(camera, quarter);
         let coarse_rays = coarse_viewer.rays();
         let coarse = with_values(&yaw, |yaw| {
-            yaw.iter().flat_map(|&yaw| coarse_viewer.turned(&coarse_rays, yaw)).collect()
+            yaw.iter()
+                .flat_map(|&yaw| coarse_viewer.turned(&coarse_rays, yaw))
+                .collect()
         })?;
-        let before: Vec<CameraPose> = (0..poses.len()).map(|item| rows.pose(spec, item / spec.horizon)).collect();
+        let before: Vec<CameraPose> = (0..poses.len())
+            .map(|item| rows.pose(spec, item / spec.horizon))
+            .collect();
         let room = self.scene.room_places(viewer, poses, &before)?;
         let room_or_turned = match &room {
             Some(places) => places.clone(),
@@ -295,7 +299,8 @@ impl FlowModel {
             for row in 0..quarter.height {
                 for column in 0..quarter.width {
                     for axis in 0..2 {
-                        let at = |dy: usize, dx: usize| item[((4 * row + dy) * size.width + 4 * column + dx) * 2 + axis];
+                        let at =
+                            |dy: usize, dx: usize| item[((4 * row + dy) * size.width + 4 * column + dx) * 2 + axis];
                         let middle = (at(1, 1) + at(2, 2) + at(1, 2) + at(2, 1)) / 4.0;
                         coarse.push((middle - 1.5) / 4.0);
                     }
@@ -324,5 +329,8 @@ struct ItemPlaces {
 }
 
 fn motion_rows(values: &[f32]) -> Vec<[f32; 3]> {
-    values.chunks_exact(3).map(|motion| [motion[0], motion[1], motion[2]]).collect()
+    values
+        .chunks_exact(3)
+        .map(|motion| [motion[0], motion[1], motion[2]])
+        .collect()
 }

@@ -109,13 +109,18 @@ impl FutureRows {
 
     /// The scaled state of each future.
     pub(super) fn scaled_states(&self, spec: &ModelSpec) -> Vec<Vec<f32>> {
-        (0..self.count()).map(|row| spec.scaled_state(self.state(row))).collect()
+        (0..self.count())
+            .map(|row| spec.scaled_state(self.state(row)))
+            .collect()
     }
 
     fn scaled_row(&self, spec: &ModelSpec, row: usize) -> Vec<f32> {
         let state = self.state(row).iter().zip(&spec.states);
         let actions = self.actions(row).iter().zip(spec.actions.iter().cycle());
-        state.chain(actions).map(|(value, channel)| channel.scaled(*value)).collect()
+        state
+            .chain(actions)
+            .map(|(value, channel)| channel.scaled(*value))
+            .collect()
     }
 
     /// Per item: the scaled state, the scaled actions up to the step (zero after it) and which step it is, `[M, …]`.
@@ -127,7 +132,12 @@ impl FutureRows {
             let scaled = self.scaled_row(spec, row);
             for step in 0..horizon {
                 let taken = self.state_count + (step + 1) * self.action_count;
-                values.extend(scaled.iter().enumerate().map(|(at, value)| if at < taken { *value } else { 0.0 }));
+                values.extend(
+                    scaled
+                        .iter()
+                        .enumerate()
+                        .map(|(at, value)| if at < taken { *value } else { 0.0 }),
+                );
                 values.extend((0..horizon).map(|other| f32::from(u8::from(other == step))));
             }
         }
@@ -140,7 +150,8 @@ impl FutureRows {
         let (pixels, context) = (size.pixels(), spec.context);
         let (mut row_of, mut firsts) = (Vec::with_capacity(self.count()), Vec::<usize>::new());
         for row in 0..self.count() {
-            let same = |&first: &usize| self.windows[first] == self.windows[row] && self.state(first) == self.state(row);
+            let same =
+                |&first: &usize| self.windows[first] == self.windows[row] && self.state(first) == self.state(row);
             let known = firsts.last().filter(|first| same(first)).is_some();
             if !known {
                 firsts.push(row);
@@ -207,7 +218,9 @@ impl EncoderViews {
         let own = own_places(size);
         let mut inputs = vec![0.0; self.count() * half.pixels() * Self::CHANNELS];
         for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * Self::CHANNELS).enumerate() {
-            let turns = StateChannels::of(spec).yaw_rate_in(&self.states[index]).zip(spec.camera);
+            let turns = StateChannels::of(spec)
+                .yaw_rate_in(&self.states[index])
+                .zip(spec.camera);
             write_blocks(&self.last_frames[index * pixels..], size, &own, inputs, 0);
             for back in 1..FRAMES_READ {
                 let frame = &self.earlier[(index * (FRAMES_READ - 1) + back - 1) * pixels..];
@@ -218,7 +231,11 @@ impl EncoderViews {
                 write_blocks(frame, size, places.as_ref().unwrap_or(&own), inputs, 4 * back);
             }
             let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];
-            for (place, (out, seen)) in inputs.chunks_exact_mut(Self::CHANNELS).zip(seen.chunks_exact(4)).enumerate() {
+            for (place, (out, seen)) in inputs
+                .chunks_exact_mut(Self::CHANNELS)
+                .zip(seen.chunks_exact(4))
+                .enumerate()
+            {
                 out[4 * FRAMES_READ..4 * FRAMES_READ + 4].copy_from_slice(seen);
                 out[Self::CHANNELS - 2] = centred(place % half.width, half.width);
                 out[Self::CHANNELS - 1] = centred(place / half.width, half.height);

@@ -21,7 +21,8 @@ const MODULATION_HIDDEN: usize = 64;
 const SIDES_PX: [u32; 2] = [4, 256];
 
 /// Sizes of the flow network's layers.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct FlowLayers {
     /// Channels on the grid of a quarter of the sides.
@@ -86,8 +87,8 @@ impl FlowLayers {
         Err(NnError::FrameSides {
             width: spec.frame_width_px,
             height: spec.frame_height_px,
-            least,
-            most,
+            min: least,
+            max: most,
         })
     }
 
@@ -122,7 +123,12 @@ impl FlowLayers {
             }
         }
         let moving = if actions.is_some() { 3 } else { 0 };
-        layer("modulation.inputs", known + horizon + moving, MODULATION_HIDDEN, horizon);
+        layer(
+            "modulation.inputs",
+            known + horizon + moving,
+            MODULATION_HIDDEN,
+            horizon,
+        );
         let modulated = (2 * self.decoder_blocks).max(1) * 2 * channels;
         layer("modulation.output", MODULATION_HIDDEN, modulated, horizon);
         if let Some(inputs) = SceneKind::of(spec).inputs(spec) {

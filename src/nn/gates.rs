@@ -1,6 +1,6 @@
-//! Equations (1)–(5) of the paper on rows of plain numbers, and the way back. [`super::lstm_cell`] has them on tensors;
-//! a test holds the two together, values and gradients.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Equations (1)–(5) of the paper on rows of plain numbers, and their backward pass. [`super::lstm_cell`] has the same
+//! equations on tensors; a test compares values and gradients of the two.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use super::activation::{sigmoid, tanh};
@@ -13,8 +13,8 @@ pub(super) struct Peepholes<'a> {
     pub(super) o: &'a [f32],
 }
 
-/// One row's step. `sums` `[4H]` holds `W_x x + W_h h + b` and becomes the activations i, f, tanh(·), o; `c_before` is the
-/// memory before, `c` and `h` `[H]` receive the new state.
+/// One step of one row. `sums` `[4H]` contains `W_x x + W_h h + b` and is overwritten with the activations i, f, tanh(·),
+/// o. `c_before` is the cell state before the step; `c` and `h` `[H]` receive the new state.
 #[inline(always)]
 pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, c: &mut [f32], h: &mut [f32]) {
     let hidden = c.len();
@@ -43,26 +43,26 @@ fn gate(sums: &mut [f32], peephole: &[f32], c: &[f32]) {
     }
 }
 
-/// What one row's step kept for the way back.
+/// Values of one row's step that the backward pass needs.
 #[derive(Clone, Copy)]
 pub(super) struct StepActivations<'a> {
     /// i, f, tanh(·), o `[4H]`.
     pub(super) activations: &'a [f32],
-    /// Memory before `[H]`.
+    /// Cell state before the step `[H]`.
     pub(super) c_before: &'a [f32],
-    /// Memory after `[H]`.
+    /// Cell state after the step `[H]`.
     pub(super) c: &'a [f32],
 }
 
-/// One row's way back. `d_h` `[H]` is the gradient of h; `d_c` `[H]` that of c from later steps, and becomes that of
-/// `c_before`; `d_sums` `[4H]` receives that of the sums.
+/// The backward pass of one row's step. `d_h` `[H]` is the gradient of h. `d_c` `[H]` is the gradient of c from later
+/// steps and is overwritten with the gradient of `c_before`. `d_sums` `[4H]` receives the gradient of the sums.
 #[inline(always)]
-pub(super) fn backward(kept: StepActivations, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
+pub(super) fn backward(step: StepActivations, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
     let StepActivations {
         activations,
         c_before,
         c,
-    } = kept;
+    } = step;
     let hidden = c.len();
     let (i, rest) = activations.split_at(hidden);
     let (f, rest) = rest.split_at(hidden);
@@ -70,7 +70,7 @@ pub(super) fn backward(kept: StepActivations, peepholes: Peepholes, d_h: &[f32],
     let (d_i, rest) = d_sums.split_at_mut(hidden);
     let (d_f, rest) = rest.split_at_mut(hidden);
     let (d_g, d_o) = rest.split_at_mut(hidden);
-    // tanh(c) waits in d_g until d_o and d_c have used it.
+    // d_g holds tanh(c) until d_o and d_c have been computed.
     for (d_g, c) in d_g.iter_mut().zip(c) {
         *d_g = tanh(*c);
     }
@@ -97,7 +97,7 @@ pub(super) fn backward(kept: StepActivations, peepholes: Peepholes, d_h: &[f32],
     add_product(d_c, d_f, peepholes.f);
 }
 
-/// sums += a · b, by elements.
+/// sums += a · b, element by element.
 #[inline(always)]
 pub(super) fn add_product(sums: &mut [f32], a: &[f32], b: &[f32]) {
     for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {

@@ -6,7 +6,9 @@ use candle_core::{Device, Result, Tensor, Var};
 pub(super) fn noise(shape: &[usize], seed: u64) -> Tensor {
     use rand::Rng;
     let mut rng = crate::types::Seed(seed).rng();
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| 2.0 * rng.random::<f32>() - 1.0).collect();
+    let values: Vec<f32> = (0..shape.iter().product())
+        .map(|_| 2.0 * rng.random::<f32>() - 1.0)
+        .collect();
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
@@ -17,13 +19,27 @@ pub(super) fn assert_gradients(inputs: &[Tensor], step: f32, operation: impl Fn(
     let out = operation(&tensors).unwrap();
     let weights = noise(out.dims(), 99);
     let value = |inputs: &[Tensor]| -> f64 {
-        let out = operation(inputs).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let out = operation(inputs)
+            .unwrap()
+            .flatten_all()
+            .unwrap()
+            .to_vec1::<f32>()
+            .unwrap();
         let weights = weights.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        out.iter().zip(&weights).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+        out.iter()
+            .zip(&weights)
+            .map(|(a, b)| f64::from(*a) * f64::from(*b))
+            .sum()
     };
     let gradients = (out * &weights).unwrap().sum_all().unwrap().backward().unwrap();
     for (index, var) in vars.iter().enumerate() {
-        let found = gradients.get(var.as_tensor()).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let found = gradients
+            .get(var.as_tensor())
+            .unwrap()
+            .flatten_all()
+            .unwrap()
+            .to_vec1::<f32>()
+            .unwrap();
         let base = inputs[index].flatten_all().unwrap().to_vec1::<f32>().unwrap();
         let largest = found.iter().fold(0.0f32, |most, value| most.max(value.abs()));
         for place in (0..base.len()).step_by(base.len().div_ceil(40)) {

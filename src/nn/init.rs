@@ -1,10 +1,10 @@
-//! Fresh weights from our own seeded generator. Each tensor draws from a stream of its own name, so that one tensor's
-//! values don't depend on which others a model has.
+//! Initial weights from a seeded random generator. Each tensor has its own random stream, named after the tensor, so that
+//! its values do not depend on which other tensors a model has.
 //!
 //! - Dense weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
-//! - The flow network's weights: the dense range, or the share of it that [`flow_gain`] names; all else 0.
-//! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts "nothing changes".
+//! - The flow network's weights: the dense range, or a share of it ([`flow_gain`]); its other tensors 0.
+//! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts almost no change.
 
 use candle_core::{Device, Tensor};
 use rand::Rng;
@@ -12,7 +12,7 @@ use rand::Rng;
 use super::NnError;
 use crate::types::Seed;
 
-/// A fresh tensor for that name and shape.
+/// The initial tensor of this name and shape.
 pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, NnError> {
     let count = shape.iter().product();
     let (layer, part) = name.rsplit_once('.').unwrap_or(("", name));
@@ -21,7 +21,7 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
             uniform(count, flow_gain(layer) * (6.0 / (inputs + outputs) as f32).sqrt(), name, seed)
         }
         _ if layer.starts_with("flow.") => vec![0.0; count],
-        ("bias", &[gates]) if is_lstm(name) => forget_gate_open(gates),
+        ("bias", &[gates]) if is_lstm(name) => lstm_bias(gates),
         ("bias", _) => vec![0.0; count],
         ("weight", &[inputs, outputs]) => {
             let gain = if name == "predictor.output.weight" { 0.1 } else { 1.0 };
@@ -36,8 +36,8 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
     Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
 }
 
-/// Share of the dense range that a layer of the flow network starts with: at first its residual blocks and corrections
-/// change nothing, and hardly any pixel moves.
+/// The share of the dense range for a layer of the flow network. At first, the residual blocks and corrections change
+/// nothing, and pixels hardly move.
 fn flow_gain(layer: &str) -> f32 {
     match layer {
         "flow.motion.output" | "flow.affine" => 0.0,
@@ -47,13 +47,13 @@ fn flow_gain(layer: &str) -> f32 {
     }
 }
 
-/// Whether the tensor belongs to an LSTM itself, not to a dense layer.
+/// Whether the tensor belongs to an LSTM cell, not to a dense layer.
 fn is_lstm(name: &str) -> bool {
     matches!(name.split_once('.'), Some(("encoder" | "predictor" | "reconstructor", part)) if !part.contains('.'))
 }
 
-/// Biases of the gates i, f, c, o: 0, 1, 0, 0.
-fn forget_gate_open(gates: usize) -> Vec<f32> {
+/// Biases of the gates i, f, c, o: 0, 1, 0, 0. The forget gate starts open.
+fn lstm_bias(gates: usize) -> Vec<f32> {
     let hidden = gates / 4;
     (0..gates)
         .map(|unit| if unit / hidden == 1 { 1.0 } else { 0.0 })

@@ -1,5 +1,5 @@
-//! How far a prediction is from the truth, as one number to make small.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Loss functions: the difference of a prediction and its target as one number.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use std::fmt;
@@ -14,7 +14,7 @@ use super::spec::named_enum;
 use super::tensors::{slice, with_values};
 
 named_enum!(
-    /// The loss that training makes small. The paper found the mean squared error best.
+    /// The loss that training minimizes. The paper found the mean squared error best.
     Loss, "loss", "\"mse\" and \"l1\"", {
         /// Mean of the squared differences.
         Mse = "mse",
@@ -24,21 +24,21 @@ named_enum!(
 );
 
 impl Loss {
-    /// The loss as a scalar tensor; its gradient goes to `prediction` alone. Errors: `Shape` if the two differ in shape.
-    pub fn between(self, prediction: &Tensor, truth: &Tensor) -> Result<Tensor, NnError> {
-        if prediction.dims() != truth.dims() {
+    /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
+    pub fn between(self, prediction: &Tensor, target: &Tensor) -> Result<Tensor, NnError> {
+        if prediction.dims() != target.dims() {
             return Err(NnError::shape(
                 "prediction",
                 prediction,
-                format!("the truth's shape {:?}", truth.dims()),
+                format!("the target's shape {:?}", target.dims()),
             ));
         }
         if prediction.dtype() == DType::F32 {
             return Ok(prediction
                 .contiguous()?
-                .apply_op2(&truth.detach().contiguous()?, self)?);
+                .apply_op2(&target.detach().contiguous()?, self)?);
         }
-        let difference = (prediction - truth.detach())?;
+        let difference = (prediction - target.detach())?;
         Ok(match self {
             Self::Mse => difference.sqr()?.mean_all()?,
             Self::L1 => difference.abs()?.mean_all()?,
@@ -46,7 +46,7 @@ impl Loss {
     }
 }
 
-/// In f32, one pass forth and one back.
+/// The f32 implementation: one pass over memory forward and one backward.
 impl CustomOp2 for Loss {
     fn name(&self) -> &'static str {
         "loss"
@@ -56,14 +56,14 @@ impl CustomOp2 for Loss {
         &self,
         prediction: &CpuStorage,
         prediction_layout: &Layout,
-        truth: &CpuStorage,
-        truth_layout: &Layout,
+        target: &CpuStorage,
+        target_layout: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let (prediction, truth) = (slice(prediction, prediction_layout)?, slice(truth, truth_layout)?);
+        let (prediction, target) = (slice(prediction, prediction_layout)?, slice(target, target_layout)?);
         let count = prediction.len() as f64;
         let sum = match self {
-            Self::Mse => sum_of(prediction, truth, |difference| difference * difference),
-            Self::L1 => sum_of(prediction, truth, f32::abs),
+            Self::Mse => sum_of(prediction, target, |difference| difference * difference),
+            Self::L1 => sum_of(prediction, target, f32::abs),
         };
         Ok((CpuStorage::F32(vec![(sum / count) as f32]), Shape::from(())))
     }
@@ -71,15 +71,15 @@ impl CustomOp2 for Loss {
     fn bwd(
         &self,
         prediction: &Tensor,
-        truth: &Tensor,
+        target: &Tensor,
         _loss: &Tensor,
         gradient: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
         let scale = gradient.to_scalar::<f32>()? / prediction.elem_count() as f32;
         let values = with_values(prediction, |prediction| {
-            with_values(truth, |truth| match self {
-                Self::Mse => each(prediction, truth, |difference| 2.0 * scale * difference),
-                Self::L1 => each(prediction, truth, |difference| {
+            with_values(target, |target| match self {
+                Self::Mse => slopes(prediction, target, |difference| 2.0 * scale * difference),
+                Self::L1 => slopes(prediction, target, |difference| {
                     let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
                     scale * sign
                 }),
@@ -92,18 +92,18 @@ impl CustomOp2 for Loss {
     }
 }
 
-/// Sum of `term` of each difference, blocks in f32, their sum in f64.
+/// Sum of `term` of each difference: blocks in f32, the sum of the blocks in f64.
 #[inline(always)]
-fn sum_of(prediction: &[f32], truth: &[f32], term: impl Fn(f32) -> f32) -> f64 {
+fn sum_of(prediction: &[f32], target: &[f32], term: impl Fn(f32) -> f32) -> f64 {
     Arch::new().dispatch(
         #[inline(always)]
         || {
             let mut total = 0.0;
-            for (prediction, truth) in prediction.chunks(512).zip(truth.chunks(512)) {
+            for (prediction, target) in prediction.chunks(512).zip(target.chunks(512)) {
                 let mut lanes = [0.0f32; 16];
-                for (prediction, truth) in prediction.chunks(16).zip(truth.chunks(16)) {
-                    for ((lane, prediction), truth) in lanes.iter_mut().zip(prediction).zip(truth) {
-                        *lane += term(prediction - truth);
+                for (prediction, target) in prediction.chunks(16).zip(target.chunks(16)) {
+                    for ((lane, prediction), target) in lanes.iter_mut().zip(prediction).zip(target) {
+                        *lane += term(prediction - target);
                     }
                 }
                 total += f64::from(lanes.iter().sum::<f32>());
@@ -113,15 +113,16 @@ fn sum_of(prediction: &[f32], truth: &[f32], term: impl Fn(f32) -> f32) -> f64 {
     )
 }
 
+/// `slope` of each difference.
 #[inline(always)]
-fn each(prediction: &[f32], truth: &[f32], slope: impl Fn(f32) -> f32) -> Vec<f32> {
+fn slopes(prediction: &[f32], target: &[f32], slope: impl Fn(f32) -> f32) -> Vec<f32> {
     Arch::new().dispatch(
         #[inline(always)]
         || {
             prediction
                 .iter()
-                .zip(truth)
-                .map(|(prediction, truth)| slope(prediction - truth))
+                .zip(target)
+                .map(|(prediction, target)| slope(prediction - target))
                 .collect()
         },
     )

@@ -1,5 +1,5 @@
-//! An LSTM over time: driven by a sequence, or by its own output. f32 goes through one fused operation
-//! (`recurrence`); other types, which only tests use, go step by step through [`PeepholeCell::step`].
+//! An LSTM over a sequence of inputs, or over its own output. f32 uses one fused operation (`recurrence`). Other types,
+//! which only tests use, call [`PeepholeCell::step`] for each step.
 
 use candle_core::{DType, Tensor};
 
@@ -8,11 +8,11 @@ use super::dense::{Activation, Dense};
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::recurrence::{decode_autoregressive, forward_sequence};
 
-/// Runs the cell over a sequence x `[B, T, D]` from `state`: the outputs `[B, T, H]` and the last state.
+/// Runs the cell over a sequence x `[B, T, D]` from `state`. Returns the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
     let (batch, steps, _) = x.dims3()?;
     if x.dtype() == DType::F32 {
-        let (outputs, c) = forward_sequence(cell, &drive(cell, x, 0)?, state)?;
+        let (outputs, c) = forward_sequence(cell, &input_projection(cell, x, 0)?, state)?;
         let h = outputs.get(steps - 1)?;
         return Ok((outputs.transpose(0, 1)?.contiguous()?, LstmState { h, c }));
     }
@@ -25,9 +25,9 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
     Ok((Tensor::stack(&outputs, 1)?, state))
 }
 
-/// What x `[B, T, D]` adds to the cell's sums through `w_x` from row `first_row`, bias included: one product for all steps,
-/// `[T, B, 4H]`.
-fn drive(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
+/// The input projection `w_x x + b` of x `[B, T, D]`, with the rows of `w_x` from `first_row`: one matrix product for all
+/// steps, `[T, B, 4H]`.
+fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let (batch, steps, inputs) = x.dims3()?;
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
     let w_x = cell.w_x.narrow(0, first_row, inputs)?;
@@ -35,19 +35,19 @@ fn drive(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, Nn
     Ok(sums.reshape((steps, batch, 4 * cell.hidden()))?)
 }
 
-/// An LSTM that feeds its output back.
+/// An autoregressive LSTM decoder: each step gets the output of the step before.
 #[derive(Clone, Copy, Debug)]
 pub struct Decoder<'a> {
-    /// The cell; its inputs are the features, then the conditions.
+    /// The cell. Its inputs are the features, then the conditioning inputs.
     pub cell: &'a PeepholeCell,
-    /// From the cell's output to features.
+    /// The layer from the cell's output to features.
     pub output: &'a Dense,
-    /// Whether the output is a change of the features before, or the features themselves.
+    /// Whether the output is added to the previous features, instead of replacing them.
     pub residual: bool,
 }
 
 impl Decoder<'_> {
-    /// Features [B, steps, F] that follow `first` `[B, F]`; step k also takes `conditions` [B, steps, C] at k.
+    /// Features `[B, steps, F]` that follow `first` `[B, F]`. Step k also gets `conditions` `[B, steps, A + S]` at k.
     pub fn run(
         &self,
         steps: usize,
@@ -56,11 +56,11 @@ impl Decoder<'_> {
         state: &LstmState,
     ) -> Result<Tensor, NnError> {
         if first.dtype() == DType::F32 {
-            let drive = match conditions {
-                Some(conditions) => drive(self.cell, conditions, first.dim(1)?)?,
+            let projection = match conditions {
+                Some(conditions) => input_projection(self.cell, conditions, first.dim(1)?)?,
                 None => self.cell.bias.clone(),
             };
-            let features = decode_autoregressive(self, steps, &drive, first, state)?;
+            let features = decode_autoregressive(self, steps, &projection, first, state)?;
             return Ok(features.transpose(0, 1)?.contiguous()?);
         }
         let mut state = state.clone();

@@ -4,12 +4,12 @@ use candle_core::Tensor;
 
 use super::NnError;
 
-/// What an LSTM carries from one step to the next.
+/// The state of an LSTM between two steps.
 #[derive(Clone, Debug)]
 pub struct LstmState {
     /// Output of the units, h `[B, H]`.
     pub h: Tensor,
-    /// Memory of the cells, c `[B, H]`.
+    /// Cell state, c `[B, H]`.
     pub c: Tensor,
 }
 
@@ -27,7 +27,7 @@ pub struct PeepholeCell {
 }
 
 impl PeepholeCell {
-    /// A cell of those weights: `w_x` `[D, 4H]`, `w_h` `[H, 4H]`, bias `[4H]`, and the diagonals of `W_ci`, `W_cf`, `W_co` `[H]`.
+    /// A cell with these weights: `w_x` `[D, 4H]`, `w_h` `[H, 4H]`, bias `[4H]`, and the diagonals of `W_ci`, `W_cf`, `W_co` `[H]`.
     #[must_use]
     pub fn new(w_x: Tensor, w_h: Tensor, bias: Tensor, peepholes: [Tensor; 3]) -> Self {
         Self {
@@ -53,17 +53,17 @@ impl PeepholeCell {
     }
 
     /// Advances the cell one step (paper, eqs. 1–5). x is `[B, D]`, state `[B, H]`.
-    /// Sequences of f32 go through [`super::lstm`], which does the same in fewer passes.
+    /// For sequences of f32, [`super::lstm`] computes the same in fewer passes over memory.
     pub fn step(&self, x: &Tensor, state: &LstmState) -> Result<LstmState, NnError> {
         let sums = (x.matmul(&self.w_x)?.broadcast_add(&self.bias)? + state.h.matmul(&self.w_h)?)?;
         let hidden = self.hidden();
         let gate = |index: usize| sums.narrow(1, index * hidden, hidden);
-        let seen = |peephole: &Tensor, c: &Tensor| c.broadcast_mul(peephole);
+        let through_peephole = |peephole: &Tensor, c: &Tensor| c.broadcast_mul(peephole);
         let [w_ci, w_cf, w_co] = &self.peepholes;
-        let i = candle_nn::ops::sigmoid(&(gate(0)? + seen(w_ci, &state.c)?)?)?;
-        let f = candle_nn::ops::sigmoid(&(gate(1)? + seen(w_cf, &state.c)?)?)?;
+        let i = candle_nn::ops::sigmoid(&(gate(0)? + through_peephole(w_ci, &state.c)?)?)?;
+        let f = candle_nn::ops::sigmoid(&(gate(1)? + through_peephole(w_cf, &state.c)?)?)?;
         let c = ((f * &state.c)? + (i * gate(2)?.tanh()?)?)?;
-        let o = candle_nn::ops::sigmoid(&(gate(3)? + seen(w_co, &c)?)?)?;
+        let o = candle_nn::ops::sigmoid(&(gate(3)? + through_peephole(w_co, &c)?)?)?;
         let h = (o * c.tanh()?)?;
         Ok(LstmState { h, c })
     }

@@ -62,9 +62,7 @@ impl Model {
     /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
     pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
         let network = match spec.architecture {
-            Architecture::Dense => {
-                Network::Dense(Box::new(DenseModel::with_frozen(spec.clone(), parameters, frozen)?))
-            }
+            Architecture::Dense => Network::Dense(Box::new(DenseModel::with_frozen(spec.clone(), parameters, frozen)?)),
             Architecture::Flow => {
                 spec.validate()?;
                 let tensors = NamedTensors {
@@ -146,7 +144,9 @@ impl Model {
         let batch = self.check_windows(frames)?;
         match &self.network {
             Network::Dense(_) => Ok(None),
-            Network::Flow(flow) => flow.predict(&self.spec, frames, &each_once(batch), conditioning).map(Some),
+            Network::Flow(flow) => flow
+                .predict(&self.spec, frames, &each_once(batch), conditioning)
+                .map(Some),
         }
     }
 
@@ -165,7 +165,11 @@ impl Model {
         let (context, pixels, code) = (self.spec.context, self.spec.pixels(), self.spec.code_len());
         let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
         let codes = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;
-        let predicted = self.predict(&codes.reshape((batch, context, code))?, conditioning, Feedback::Prediction)?;
+        let predicted = self.predict(
+            &codes.reshape((batch, context, code))?,
+            conditioning,
+            Feedback::Prediction,
+        )?;
         let frames = self.decode_frames(&predicted.flatten(0, 1)?)?;
         Ok(frames.reshape((batch, self.spec.horizon, pixels))?)
     }

@@ -61,7 +61,12 @@ impl CustomOp1 for Silu {
             with_values(gradient, |gradient| {
                 Arch::new().dispatch(
                     #[inline(always)]
-                    || x.iter().zip(gradient).map(|(&x, gradient)| gradient * slope(x)).collect(),
+                    || {
+                        x.iter()
+                            .zip(gradient)
+                            .map(|(&x, gradient)| gradient * slope(x))
+                            .collect()
+                    },
                 )
             })
         })??;

@@ -36,8 +36,16 @@ impl StateChannels {
         let by_unit = |channels: &[ChannelScale]| {
             ["m/s", "rad/s"].map(|unit| channels.iter().position(|channel| channel.unit == unit))
         };
-        let states: &[ChannelScale] = if spec.state_inputs().is_some() { &spec.states } else { &[] };
-        let actions: &[ChannelScale] = if spec.action_inputs().is_some() { &spec.actions } else { &[] };
+        let states: &[ChannelScale] = if spec.state_inputs().is_some() {
+            &spec.states
+        } else {
+            &[]
+        };
+        let actions: &[ChannelScale] = if spec.action_inputs().is_some() {
+            &spec.actions
+        } else {
+            &[]
+        };
         let named = |name: &str| states.iter().position(|channel| channel.name == name);
         let pose = match ["x", "y", "heading_cos", "heading_sin"].map(named) {
             [Some(x), Some(y), Some(cos), Some(sin)] => Some([x, y, cos, sin]),
@@ -52,11 +60,12 @@ impl StateChannels {
 
     /// The pose in a state; the origin where states hold none.
     pub(super) fn pose_in(self, state: &[f32]) -> CameraPose {
-        self.pose.map_or_else(CameraPose::default, |[x, y, cos, sin]| CameraPose {
-            x: state[x],
-            y: state[y],
-            heading: state[sin].atan2(state[cos]),
-        })
+        self.pose
+            .map_or_else(CameraPose::default, |[x, y, cos, sin]| CameraPose {
+                x: state[x],
+                y: state[y],
+                heading: state[sin].atan2(state[cos]),
+            })
     }
 
     /// The yaw rate in a state, in radians a second.
@@ -146,7 +155,13 @@ impl MotionHead {
         let (items, pixels) = (motion.dim(0)?, size.pixels());
         let sides = Tensor::new(&[size.width as f32, size.height as f32], &Device::Cpu)?;
         let from_middle = (own.broadcast_div(&sides)? * 2.0)?.affine(1.0, -1.0)?;
-        let basis = Tensor::cat(&[&from_middle, &Tensor::ones((1, pixels, 1), candle_core::DType::F32, &Device::Cpu)?], 2)?;
+        let basis = Tensor::cat(
+            &[
+                &from_middle,
+                &Tensor::ones((1, pixels, 1), candle_core::DType::F32, &Device::Cpu)?,
+            ],
+            2,
+        )?;
         let map = (affine.forward(motion)? * AFFINE)?.reshape((items, 3, 2))?;
         let basis = basis.broadcast_as((items, pixels, 3))?.contiguous()?;
         let moved = basis.matmul(&map)?.broadcast_mul(&sides)?;

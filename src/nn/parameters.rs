@@ -12,7 +12,7 @@ use crate::types::Seed;
 pub struct Parameters(BTreeMap<String, Var>);
 
 impl Parameters {
-    /// Fresh weights, f32: the same seed gives the same bits. Errors: those of [`ModelSpec::validate`].
+    /// Initial weights, f32: the same seed gives the same bits. Errors: those of [`ModelSpec::validate`].
     pub fn initialize(spec: &ModelSpec, seed: Seed) -> Result<Self, NnError> {
         spec.validate()?;
         let tensors = spec
@@ -23,7 +23,7 @@ impl Parameters {
         Ok(Self(tensors))
     }
 
-    /// Weights that were stored, any float type, as f32. Errors: `OtherArchitecture`, `TensorMissing`, `TensorUnknown`, `TensorShape`,
+    /// Weights from stored tensors of any float type, converted to f32. Errors: `OtherArchitecture`, `TensorMissing`, `TensorUnknown`, `TensorShape`,
     /// `TensorNotFinite`, and those of [`ModelSpec::validate`].
     pub fn from_tensors(spec: &ModelSpec, mut tensors: BTreeMap<String, Tensor>) -> Result<Self, NnError> {
         spec.validate()?;
@@ -54,18 +54,18 @@ impl Parameters {
         }
     }
 
-    /// Every tensor with its name, in the order of the names.
+    /// Every tensor with its name, sorted by name.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.0.iter().map(|(name, var)| (name.as_str(), var))
     }
 
-    /// The tensor of that name.
+    /// The tensor with this name.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&Var> {
         self.0.get(name)
     }
 
-    /// Copies of the tensors as they are now, which later updates don't change.
+    /// Copies of the current tensors. Later updates do not change the copies.
     pub fn snapshot(&self) -> Result<BTreeMap<String, Tensor>, NnError> {
         self.0
             .iter()
@@ -73,7 +73,7 @@ impl Parameters {
             .collect()
     }
 
-    /// Gives every tensor the value that `snapshot` held, in place: models that share the storage see it.
+    /// Sets every tensor to its value in `snapshot`, in place: models that share the storage see the change.
     /// Errors: `TensorMissing`, `TensorShape`.
     pub fn restore(&self, snapshot: &BTreeMap<String, Tensor>) -> Result<(), NnError> {
         for (name, var) in &self.0 {
@@ -98,13 +98,13 @@ impl Parameters {
         Ok(())
     }
 
-    /// Number of trained values.
+    /// Number of parameters.
     #[must_use]
     pub fn count(&self) -> u64 {
         self.0.values().map(|var| var.elem_count() as u64).sum()
     }
 
-    /// Fresh variables of another float type with these values; f64 serves to check gradients.
+    /// New variables of another float type with the same values; tests use f64 to check gradients.
     pub fn to_dtype(&self, dtype: DType) -> Result<Self, NnError> {
         let tensors = self
             .0

@@ -143,7 +143,10 @@ impl CustomOp1 for Turning {
         if layout.dims().len() != 1 {
             bail!("yaw has shape {:?}; it must be [M]", layout.dims());
         }
-        let places: Vec<f32> = yaw.iter().flat_map(|&yaw| self.viewer.turned(&self.rays, yaw)).collect();
+        let places: Vec<f32> = yaw
+            .iter()
+            .flat_map(|&yaw| self.viewer.turned(&self.rays, yaw))
+            .collect();
         Ok((CpuStorage::F32(places), Shape::from((yaw.len(), self.rays.len(), 2))))
     }
 
@@ -221,12 +224,18 @@ mod tests {
     fn gradients_of_the_yaw_agree_with_differences() {
         let viewer = Viewer::new(CAMERA, SIZE);
         let yaw = Tensor::new(&[0.1f32, -0.4, 0.0], &candle_core::Device::Cpu).unwrap();
-        assert_gradients(&[yaw], 1e-3, |inputs| turning_places(viewer, &viewer.rays(), &inputs[0]));
+        assert_gradients(&[yaw], 1e-3, |inputs| {
+            turning_places(viewer, &viewer.rays(), &inputs[0])
+        });
     }
 
     #[test]
     fn a_motion_leads_from_one_pose_to_the_other() {
-        let here = CameraPose { x: 1.0, y: -2.0, heading: 3.0 };
+        let here = CameraPose {
+            x: 1.0,
+            y: -2.0,
+            heading: 3.0,
+        };
         let motion = [0.4, 0.3, -0.1];
         let found = here.motion_to(here.moved(motion));
         assert!(found.iter().zip(motion).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");

@@ -1,9 +1,9 @@
-//! A whole sequence of LSTM steps as one f32 operation with its own way back. Against one graph node per sum and gate it
-//! saves most passes over memory, and each weight's gradient is one product over all steps.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! A whole sequence of LSTM steps as one f32 operation with its own backward pass. Compared with one graph node per sum and
+//! gate, it needs far fewer passes over memory, and each weight's gradient is one matrix product over all steps.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-mod back;
+mod backward;
 
 use std::sync::{Mutex, PoisonError};
 
@@ -15,7 +15,7 @@ use super::lstm::Decoder;
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::tensors::{add_columns, matrix, slice, with_values};
 
-/// A layer that feeds its output back into the cell.
+/// The output layer of an autoregressive decoder; its output is an input of the cell's next step.
 #[derive(Clone)]
 struct FeedbackLoop {
     /// Weights from the features to the cell's sums `[F, 4H]`.
@@ -24,11 +24,11 @@ struct FeedbackLoop {
     weight: Tensor,
     /// Bias of the features `[F]`.
     bias: Vec<f32>,
-    /// Whether the layer's output is added to the features before, instead of replacing them.
+    /// Whether the layer's output is added to the previous features, instead of replacing them.
     residual: bool,
 }
 
-/// What the steps did, for the way back: rows are B of a step, then the next step's.
+/// Values of all steps that the backward pass needs. Rows: the B rows of the first step, then those of the next step, …
 struct RecurrenceTrace {
     /// [T · B, 4H].
     activations: Vec<f32>,
@@ -49,20 +49,27 @@ struct Recurrence {
     trace: Mutex<Option<RecurrenceTrace>>,
 }
 
-/// Runs the cell on sums that are known beforehand, `drive` `[T, B, 4H]` = `W_x x + b`: every h `[T, B, H]` and the last c `[B, H]`.
-pub(super) fn forward_sequence(cell: &PeepholeCell, drive: &Tensor, state: &LstmState) -> Result<(Tensor, Tensor)> {
-    let steps = drive.dim(0)?;
+/// Runs the cell over a sequence whose input `projection` `W_x x + b` `[T, B, 4H]` is already computed. Returns every h
+/// `[T, B, H]` and the last c `[B, H]`.
+pub(super) fn forward_sequence(
+    cell: &PeepholeCell,
+    projection: &Tensor,
+    state: &LstmState,
+) -> Result<(Tensor, Tensor)> {
+    let steps = projection.dim(0)?;
     let start = Tensor::cat(&[&state.h, &state.c], 1)?;
-    let all = Recurrence::new(cell, None, steps)?.apply(&drive.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
+    let all =
+        Recurrence::new(cell, None, steps)?.apply(&projection.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
     Ok((all.narrow(0, 0, steps)?, all.get(steps)?))
 }
 
-/// Runs a decoder on its own output: features `[T, B, F]`. Only the first F rows of the cell's `w_x` take features; `drive`
-/// is what all else adds to the sums, `[T, B, 4H]`, or `[4H]` if the same in every step.
+/// Runs a decoder on its own output. Returns features `[T, B, F]`. The first F rows of the cell's `w_x` belong to the
+/// features; `projection` is the contribution of all other inputs and the bias, `[T, B, 4H]`, or `[4H]` if it is the same in
+/// every step.
 pub(super) fn decode_autoregressive(
     decoder: &Decoder,
     steps: usize,
-    drive: &Tensor,
+    projection: &Tensor,
     first: &Tensor,
     state: &LstmState,
 ) -> Result<Tensor> {
@@ -75,18 +82,18 @@ pub(super) fn decode_autoregressive(
         residual,
     };
     let start = Tensor::cat(&[&state.h, &state.c, first], 1)?;
-    let drive = if drive.rank() == 1 {
-        drive.clone()
+    let projection = if projection.rank() == 1 {
+        projection.clone()
     } else {
-        drive.flatten(0, 1)?
+        projection.flatten(0, 1)?
     };
     let mut weights = cell.recurrent_weights();
     weights.extend([w_x, output.weight.clone(), output.bias.clone()]);
-    Recurrence::new(cell, Some(feedback), steps)?.apply(&drive, &start, &weights)
+    Recurrence::new(cell, Some(feedback), steps)?.apply(&projection, &start, &weights)
 }
 
 impl PeepholeCell {
-    /// The weights whose gradients the operation gives, in its order.
+    /// The weights whose gradients the operation computes, in its order.
     fn recurrent_weights(&self) -> Vec<Tensor> {
         let mut weights = vec![self.w_h.clone()];
         weights.extend(self.peepholes.iter().cloned());
@@ -108,15 +115,15 @@ impl Recurrence {
         })
     }
 
-    /// Applies the operation. `weights` are only there to receive their gradients, joined in one vector since an
-    /// operation takes three arguments; without gradients they are left out.
-    fn apply(self, drive: &Tensor, start: &Tensor, weights: &[Tensor]) -> Result<Tensor> {
-        let (drive, start) = (drive.contiguous()?, start.contiguous()?);
-        if !weights.iter().chain([&drive, &start]).any(Tensor::track_op) {
-            return drive.apply_op3_no_bwd(&start, &start, &self);
+    /// Applies the operation. `weights` are an argument only to receive their gradients. They are joined in one vector,
+    /// because an operation takes three arguments, and left out if no gradients are needed.
+    fn apply(self, projection: &Tensor, start: &Tensor, weights: &[Tensor]) -> Result<Tensor> {
+        let (projection, start) = (projection.contiguous()?, start.contiguous()?);
+        if !weights.iter().chain([&projection, &start]).any(Tensor::track_op) {
+            return projection.apply_op3_no_bwd(&start, &start, &self);
         }
         let flat = weights.iter().map(Tensor::flatten_all).collect::<Result<Vec<_>>>()?;
-        drive.apply_op3(&start, &Tensor::cat(&flat, 0)?, self)
+        projection.apply_op3(&start, &Tensor::cat(&flat, 0)?, self)
     }
 
     fn features(&self) -> usize {
@@ -128,33 +135,35 @@ impl Recurrence {
         Peepholes { i, f, o }
     }
 
-    /// All steps from `start` [B, H + H + F].
-    fn run(&self, drive: &[f32], start: &[f32]) -> Result<RecurrenceTrace> {
+    /// Computes all steps from `start` `[B, H + H + F]`.
+    fn run(&self, projection: &[f32], start: &[f32]) -> Result<RecurrenceTrace> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = start.len() / (2 * hidden + features);
-        let mut trace = RecurrenceTrace::starting(start, [hidden, hidden, features], self.steps);
+        let mut trace = RecurrenceTrace::new(start, [hidden, hidden, features], self.steps);
         for t in 0..self.steps {
             let before = t * batch..(t + 1) * batch;
             let h = matrix(trace.h[before.start * hidden..before.end * hidden].to_vec(), hidden)?;
             let recurrent = h.matmul(&self.w_h)?;
-            let fed = match &self.feedback {
+            let projected_features = match &self.feedback {
                 Some(feedback) => {
-                    let seen = trace.features[before.start * features..before.end * features].to_vec();
-                    Some(matrix(seen, features)?.matmul(&feedback.w_x)?)
+                    let previous = trace.features[before.start * features..before.end * features].to_vec();
+                    Some(matrix(previous, features)?.matmul(&feedback.w_x)?)
                 }
                 None => None,
             };
-            let drive = if drive.len() == 4 * hidden {
-                drive
+            let projection = if projection.len() == 4 * hidden {
+                projection
             } else {
-                &drive[before.start * 4 * hidden..before.end * 4 * hidden]
+                &projection[before.start * 4 * hidden..before.end * 4 * hidden]
             };
             let mut advance = |parts: [&[f32]; 3]| self.advance(&mut trace, t, batch, parts);
             with_values(&recurrent, |recurrent| {
-                if let Some(fed) = &fed {
-                    with_values(fed, |fed| advance([drive, recurrent, fed]))
+                if let Some(projected_features) = &projected_features {
+                    with_values(projected_features, |projected_features| {
+                        advance([projection, recurrent, projected_features])
+                    })
                 } else {
-                    advance([drive, recurrent, &[]]);
+                    advance([projection, recurrent, &[]]);
                     Ok(())
                 }
             })??;
@@ -170,7 +179,7 @@ impl Recurrence {
         Ok(trace)
     }
 
-    /// Step `t` from the parts of its sums.
+    /// Computes step `t` from the parts of its sums.
     fn advance(&self, trace: &mut RecurrenceTrace, t: usize, batch: usize, parts: [&[f32]; 3]) {
         let hidden = self.hidden;
         let RecurrenceTrace { activations, h, c, .. } = trace;
@@ -197,7 +206,7 @@ impl Recurrence {
 }
 
 impl FeedbackLoop {
-    /// Features of the step after the one at `from`.
+    /// Computes the features after the step whose input features start at index `from`.
     fn advance(&self, features: &mut [f32], from: usize, change: &Tensor) -> Result<()> {
         let bias = &self.bias;
         with_values(change, |change| {
@@ -218,9 +227,9 @@ impl FeedbackLoop {
 }
 
 impl RecurrenceTrace {
-    /// Room for all steps, with the state before the first one in place.
-    fn starting(start: &[f32], sides: [usize; 3], steps: usize) -> Self {
-        let [hidden, _, features] = sides;
+    /// Allocates memory for all steps and writes the state before the first step.
+    fn new(start: &[f32], sizes: [usize; 3], steps: usize) -> Self {
+        let [hidden, _, features] = sizes;
         let width = 2 * hidden + features;
         let batch = start.len() / width;
         let mut trace = Self {
@@ -247,15 +256,15 @@ impl CustomOp3 for Recurrence {
 
     fn cpu_fwd(
         &self,
-        drive: &CpuStorage,
-        drive_layout: &Layout,
+        projection: &CpuStorage,
+        projection_layout: &Layout,
         start: &CpuStorage,
         start_layout: &Layout,
         _weights: &CpuStorage,
         _weights_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (drive, start) = (slice(drive, drive_layout)?, slice(start, start_layout)?);
-        let trace = self.run(drive, start)?;
+        let (projection, start) = (slice(projection, projection_layout)?, slice(start, start_layout)?);
+        let trace = self.run(projection, start)?;
         let batch = start_layout.dims()[0];
         let result = if self.feedback.is_some() {
             let features = self.features();
@@ -274,7 +283,7 @@ impl CustomOp3 for Recurrence {
 
     fn bwd(
         &self,
-        drive: &Tensor,
+        projection: &Tensor,
         start: &Tensor,
         _weights: &Tensor,
         _result: &Tensor,
@@ -282,23 +291,23 @@ impl CustomOp3 for Recurrence {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let trace = self.trace.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(trace) = trace.as_ref() else {
-            bail!("the recurrence has not run");
+            bail!("the recurrence has no forward pass to differentiate; this is a bug");
         };
-        let back = with_values(gradient, |gradient| self.back(trace, gradient))??;
+        let gradients = with_values(gradient, |gradient| self.backward(trace, gradient))??;
         let hidden = self.hidden;
-        let sums = matrix(back.sums.clone(), 4 * hidden)?;
-        let weights = self.weights_back(trace, &back, &sums)?;
-        let drive = if drive.rank() == 1 {
+        let sums = matrix(gradients.sums.clone(), 4 * hidden)?;
+        let weights = self.weight_gradients(trace, &gradients, &sums)?;
+        let projection = if projection.rank() == 1 {
             let mut columns = vec![0.0; 4 * hidden];
-            add_columns(&mut columns, &back.sums);
-            Tensor::from_vec(columns, 4 * hidden, drive.device())?
+            add_columns(&mut columns, &gradients.sums);
+            Tensor::from_vec(columns, 4 * hidden, projection.device())?
         } else {
             sums
         };
-        let mut parts = vec![matrix(back.h, hidden)?, matrix(back.c, hidden)?];
+        let mut parts = vec![matrix(gradients.h, hidden)?, matrix(gradients.c, hidden)?];
         if self.feedback.is_some() {
-            parts.push(matrix(back.first, start.dim(1)? - 2 * hidden)?);
+            parts.push(matrix(gradients.first, start.dim(1)? - 2 * hidden)?);
         }
-        Ok((Some(drive), Some(Tensor::cat(&parts, 1)?), Some(weights)))
+        Ok((Some(projection), Some(Tensor::cat(&parts, 1)?), Some(weights)))
     }
 }

@@ -195,7 +195,11 @@ impl CustomOp1 for RoomViews {
         let rows = self.poses.len() * self.rays.len();
         let mut out = vec![0.0; rows * RAY_VALUES];
         self.visit(|index, ray| {
-            describe(ray, sides.hit(ray), &mut out[index * RAY_VALUES..(index + 1) * RAY_VALUES]);
+            describe(
+                ray,
+                sides.hit(ray),
+                &mut out[index * RAY_VALUES..(index + 1) * RAY_VALUES],
+            );
         });
         Ok((CpuStorage::F32(out), Shape::from((rows, RAY_VALUES))))
     }
@@ -212,7 +216,11 @@ impl CustomOp1 for RoomViews {
                 });
             })
         })??;
-        Ok(Some(Tensor::from_vec(sums.to_vec(), parameter.dims(), parameter.device())?))
+        Ok(Some(Tensor::from_vec(
+            sums.to_vec(),
+            parameter.dims(),
+            parameter.device(),
+        )?))
     }
 }
 
@@ -239,8 +247,8 @@ fn side_gradient(ray: RoomRay, hit: RoomHit, y: &[f32], gradient: &[f32]) -> f32
     let length = (x * x + level_y * level_y + z * z).sqrt();
     let distance = hit.time * length;
     let near = 1.0 / (distance + 0.3);
-    for_time += length
-        * (0.25 * gradient[rest + 9] + 0.1 * distance * gradient[rest + 10] - near * near * gradient[rest + 11]);
+    for_time +=
+        length * (0.25 * gradient[rest + 9] + 0.1 * distance * gradient[rest + 10] - near * near * gradient[rest + 11]);
     for_time / speed
 }
 

@@ -105,7 +105,9 @@ impl Scene {
             SceneKind::Room(scale) => self.room_seen(spec, scale, poses),
             SceneKind::Places => {
                 let scaled = rows.scaled_states(spec);
-                let items: Vec<&[f32]> = (0..poses.len()).map(|item| scaled[item / spec.horizon].as_slice()).collect();
+                let items: Vec<&[f32]> = (0..poses.len())
+                    .map(|item| scaled[item / spec.horizon].as_slice())
+                    .collect();
                 self.places_seen(spec, &items, &motion.flatten(0, 1)?)
             }
             SceneKind::Image => self.image_seen(spec, poses.len()),

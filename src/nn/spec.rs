@@ -1,12 +1,11 @@
-//! All that determines a model's shape and its meaning, validated; the sizes that follow from it.
+//! The specification of a model: its dimensions and what its numbers mean, with validation, and the sizes that follow.
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
-
 use candle_core::{Device, Tensor};
+use serde::{Deserialize, Serialize};
 
 use super::motion::StateChannels;
 use super::sampling::ImageSize;
@@ -15,32 +14,33 @@ use crate::frame::preprocess::Preprocess;
 use crate::frame::warp::CameraModel;
 use crate::types::Channel;
 
-/// Greatest side of a frame that a model takes, in pixels.
+/// Largest width and height of a model's frames, in pixels.
 pub const MAX_MODEL_SIDE_PX: u32 = 512;
-/// Greatest period between two frames, in seconds; the least is [`MIN_FRAME_PERIOD_S`].
+/// Largest frame period, in seconds; the smallest is [`MIN_FRAME_PERIOD_S`].
 pub const MAX_FRAME_PERIOD_S: f64 = 3600.0;
-/// Least period between two frames, in seconds.
+/// Smallest frame period, in seconds.
 pub const MIN_FRAME_PERIOD_S: f64 = 1e-4;
-/// Greatest number of context frames, and of predicted frames.
+/// Largest number of context frames, and of predicted frames.
 pub const MAX_STEPS: usize = 256;
-/// Greatest number of features of a frame.
+/// Largest number of features of a frame.
 pub const MAX_FEATURES: usize = 4096;
-/// Greatest number of hidden units of an LSTM.
+/// Largest number of hidden units of an LSTM.
 pub const MAX_HIDDEN: usize = 4096;
-/// Greatest number of components of an action, and of a state.
+/// Largest number of components of an action, and of a state.
 pub const MAX_CHANNELS: usize = 64;
-/// Greatest standard deviation of the smoothing, in pixels.
+/// Largest standard deviation of the smoothing, in pixels.
 pub const MAX_BLUR_SIGMA_PX: f32 = 16.0;
-/// Greatest number of trained values of a model (1 GiB in f32).
+/// Largest number of parameters of a model (1 GiB in f32).
 pub const MAX_PARAMETERS: u64 = 1 << 28;
-/// A channel that varies less than this (in its own unit) is scaled as if it varied this much, so that a constant
-/// channel doesn't divide by zero.
+/// Smallest standard deviation used to scale a channel, in the channel's unit. It avoids division by zero for a constant
+/// channel.
 pub const MIN_CHANNEL_STD: f32 = 1e-3;
 
 macro_rules! named_enum {
     ($(#[$doc:meta])* $name:ident, $kind:literal, $known:literal, { $($(#[$vdoc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
         $(#[$doc])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+        #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
         #[serde(rename_all = "kebab-case")]
         pub enum $name {
             $($(#[$vdoc])* $variant,)+
@@ -71,13 +71,13 @@ named_enum!(
     Architecture, "architecture", "\"dense\" and \"flow\"", {
         /// The paper's: a dense codec and LSTMs.
         Dense = "dense",
-        /// Convolutions that move the last frame's pixels.
+        /// A convolutional network that moves the pixels of the last frame.
         Flow = "flow",
     }
 );
 
 impl Architecture {
-    /// The architecture that these tensors belong to, as far as their names tell.
+    /// The architecture that these tensors belong to, if their names show it.
     pub(super) fn of_tensors(tensors: &BTreeMap<String, Tensor>) -> Option<Self> {
         let has = |prefix: &str| tensors.keys().any(|name| name.starts_with(prefix));
         match (has("flow."), has("frame_encoder.")) {
@@ -86,19 +86,20 @@ impl Architecture {
             _ => None,
         }
     }
+
+    /// The architecture of specifications that name none.
+    pub(crate) fn dense() -> Self {
+        Self::Dense
+    }
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
 fn is_dense(architecture: &Architecture) -> bool {
     *architecture == Architecture::Dense
 }
 
-fn dense() -> Architecture {
-    Architecture::Dense
-}
-
 named_enum!(
-    /// The paper's two approaches to reconstruct the frames seen.
+    /// The paper's two approaches to reconstruct the context frames.
     Reconstruction, "reconstruction", "\"sequence\" and \"stepwise\"", {
         /// Encodes the whole sequence, then decodes it (approach 1).
         Sequence = "sequence",
@@ -108,33 +109,36 @@ named_enum!(
 );
 
 named_enum!(
-    /// What the prediction is conditioned on, besides the frames seen.
-    Conditioning, "conditioning", "\"none\", \"action\" and \"state-action\"", {
-        /// Nothing.
+    /// The inputs of a prediction besides the context frames.
+    Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
+        /// No further inputs.
         None = "none",
         /// The action that leads to each predicted frame.
         Action = "action",
-        /// The action that leads to each predicted frame, and the state at the last frame seen.
+        /// The state at the last context frame.
+        State = "state",
+        /// The action that leads to each predicted frame, and the state at the last context frame.
         StateAction = "state-action",
     }
 );
 
-/// One component of an action or a state, and the scale by which it enters the network: (value − mean) / std.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// One component of an action or a state, and how it is scaled for the network: (value − mean) / std.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ChannelScale {
-    /// What the component is, for example `linear`.
+    /// The component's name, for example `linear`.
     pub name: String,
-    /// Its unit, for example `m/s`; empty where it has none.
+    /// Its unit, for example `m/s`; empty if it has none.
     pub unit: String,
     /// Mean over the training data, in that unit.
     pub mean: f32,
-    /// Standard deviation over the training data, in that unit; taken as [`MIN_CHANNEL_STD`] where less.
+    /// Standard deviation over the training data, in that unit; at least [`MIN_CHANNEL_STD`] is used.
     pub std: f32,
 }
 
 impl ChannelScale {
-    /// The value as it enters the network: (value − mean) / std.
+    /// The value scaled for the network: (value − mean) / std.
     #[must_use]
     pub fn scaled(&self, value: f32) -> f32 {
         (value - self.mean) / self.std.max(MIN_CHANNEL_STD)
@@ -147,41 +151,42 @@ impl fmt::Display for ChannelScale {
     }
 }
 
-/// All dimensions of a model, and what its numbers mean.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// All dimensions of a model, and the meaning of its inputs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpec {
     /// The kind of network.
-    #[serde(default = "dense", skip_serializing_if = "is_dense")]
+    #[serde(default = "Architecture::dense", skip_serializing_if = "is_dense")]
     pub architecture: Architecture,
     /// Width of a frame in pixels.
     pub frame_width_px: u32,
     /// Height of a frame in pixels.
     pub frame_height_px: u32,
-    /// Time from one frame to the next in seconds.
+    /// Seconds from one frame to the next.
     pub frame_period_s: f64,
-    /// How frames enter the model's space.
+    /// How frames are converted to the model's value range.
     pub preprocess: Preprocess,
-    /// Frames seen before the prediction starts.
+    /// Number of context frames.
     pub context: usize,
-    /// Frames predicted.
+    /// Number of predicted frames.
     pub horizon: usize,
-    /// Features of a frame, F; of no meaning for the flow network.
+    /// Features of a frame, F; not used by the flow network.
     pub features: usize,
-    /// Hidden units of each LSTM, H; of no meaning for the flow network.
+    /// Hidden units of each LSTM, H; not used by the flow network.
     pub hidden: usize,
-    /// How the frames seen are reconstructed.
+    /// How the context frames are reconstructed.
     pub reconstruction: Reconstruction,
-    /// What the prediction is conditioned on.
+    /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
-    /// Components of an action of the data it was trained on; taken only where `conditioning` names actions.
+    /// Components of an action in the training data; used only if `conditioning` includes actions.
     pub actions: Vec<ChannelScale>,
-    /// Components of a state of that data; taken only where `conditioning` names states.
+    /// Components of a state in the training data; used only if `conditioning` includes the state.
     pub states: Vec<ChannelScale>,
-    /// Sizes of the flow network; absent for the dense one.
+    /// Layer sizes of the flow network; absent for the dense network.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flow: Option<FlowLayers>,
-    /// How the camera projects, where that is known. Only the flow network uses it.
+    /// The camera model, if it is known. Only the flow network uses it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraModel>,
 }
@@ -209,7 +214,7 @@ impl Default for ModelSpec {
 }
 
 impl ModelSpec {
-    /// Checks every field against its bound. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`.
+    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`, `Camera`, `FrameSides`.
     pub fn validate(&self) -> Result<(), NnError> {
         let side = f64::from(MAX_MODEL_SIDE_PX);
         in_range("frame_width_px", f64::from(self.frame_width_px), 1.0, side)?;
@@ -276,7 +281,8 @@ impl ModelSpec {
         self.frame_width_px as usize * self.frame_height_px as usize
     }
 
-    /// Numbers that the model keeps of each frame: the dense network's features, or the pixels for the flow network.
+    /// Number of values that the model keeps of each frame: the features for the dense network, the pixels for the flow
+    /// network.
     #[must_use]
     pub fn code_len(&self) -> usize {
         match self.architecture {
@@ -285,7 +291,7 @@ impl ModelSpec {
         }
     }
 
-    /// Sizes of the flow network, the default ones where none are given.
+    /// Layer sizes of the flow network; the defaults if none are given.
     #[must_use]
     pub fn flow_layers(&self) -> FlowLayers {
         self.flow.unwrap_or_default()
@@ -300,7 +306,7 @@ impl ModelSpec {
     }
 
     /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left
-    /// `[B, T, 3]`, in radians and metres. `None` if the model takes no state or that holds no pose.
+    /// `[B, T, 3]`, in radians and metres. `None` if the model gets no state or the state has no pose.
     pub fn measured_motion(&self, state: &Tensor, later: &Tensor) -> Result<Option<Tensor>, NnError> {
         let channels = StateChannels::of(self);
         if channels.pose.is_none() {
@@ -318,21 +324,21 @@ impl ModelSpec {
         Ok(Some(Tensor::from_vec(motions, (batch, time, 3), &Device::Cpu)?))
     }
 
-    /// A state as it enters the network.
+    /// The state scaled for the network.
     pub(super) fn scaled_state(&self, state: &[f32]) -> Vec<f32> {
         state.iter().zip(&self.states).map(|(value, channel)| channel.scaled(*value)).collect()
     }
 
-    /// Components of an action that enter the predictor; `None` if the conditioning ignores actions.
+    /// Number of action components that the predictor gets; `None` if the conditioning does not include actions.
     #[must_use]
     pub fn action_inputs(&self) -> Option<usize> {
-        (self.conditioning != Conditioning::None).then_some(self.actions.len())
+        matches!(self.conditioning, Conditioning::Action | Conditioning::StateAction).then_some(self.actions.len())
     }
 
-    /// Components of a state that enter the predictor; `None` if the conditioning ignores states.
+    /// Number of state components that the predictor gets; `None` if the conditioning does not include the state.
     #[must_use]
     pub fn state_inputs(&self) -> Option<usize> {
-        (self.conditioning == Conditioning::StateAction).then_some(self.states.len())
+        matches!(self.conditioning, Conditioning::State | Conditioning::StateAction).then_some(self.states.len())
     }
 
     /// Inputs of the predictor's LSTM: features, then the action, then the state.
@@ -341,7 +347,7 @@ impl ModelSpec {
         self.features + self.action_inputs().unwrap_or(0) + self.state_inputs().unwrap_or(0)
     }
 
-    /// Inputs of the reconstructor's LSTM: its own output fed back (approach 1), or the encoder's output (approach 2).
+    /// Inputs of the reconstructor's LSTM: its own previous output (approach 1), or the encoder's output (approach 2).
     #[must_use]
     pub fn reconstructor_inputs(&self) -> usize {
         match self.reconstruction {
@@ -382,22 +388,22 @@ impl ModelSpec {
         shapes
     }
 
-    /// Number of trained values, the reconstructor's among them.
+    /// Number of parameters, including the reconstructor's.
     #[must_use]
     pub fn parameter_count(&self) -> u64 {
         self.tensor_shapes()
             .values()
-            .map(|shape| shape.iter().map(|&side| side as u64).product::<u64>())
+            .map(|shape| shape.iter().map(|&size| size as u64).product::<u64>())
             .sum()
     }
 
-    /// Multiply–adds of weights (biases and the gates' own products apart) per predicted frame, with the context's
-    /// encoding spread over the frames predicted, rounded up:
+    /// Multiply–add operations with weights per predicted frame, rounded up. Biases and the products inside the gates are
+    /// not counted. The cost of encoding the context is divided by the horizon:
     ///
     /// `(context · (P·F + L(F)) + horizon · (L(F+A+S) + H·F + F·P)) / horizon`, `L(D) = 4H·(D + H) + 3H`.
     ///
-    /// A session that keeps the encoder's state does less; the reconstructor has no part in a prediction. For the flow
-    /// network, the products of all its layers with weights.
+    /// A session keeps the features of earlier frames, so it computes less. The reconstructor is not used in a prediction.
+    /// For the flow network, the products of all layers with their weights are counted.
     #[must_use]
     pub fn multiply_adds_per_frame(&self) -> u64 {
         if self.architecture == Architecture::Flow {
@@ -406,13 +412,13 @@ impl ModelSpec {
         let (context, horizon) = (self.context as u64, self.horizon.max(1) as u64);
         let (pixels, features, hidden) = (self.pixels() as u64, self.features as u64, self.hidden as u64);
         let lstm = |inputs: u64| 4 * hidden * (inputs + hidden) + 3 * hidden;
-        let seen = context * (pixels * features + lstm(features));
-        let predicted = lstm(self.predictor_inputs() as u64) + hidden * features + features * pixels;
-        seen.div_ceil(horizon) + predicted
+        let encoding = context * (pixels * features + lstm(features));
+        let prediction = lstm(self.predictor_inputs() as u64) + hidden * features + features * pixels;
+        encoding.div_ceil(horizon) + prediction
     }
 }
 
-/// Refuses a value outside its bounds, NaN with it.
+/// Errors: `OutOfRange` if the value is NaN or not in the range.
 pub(super) fn in_range(field: &'static str, value: f64, min: f64, max: f64) -> Result<(), NnError> {
     if (min..=max).contains(&value) {
         return Ok(());

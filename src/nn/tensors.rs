@@ -1,5 +1,5 @@
-//! Between tensors and plain slices, for the operations of our own.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Converts between tensors and plain slices, for the fused operations of this crate.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, Device, Layout, Result, Storage, Tensor, bail};
@@ -8,7 +8,7 @@ use candle_core::{CpuStorage, Device, Layout, Result, Storage, Tensor, bail};
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     match (storage, layout.contiguous_offsets()) {
         (CpuStorage::F32(values), Some((from, to))) => Ok(&values[from..to]),
-        _ => bail!("a fused operation takes contiguous f32 tensors"),
+        _ => bail!("a fused operation needs contiguous f32 tensors"),
     }
 }
 
@@ -18,17 +18,17 @@ pub(crate) fn with_values<T>(tensor: &Tensor, read: impl FnOnce(&[f32]) -> T) ->
     let (storage, layout) = tensor.storage_and_layout();
     match &*storage {
         Storage::Cpu(storage) => Ok(read(slice(storage, layout)?)),
-        _ => bail!("a fused operation takes tensors on the CPU"),
+        _ => bail!("a fused operation needs tensors on the CPU"),
     }
 }
 
-/// A [rows, columns] tensor of those values.
+/// A tensor `[rows, columns]` with these values.
 pub(super) fn matrix(values: Vec<f32>, columns: usize) -> Result<Tensor> {
     let rows = values.len() / columns;
     Tensor::from_vec(values, (rows, columns), &Device::Cpu)
 }
 
-/// Sums of the columns of values [N, `sums.len()`], added to `sums`.
+/// Adds the column sums of `values` `[N, sums.len()]` to `sums`.
 #[inline(always)]
 pub(super) fn add_columns(sums: &mut [f32], values: &[f32]) {
     for row in values.chunks_exact(sums.len()) {

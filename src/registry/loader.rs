@@ -1,5 +1,5 @@
-//! From files to a model: hash, names and shapes are checked before anything is built. Any program that reads
-//! safetensors can load the same file; `models/README.md` lists the tensors.
+//! Loads a model from its files. Hash, tensor names and shapes are checked before the model is built. Other programs that
+//! read safetensors can load the same file; `models/README.md` lists the tensors.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -12,15 +12,15 @@ use super::{RegistryError, WEIGHTS_FILE};
 use crate::files::sha256_hex;
 use crate::nn::{Model, NnError, Parameters};
 
-/// The largest weights' file that is read, in bytes.
+/// The largest weights file that is accepted, in bytes.
 const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
 
-/// A model that is ready to predict, with its description.
+/// A loaded model with its manifest.
 #[derive(Clone)]
 pub struct LoadedModel {
-    /// What it is.
+    /// The model's description.
     pub manifest: Arc<Manifest>,
-    /// What predicts.
+    /// The network, ready to predict.
     pub model: Model,
 }
 
@@ -28,18 +28,18 @@ pub struct LoadedModel {
 pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     let manifest = manifest::read(model_dir)?;
     let path = model_dir.join(WEIGHTS_FILE);
-    let unread = |source| RegistryError::Io {
+    let read_failed = |source| RegistryError::Io {
         action: "read",
         path: path.clone(),
         source,
     };
-    let size = std::fs::metadata(&path).map_err(unread)?.len();
+    let size = std::fs::metadata(&path).map_err(read_failed)?.len();
     if size > MAX_WEIGHTS_BYTES {
-        return Err(unread(std::io::Error::other(format!(
-            "{size} bytes, over the limit of {MAX_WEIGHTS_BYTES}"
+        return Err(read_failed(std::io::Error::other(format!(
+            "the file has {size} bytes; at most {MAX_WEIGHTS_BYTES} are allowed"
         ))));
     }
-    let bytes = std::fs::read(&path).map_err(unread)?;
+    let bytes = std::fs::read(&path).map_err(read_failed)?;
     let found = sha256_hex(&bytes);
     if found != manifest.weights_sha256 {
         return Err(RegistryError::Hash {
@@ -53,19 +53,32 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
             path: path.clone(),
             source,
         })?;
-    let misfit = |source| RegistryError::Weights {
+    let wrong_weights = |source| RegistryError::Weights {
         path: path.clone(),
         source,
     };
-    let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(misfit)?;
-    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(misfit)?;
+    let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(wrong_weights)?;
+    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(wrong_weights)?;
     Ok(LoadedModel {
         manifest: Arc::new(manifest),
         model,
     })
 }
 
-/// The parameters as a safetensors file of half-precision numbers, tensors sorted by name.
+/// As [`load`], under another name than the manifest's. Errors: as [`load`].
+pub fn load_as(model_dir: &Path, name: &str) -> Result<LoadedModel, RegistryError> {
+    let loaded = load(model_dir)?;
+    let manifest = Manifest {
+        name: name.to_owned(),
+        ..(*loaded.manifest).clone()
+    };
+    Ok(LoadedModel {
+        manifest: Arc::new(manifest),
+        model: loaded.model,
+    })
+}
+
+/// The parameters as the bytes of a safetensors file, in half precision, sorted by name.
 pub(super) fn serialize_f16(parameters: &Parameters) -> Result<Vec<u8>, NnError> {
     let halves = parameters
         .snapshot()?

@@ -1,4 +1,4 @@
-//! What a trained model says of itself.
+//! The manifest: the description of a trained model.
 
 use std::path::Path;
 
@@ -8,40 +8,40 @@ use super::{MANIFEST_FILE, RegistryError};
 use crate::nn::ModelSpec;
 use crate::types::Seed;
 
-/// The largest manifest that is read, in bytes.
+/// The largest manifest that is accepted, in bytes.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 
-/// A model's description: what it takes and gives, where it comes from, how good it was.
+/// A model's description: its inputs and outputs, its origin and its scores.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// The model's name.
     pub name: String,
-    /// Counts the publications of this name, from 1.
+    /// The version of this model name, counted from 1.
     pub version: u32,
-    /// Dimensions, units, preprocessing.
+    /// Dimensions, channels and preprocessing.
     pub spec: ModelSpec,
-    /// SHA-256 of the weights' file, hexadecimal; filled in when published.
+    /// SHA-256 of the weights file in hexadecimal; filled in when the model is published.
     pub weights_sha256: String,
-    /// What it was trained on.
+    /// The data set of the training.
     pub dataset: DatasetStamp,
-    /// The seed of its training.
+    /// The seed of the training.
     pub seed: Seed,
-    /// The command line that made it.
+    /// The command line of the training.
     pub command: String,
-    /// The whole training configuration.
+    /// The complete training configuration.
     pub training: serde_json::Value,
-    /// Scores, by name: of validation when trained, of the test sets once evaluated.
+    /// Scores by name: of the validation split after training, of the test splits after an evaluation.
     pub metrics: serde_json::Value,
-    /// Trained numbers.
+    /// Number of trained parameters.
     pub parameters: u64,
-    /// Multiply–adds to predict one frame, the context's encoding shared out.
+    /// Multiply–add operations per predicted frame. The cost of encoding the context is divided by the horizon.
     pub multiply_adds_per_frame: u64,
     /// The program that trained it.
     pub program: ProgramStamp,
 }
 
-/// The data set that a model was trained on.
+/// The data set on which a model was trained.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetStamp {
@@ -49,26 +49,26 @@ pub struct DatasetStamp {
     pub name: String,
     /// SHA-256 of its content.
     pub content_hash: String,
-    /// The scenario that was simulated, if one was.
+    /// The simulated scenario; none for recordings.
     pub scenario: Option<String>,
-    /// Windows trained on.
+    /// Number of training windows.
     pub windows: usize,
-    /// The seed of the split into training, validation and test.
+    /// The seed of the split into training, validation and test parts.
     pub split_seed: Seed,
 }
 
-/// Which program wrote a file.
+/// Version of the program that wrote a file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProgramStamp {
     /// Its version.
     pub version: String,
-    /// The commit that it was built from, where known.
+    /// The Git commit from which it was built, if known.
     pub git_commit: Option<String>,
 }
 
 impl ProgramStamp {
-    /// This program.
+    /// The version of this program.
     #[must_use]
     pub fn current() -> Self {
         let commit = env!("GIT_COMMIT_AT_BUILD");
@@ -89,7 +89,9 @@ pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
     };
     let size = std::fs::metadata(&path).map_err(failed)?.len();
     if size > MAX_MANIFEST_BYTES {
-        let source = std::io::Error::other(format!("{size} bytes, over the limit of {MAX_MANIFEST_BYTES}"));
+        let source = std::io::Error::other(format!(
+            "the file has {size} bytes; at most {MAX_MANIFEST_BYTES} are allowed"
+        ));
         return Err(RegistryError::Io {
             action: "read",
             path,

@@ -1,4 +1,4 @@
-//! The server's bounds. Every one is checked before the server starts and has a test that is refused by it.
+//! The settings of the server. Every bound is checked before the server starts, and has a test that exceeds it.
 
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
@@ -6,93 +6,119 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::ServerError;
 use crate::jobs::JobLimits;
+use crate::jobs::child::JobProcess;
 use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
+
+/// A setting out of range.
+#[derive(Debug, thiserror::Error)]
+#[error("{field} is {value}; it must be {least} to {most}")]
+pub struct SettingError {
+    /// The setting.
+    pub field: &'static str,
+    /// Its value.
+    pub value: u64,
+    /// The least it may be.
+    pub least: u64,
+    /// The most it may be.
+    pub most: u64,
+}
 
 /// All settings of the server, with their defaults.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default)]
 pub struct ServerConfig {
-    /// Where jobs write: `datasets`, `runs`, `reports` and `models` below it.
+    /// Where jobs write: in its folders `datasets`, `runs`, `reports` and `models`.
     #[schema(value_type = String)]
     pub data_dir: PathBuf,
-    /// The directory of the models that are served without having been published by a job.
+    /// The directory of the models that were not published by a job of this server.
     #[schema(value_type = String)]
     pub models_dir: PathBuf,
-    /// `sqlite:FILE` or `postgres://…`; a file in the data directory where it is not given.
+    /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
     pub database_url: Option<String>,
-    /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share; the data directory where it is not
-    /// given.
+    /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share. Default: the data directory.
     pub objects_url: Option<String>,
-    /// Whether this process only takes jobs, and leaves them to workers.
+    /// If true, this server accepts jobs but leaves the work to workers.
     pub no_jobs: bool,
-    /// Bytes of a request's body, and of a message on a socket, at most.
+    /// Maximum size of a request body and of a message of a stream, in bytes.
     pub max_body_bytes: usize,
-    /// Bytes of a request for a job at most.
+    /// Maximum size of the request body of a job, in bytes.
     pub max_job_bytes: usize,
-    /// Images in one request at most.
+    /// Maximum number of images in one request.
     pub max_frames: usize,
-    /// Predictions that may wait; more are answered 503.
+    /// Maximum number of predictions that wait; more are refused with 503.
     pub max_queued_predictions: usize,
-    /// Futures predicted together at most; of one request a quarter of that.
+    /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch.
     pub max_batch: usize,
-    /// Connections at a time; more are answered 503 and closed.
+    /// Maximum number of connections; more are refused with 503 and closed.
     pub max_connections: usize,
-    /// Streams at a time; more are answered 503.
+    /// Maximum number of streams; more are refused with 503.
     pub max_streams: usize,
-    /// Simulated environments at a time; more are answered 503.
+    /// Maximum number of simulated environments; see `environment_evict_ms`.
     pub max_environments: usize,
-    /// Sessions at a time; more are answered 503.
+    /// Maximum number of sessions; more are refused with 503.
     pub max_sessions: usize,
-    /// Frames of a stream that are read before those before them are answered; more are read later.
+    /// Maximum number of frames of a stream that are read before the earlier ones are answered; more are read later.
     pub max_pipelined_frames: usize,
-    /// Bytes of answers that wait for a slow reader of a stream; beyond them the oldest predictions are dropped.
+    /// Maximum size of the messages that wait for a slow reader of a stream, in bytes. Beyond it, the oldest predictions
+    /// are dropped.
     pub max_stream_buffer_bytes: usize,
-    /// Candidates in one request for rollouts at most.
+    /// Maximum number of plans in one rollout request.
     pub max_candidates: usize,
-    /// Bytes of predicted images, unencoded, that one request for rollouts may ask for.
+    /// Maximum size of the predicted images of one rollout request, in bytes before encoding.
     pub max_rollout_bytes: usize,
-    /// Jobs that may wait; more are answered 503.
+    /// Maximum number of jobs that wait; more are refused with 503.
     pub max_queued_jobs: usize,
-    /// Ended jobs that are remembered.
+    /// Maximum number of ended jobs in the list; older ones are removed.
     pub max_ended_jobs: usize,
-    /// Lines of a job's log that are kept.
+    /// Maximum number of lines of a job's log; older ones are removed.
     pub max_job_log_lines: usize,
-    /// Threads that the work of jobs may use.
+    /// Number of threads for jobs.
     pub job_threads: usize,
-    /// Threads that decode and encode images, simulate and read files for requests; more such work waits.
+    /// Number of threads that decode and encode images, simulate and read files for requests; more such work waits.
     pub request_threads: usize,
-    /// How long a process that works on a job may be silent before others take it, in milliseconds.
+    /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
+    pub job_memory_mb: u64,
+    /// After this many attempts in a row that ended abnormally without progress, a job fails.
+    pub job_max_attempts: u32,
+    /// How long one attempt of a job can run, in seconds; 0 for no limit.
+    pub job_time_limit_s: u64,
+    /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
+    #[serde(skip)]
+    pub job_program: Option<PathBuf>,
+    /// How long a lease of a job lasts without renewal, in milliseconds. After that, another process can claim the job.
     pub job_lease_ms: u64,
-    /// How long a prediction may take, queue and all, in milliseconds.
+    /// How long a prediction may take, including its time in the queue, in milliseconds.
     pub prediction_deadline_ms: u64,
     /// How long a request may take to arrive and be answered, in milliseconds.
     pub request_deadline_ms: u64,
     /// How long an environment is kept that nobody steps, in milliseconds.
     pub environment_idle_ms: u64,
-    /// How long a stream may be silent, in milliseconds.
+    /// At the limit of environments, a new one replaces the one that was idle the longest, if that was idle for at least
+    /// this time, in milliseconds.
+    pub environment_evict_ms: u64,
+    /// How long a stream may be idle, in milliseconds.
     pub stream_idle_ms: u64,
     /// How long a client may take to read a message of its stream, in milliseconds.
     pub stream_send_ms: u64,
-    /// Bytes of a request's head at most; more are answered 431.
+    /// Maximum size of a request's head, in bytes; a longer one is refused with 431.
     pub max_header_bytes: usize,
-    /// How long a request's head may take to arrive, from the connection's opening or the answer before it: so also how
-    /// long a connection may be idle, in milliseconds.
+    /// How long a request's head may take to arrive, counted from the start of the connection or from the previous
+    /// response, in milliseconds. So this is also how long a connection may be idle.
     pub header_read_ms: u64,
-    /// How long a client may read nothing of what is written to it, in milliseconds.
+    /// How long a client may read nothing while a response is written to it, in milliseconds.
     pub write_stall_ms: u64,
-    /// How long the server, told to stop, goes on taking requests while `/readyz` says 503, in milliseconds.
+    /// How long the server drains: it accepts requests while `/readyz` answers 503, in milliseconds.
     pub drain_ms: u64,
-    /// How long a session is kept when no stream is open and nobody uses it, in milliseconds.
+    /// How long a session is kept without an open stream and without use, in milliseconds.
     pub session_grace_ms: u64,
-    /// How long stopping may take, draining and all, in milliseconds.
+    /// How long stopping may take, including draining, in milliseconds.
     pub shutdown_deadline_ms: u64,
-    /// How often keys are read: how long a revoked one may still be taken, in milliseconds.
+    /// How often the API keys are read, in milliseconds. A revoked key may be valid for that long.
     pub key_refresh_ms: u64,
-    /// Origins of other pages whose scripts may call this server, for example `https://robots.example`. Where no key is
-    /// asked for, the hosts in them are also the only names with a dot that the server answers to.
+    /// Origins of other web pages that may call this server, for example `https://robots.example`. If authentication is
+    /// off, their hosts are also the only names with a dot that the server answers to.
     pub cors_origins: Vec<String>,
 }
 
@@ -125,10 +151,15 @@ impl Default for ServerConfig {
             max_job_log_lines: 1000,
             job_threads: spare_cores(),
             request_threads: 4,
+            job_memory_mb: crate::jobs::memory::default_limit_mb(),
+            job_max_attempts: 3,
+            job_time_limit_s: 0,
+            job_program: None,
             job_lease_ms: 30_000,
             prediction_deadline_ms: 10_000,
             request_deadline_ms: 30_000,
             environment_idle_ms: 600_000,
+            environment_evict_ms: 5_000,
             stream_idle_ms: 60_000,
             stream_send_ms: 10_000,
             max_header_bytes: 32 << 10,
@@ -143,7 +174,7 @@ impl Default for ServerConfig {
     }
 }
 
-/// One core less than there are, which is left to predictions, but one at least.
+/// All cores but one, which is left for predictions; at least one.
 fn spare_cores() -> usize {
     std::thread::available_parallelism().map_or(1, |cores| (cores.get() - 1).max(1))
 }
@@ -152,10 +183,10 @@ fn spare_cores() -> usize {
 const MAX_DEADLINE_MS: u64 = 86_400_000;
 
 impl ServerConfig {
-    /// Errors: `Config`, which names the field and its range.
-    pub fn validate(&self) -> Result<(), ServerError> {
+    /// Errors: a setting is out of its range.
+    pub fn validate(&self) -> Result<(), SettingError> {
         self.out_of_bounds().map_or(Ok(()), |(field, value, range)| {
-            Err(ServerError::Config {
+            Err(SettingError {
                 field,
                 value,
                 least: *range.start(),
@@ -203,11 +234,15 @@ impl ServerConfig {
             ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
             ("job_threads", self.job_threads as u64, 1..=1024),
             ("request_threads", self.request_threads as u64, 1..=1024),
+            ("job_memory_mb", self.job_memory_mb, 0..=1 << 30),
+            ("job_max_attempts", u64::from(self.job_max_attempts), 1..=1_000_000),
+            ("job_time_limit_s", self.job_time_limit_s, 0..=100_000_000),
             ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
             ("max_header_bytes", self.max_header_bytes as u64, 8192..=1 << 20),
             ("prediction_deadline_ms", self.prediction_deadline_ms, deadline.clone()),
             ("request_deadline_ms", self.request_deadline_ms, deadline.clone()),
             ("environment_idle_ms", self.environment_idle_ms, deadline.clone()),
+            ("environment_evict_ms", self.environment_evict_ms, 0..=MAX_DEADLINE_MS),
             ("stream_idle_ms", self.stream_idle_ms, deadline.clone()),
             ("stream_send_ms", self.stream_send_ms, deadline.clone()),
             ("session_grace_ms", self.session_grace_ms, deadline.clone()),
@@ -219,7 +254,7 @@ impl ServerConfig {
         ]
     }
 
-    pub(super) fn predictor(&self) -> PredictorConfig {
+    pub(in crate::server) fn predictor(&self) -> PredictorConfig {
         PredictorConfig {
             queue_capacity: self.max_queued_predictions,
             batch_limit: self.max_batch,
@@ -235,11 +270,25 @@ impl ServerConfig {
             ended: self.max_ended_jobs,
             log_lines: self.max_job_log_lines,
             threads: self.job_threads,
+            max_attempts: self.job_max_attempts,
+            time_limit: (self.job_time_limit_s > 0).then(|| Duration::from_secs(self.job_time_limit_s)),
             lease: Duration::from_millis(self.job_lease_ms),
         }
     }
 
-    /// Where state is kept.
+    /// How to run jobs in child processes, if `job_program` is set.
+    #[must_use]
+    pub fn job_process(&self) -> Option<JobProcess> {
+        Some(JobProcess {
+            program: self.job_program.clone()?,
+            store: self.store(),
+            models_dir: self.models_dir.clone(),
+            threads: self.job_threads,
+            memory_mb: self.job_memory_mb,
+        })
+    }
+
+    /// Where metadata and files are kept.
     #[must_use]
     pub fn store(&self) -> StoreConfig {
         StoreConfig {
@@ -289,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn requests_or_jobs_without_threads_or_room_or_with_a_lease_that_runs_out_at_once_are_refused() {
+    fn bounds_of_jobs_and_threads_are_checked() {
         let roomless = ServerConfig {
             max_job_bytes: 0,
             ..ServerConfig::default()

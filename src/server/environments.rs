@@ -1,266 +1,161 @@
-//! The simulator over HTTP with Gymnasium's reset and step, for training policies and for the page at `/`.
+//! The table of simulated environments: bounded in number and in idle time. Time is an argument.
 
-mod table;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
-use axum::extract::State;
-use axum::http::{HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
+use tracing::info;
 
-use super::error::{ApiError, Problem};
-use super::extract::{Json, Path};
-use super::images::{self, ImageBytes, ImageFormat};
-use super::{App, blocking};
-use crate::nn::spec::MAX_MODEL_SIDE_PX;
-use crate::sim::{self, Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
-use crate::types::{Action, Channel, Seed, ValueError};
+use super::config::ServerConfig;
+use super::http::problem::ApiError;
+use super::token::Token;
+use crate::sim::Environment;
 
-pub(super) use table::Environments;
+/// An environment that one request at a time can step.
+pub(super) type SharedEnvironment = Arc<Mutex<Environment>>;
 
-/// What to simulate.
-#[derive(Debug, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(super) struct NewEnvironment {
-    /// `static-observer`, `moving-observer` or `crowded`.
-    scenario: Scenario,
-    /// The seed of the sequence of trials; the same seed and actions give the same frames.
-    #[serde(default)]
-    seed: u64,
-    /// Frame size and period, the camera, how long a trial lasts.
-    #[serde(default)]
-    world: WorldConfig,
+/// Why an environment is not available.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+pub(super) enum EnvironmentTableError {
+    #[error("there is no environment \"{}\"; one that nobody steps for {idle_s} s is dropped", .id.escape_default())]
+    Unknown { id: String, idle_s: u64 },
+    #[error("{0} environments are in use already; delete one, or try again later")]
+    Full(usize),
+    #[error("the system gave no random bytes: {0}")]
+    Random(getrandom::Error),
 }
 
-/// Where an episode begins.
-#[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ResetRequest {
-    /// Begins the sequence of this seed; without it the next trial of the present one begins.
-    #[serde(default)]
-    seed: Option<u64>,
-}
-
-/// What the robot does until the next frame.
-#[derive(Debug, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub(super) struct StepRequest {
-    /// In the order and units of the environment's `action`; cut to what the robot's base can do: ±0.7 m/s, ±1.92 rad/s.
-    action: Vec<f32>,
-}
-
-/// What the robot perceives.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct ObservationBody {
-    /// The camera's frame: PNG, base64.
-    frame: ImageBytes,
-    /// In the order and units of the environment's `state`.
-    state: Vec<f32>,
-}
-
-/// What is known beside the observation.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct Info {
-    /// Since the episode began, in seconds.
-    time_s: f64,
-    /// What the simulator's own driver would do next.
-    policy_action: Vec<f32>,
-    /// All that was drawn for the episode; only when it begins.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    trial: Option<TrialParameters>,
-}
-
-/// An environment at the beginning of an episode.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct EnvironmentBody {
-    /// Its id.
-    id: String,
-    /// Who moves.
-    scenario: Scenario,
-    /// Components of an action, in their order.
-    action: Vec<Channel>,
-    /// Components of a state, in their order.
-    state: Vec<Channel>,
-    /// The settings of the world.
-    world: WorldConfig,
-    /// What the robot perceives.
-    observation: ObservationBody,
-    /// What is known beside.
-    info: Info,
-}
-
-/// The beginning of an episode.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct ResetBody {
-    /// What the robot perceives.
-    observation: ObservationBody,
-    /// What is known beside.
-    info: Info,
-}
-
-/// What a step brought.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct StepBody {
-    /// What the robot perceives after it.
-    observation: ObservationBody,
-    /// 1 with the other robot in the middle of the view, 0 where it is out of it, less 1 for a collision.
-    reward: f32,
-    /// The other robot has reached its goal.
-    terminated: bool,
-    /// The episode's time is over.
-    truncated: bool,
-    /// What is known beside.
-    info: Info,
-}
-
-/// Why an environment could not do what was asked.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum EnvironmentError {
-    #[error("world: a frame of {width}×{height} px; up to {MAX_MODEL_SIDE_PX}×{MAX_MODEL_SIDE_PX} px can be had")]
-    FrameSize { width: u32, height: u32 },
-    #[error("world: {0}")]
-    World(SimError),
-    #[error("action: {0}")]
-    Value(#[from] ValueError),
-    #[error("action: {0}")]
-    StepResult(SimError),
-    #[error("the episode is over; reset the environment to begin the next")]
-    Ended,
-    #[error(transparent)]
-    Image(#[from] images::ImageError),
-}
-
-/// Begins the simulation of a robot that others can drive.
-#[utoipa::path(
-    post, path = "/v1/environments", tag = "environments", request_body = NewEnvironment,
-    responses(
-        (status = 201, description = "Simulated; the header Location names it", body = EnvironmentBody),
-        (status = 422, description = "Not a world that can be simulated; names the field", body = Problem),
-        (status = 503, description = "Too many environments", body = Problem),
-    )
-)]
-pub(super) async fn create(State(app): State<App>, Json(asked): Json<NewEnvironment>) -> Result<Response, ApiError> {
-    let (environment, body) = blocking(move || begin(&asked)).await??;
-    let id = app.environments().add(environment)?;
-    let location = HeaderValue::from_str(&format!("/v1/environments/{id}"));
-    let mut response = (StatusCode::CREATED, axum::Json(EnvironmentBody { id, ..body })).into_response();
-    if let Ok(location) = location {
-        response.headers_mut().insert(header::LOCATION, location);
+impl From<EnvironmentTableError> for ApiError {
+    fn from(error: EnvironmentTableError) -> Self {
+        let detail = error.to_string();
+        match error {
+            EnvironmentTableError::Unknown { .. } => Self::NotFound(detail),
+            EnvironmentTableError::Full(_) => Self::unavailable(detail),
+            EnvironmentTableError::Random(_) => Self::Internal(detail),
+        }
     }
-    Ok(response)
 }
 
-/// Begins the next episode.
-#[utoipa::path(
-    post, path = "/v1/environments/{id}/reset", tag = "environments", request_body = ResetRequest,
-    params(("id" = String, Path, description = "The environment's id")),
-    responses(
-        (status = 200, body = ResetBody),
-        (status = 404, description = "No such environment; those nobody steps are dropped", body = Problem),
-    )
-)]
-pub(super) async fn reset(
-    State(app): State<App>,
-    Path(id): Path<String>,
-    Json(asked): Json<ResetRequest>,
-) -> Result<axum::Json<ResetBody>, ApiError> {
-    let environment = app.environments().get(&id)?;
-    let work = move || restart(&mut table::lock(&environment), asked.seed.map(Seed));
-    Ok(axum::Json(blocking(work).await??))
+struct Entry {
+    environment: SharedEnvironment,
+    used: Instant,
 }
 
-/// Acts for one frame period.
-#[utoipa::path(
-    post, path = "/v1/environments/{id}/step", tag = "environments", request_body = StepRequest,
-    params(("id" = String, Path, description = "The environment's id")),
-    responses(
-        (status = 200, body = StepBody),
-        (status = 404, description = "No such environment; those nobody steps are dropped", body = Problem),
-        (status = 409, description = "The episode is over", body = Problem),
-        (status = 422, description = "Not an action of this environment", body = Problem),
-    )
-)]
-pub(super) async fn step(
-    State(app): State<App>,
-    Path(id): Path<String>,
-    Json(asked): Json<StepRequest>,
-) -> Result<axum::Json<StepBody>, ApiError> {
-    let environment = app.environments().get(&id)?;
-    let work = move || advance(&mut table::lock(&environment), asked.action);
-    Ok(axum::Json(blocking(work).await??))
+/// All environments, by id.
+pub(super) struct Environments {
+    limit: usize,
+    idle: Duration,
+    /// How long an environment must have been idle to be replaced when the table is full.
+    evict_after: Duration,
+    table: Mutex<BTreeMap<String, Entry>>,
 }
 
-/// Ends an environment.
-#[utoipa::path(
-    delete, path = "/v1/environments/{id}", tag = "environments",
-    params(("id" = String, Path, description = "The environment's id")),
-    responses(
-        (status = 204, description = "It is gone"),
-        (status = 404, description = "No such environment", body = Problem),
-    )
-)]
-pub(super) async fn delete(State(app): State<App>, Path(id): Path<String>) -> Result<StatusCode, ApiError> {
-    app.environments().remove(&id)?;
-    Ok(StatusCode::NO_CONTENT)
-}
-
-fn begin(asked: &NewEnvironment) -> Result<(Environment, EnvironmentBody), EnvironmentError> {
-    let (width, height) = (asked.world.frame_width_px, asked.world.frame_height_px);
-    if width.max(height) > MAX_MODEL_SIDE_PX {
-        return Err(EnvironmentError::FrameSize { width, height });
+impl Environments {
+    pub(super) fn new(config: &ServerConfig) -> Self {
+        Self {
+            limit: config.max_environments,
+            idle: Duration::from_millis(config.environment_idle_ms),
+            evict_after: Duration::from_millis(config.environment_evict_ms),
+            table: Mutex::default(),
+        }
     }
-    let mut environment = Environment::new(asked.scenario, asked.world.clone()).map_err(EnvironmentError::World)?;
-    let ResetBody { observation, info } = restart(&mut environment, Some(Seed(asked.seed)))?;
-    let body = EnvironmentBody {
-        id: String::new(),
-        scenario: asked.scenario,
-        action: sim::action_channels(),
-        state: sim::state_channels(),
-        world: asked.world.clone(),
-        observation,
-        info,
-    };
-    Ok((environment, body))
+
+    /// Adds an environment and gives its random id. If the table is full, it replaces the environment that was idle the
+    /// longest, if that was long enough. Errors: `Full`, `Random`.
+    pub(super) fn add(&self, environment: Environment, now: Instant) -> Result<String, EnvironmentTableError> {
+        let id = Token::random().map_err(EnvironmentTableError::Random)?.id();
+        let mut table = self.table(now);
+        if table.len() >= self.limit {
+            self.evict_idlest(&mut table, now)?;
+        }
+        let entry = Entry {
+            environment: Arc::new(Mutex::new(environment)),
+            used: now,
+        };
+        table.insert(id.clone(), entry);
+        Ok(id)
+    }
+
+    fn evict_idlest(&self, table: &mut BTreeMap<String, Entry>, now: Instant) -> Result<(), EnvironmentTableError> {
+        let idlest = table.iter().min_by_key(|(_, entry)| entry.used);
+        let idlest = idlest.map(|(id, entry)| (id.clone(), now.saturating_duration_since(entry.used)));
+        let (id, idle) = idlest
+            .filter(|(_, idle)| *idle >= self.evict_after)
+            .ok_or(EnvironmentTableError::Full(self.limit))?;
+        table.remove(&id);
+        info!(environment.id = %id, idle_s = idle.as_secs(), "environment replaced by a new one");
+        Ok(())
+    }
+
+    /// The environment; counts as use. Errors: `Unknown`.
+    pub(super) fn get(&self, id: &str, now: Instant) -> Result<SharedEnvironment, EnvironmentTableError> {
+        let mut table = self.table(now);
+        let entry = table.get_mut(id).ok_or_else(|| self.unknown(id))?;
+        entry.used = entry.used.max(now);
+        Ok(Arc::clone(&entry.environment))
+    }
+
+    /// Errors: `Unknown`.
+    pub(super) fn remove(&self, id: &str, now: Instant) -> Result<(), EnvironmentTableError> {
+        let removed = self.table(now).remove(id);
+        removed.map(drop).ok_or_else(|| self.unknown(id))
+    }
+
+    fn unknown(&self, id: &str) -> EnvironmentTableError {
+        EnvironmentTableError::Unknown {
+            id: id.to_owned(),
+            idle_s: self.idle.as_secs(),
+        }
+    }
+
+    /// The table without the environments that have been idle for too long.
+    fn table(&self, now: Instant) -> MutexGuard<'_, BTreeMap<String, Entry>> {
+        let mut table = self.table.lock().unwrap_or_else(PoisonError::into_inner);
+        table.retain(|_, entry| now.saturating_duration_since(entry.used) < self.idle);
+        table
+    }
 }
 
-fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, EnvironmentError> {
-    let (observation, trial) = environment.reset(seed).map_err(EnvironmentError::World)?;
-    Ok(ResetBody {
-        info: info(environment.world(), &observation, Some(trial)),
-        observation: body(observation)?,
-    })
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sim::{Scenario, WorldConfig};
 
-fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, EnvironmentError> {
-    let action = Action::try_from(action)?;
-    let StepResult {
-        observation,
-        reward,
-        terminated,
-        truncated,
-    } = environment.step(&action).map_err(|error| match error {
-        SimError::Ended => EnvironmentError::Ended,
-        other => EnvironmentError::StepResult(other),
-    })?;
-    Ok(StepBody {
-        info: info(environment.world(), &observation, None),
-        observation: body(observation)?,
-        reward,
-        terminated,
-        truncated,
-    })
-}
+    fn environment() -> Environment {
+        Environment::new(Scenario::Crowded, WorldConfig::default()).unwrap()
+    }
 
-fn body(observation: Observation) -> Result<ObservationBody, EnvironmentError> {
-    Ok(ObservationBody {
-        frame: images::encode_one(&observation.frame, ImageFormat::Png)?,
-        state: observation.state.into(),
-    })
-}
+    fn table(limit: usize) -> Environments {
+        Environments::new(&ServerConfig {
+            max_environments: limit,
+            ..ServerConfig::default()
+        })
+    }
 
-fn info(world: Option<&World>, observation: &Observation, trial: Option<TrialParameters>) -> Info {
-    Info {
-        time_s: observation.time_s,
-        policy_action: world.map_or_else(Vec::new, |world| world.policy_action().into()),
-        trial,
+    #[test]
+    fn a_full_table_replaces_the_idlest_environment() {
+        let (table, start) = (table(2), Instant::now());
+        let after = |seconds| start + Duration::from_secs(seconds);
+        let first = table.add(environment(), start).unwrap();
+        let second = table.add(environment(), start).unwrap();
+        assert!(table.get(&first, after(3)).is_ok());
+        let third = table.add(environment(), after(6)).unwrap();
+        assert!(table.get(&second, after(6)).is_err(), "it was idle for 6 s");
+        assert!(table.get(&first, after(6)).is_ok() && table.get(&third, after(6)).is_ok());
+    }
+
+    #[test]
+    fn an_environment_in_use_is_not_replaced() {
+        let (table, start) = (table(1), Instant::now());
+        table.add(environment(), start).unwrap();
+        let error = table.add(environment(), start + Duration::from_secs(2)).unwrap_err();
+        assert_eq!(error, EnvironmentTableError::Full(1));
+    }
+
+    #[test]
+    fn ids_are_long_and_random() {
+        let (table, now) = (table(2), Instant::now());
+        let ids = [(); 2].map(|()| table.add(environment(), now).unwrap());
+        assert!(ids[0] != ids[1] && ids.iter().all(|id| id.len() == 32));
     }
 }

@@ -1,16 +1,23 @@
-//! Images as they travel in messages: PNG, JPEG, or raw gray bytes; base64 in text, as they are in binary.
+//! Images in messages: PNG, JPEG or raw gray bytes; as base64 in text, as bytes in binary.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
+use super::http::problem::ApiError;
+use crate::error_text::with_causes;
+use crate::frame::fit::{Fit, fit};
 use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::serving::{InputError, check_size};
 
-/// How images are encoded, in both directions: `raw` is gray bytes, row by row, of the model's size; `jpeg` is answered by
-/// `png`, which loses nothing; `png` where nothing is said.
+/// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
+/// small body can take.
+const MAX_FIT_PIXELS: u32 = 1 << 22;
+
+/// How images are encoded, in both directions: `raw` is gray bytes, row by row, of the model's size; images sent as `jpeg`
+/// are answered with `png`, which is lossless. Default: `png`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ImageFormat {
@@ -19,13 +26,13 @@ pub enum ImageFormat {
     /// PNG.
     #[default]
     Png,
-    /// JPEG; answered by PNG, which loses nothing.
+    /// JPEG; answered with PNG, which is lossless.
     Jpeg,
 }
 
 impl ImageFormat {
     /// The format of the answer to images of this one.
-    pub(super) fn answer(self) -> Self {
+    pub(in crate::server) fn answer(self) -> Self {
         match self {
             Self::Raw => Self::Raw,
             Self::Png | Self::Jpeg => Self::Png,
@@ -33,7 +40,7 @@ impl ImageFormat {
     }
 }
 
-/// An image's bytes: base64 in text, as they are in binary messages.
+/// An image file or raw pixels: base64 in text, bytes in binary messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq, utoipa::ToSchema)]
 #[schema(value_type = String, format = Byte)]
 pub struct ImageBytes(pub Vec<u8>);
@@ -49,9 +56,9 @@ impl Serialize for ImageBytes {
 }
 
 impl<'de> Deserialize<'de> for ImageBytes {
-    /// From text as base64, from bytes as they are, whichever is there.
+    /// From base64 in text, or from bytes.
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // JSON would give a string's letters as bytes.
+        // Otherwise JSON would give the characters of a string as bytes.
         if deserializer.is_human_readable() {
             deserializer.deserialize_str(ImageVisitor)
         } else {
@@ -85,9 +92,9 @@ impl de::Visitor<'_> for ImageVisitor {
     }
 }
 
-/// Why an image was refused.
+/// Why an image was refused or could not be made.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum ImageError {
+pub(in crate::server) enum ImageError {
     #[error("{field} is {source}")]
     Decode { field: String, source: FrameError },
     #[error("{field} holds {found} raw bytes; model \"{model}\" takes {width}×{height} px, {expected} bytes")]
@@ -99,17 +106,36 @@ pub(super) enum ImageError {
         width: u32,
         height: u32,
     },
-    #[error(transparent)]
-    Size(#[from] InputError),
+    #[error("{0}; set fit to crop, letterbox or stretch to resize it")]
+    Size(InputError),
+    #[error("{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels")]
+    TooManyPixels { field: String, width: u32, height: u32 },
     #[error("an image of the answer could not be encoded")]
     Encode(#[source] FrameError),
 }
 
-/// The image in `field` as a frame of the model's size, which is checked before its pixels are decoded.
-pub(super) fn decode(
+impl From<ImageError> for ApiError {
+    fn from(error: ImageError) -> Self {
+        match error {
+            ImageError::Encode(_) => Self::Internal(with_causes(&error)),
+            _ => Self::Unprocessable(error.to_string()),
+        }
+    }
+}
+
+/// How the images of a request or session are read.
+#[derive(Clone, Copy)]
+pub(in crate::server) struct ImageInput {
+    pub(in crate::server) format: ImageFormat,
+    /// How an image of another size becomes a frame; `None` refuses it.
+    pub(in crate::server) fit: Option<Fit>,
+}
+
+/// The image in `field` as a frame of the model's size. The size is checked before pixels are decoded.
+pub(in crate::server) fn decode(
     field: &str,
     ImageBytes(bytes): ImageBytes,
-    format: ImageFormat,
+    input: ImageInput,
     manifest: &Manifest,
 ) -> Result<Frame, ImageError> {
     let decode_error = |source| ImageError::Decode {
@@ -117,12 +143,20 @@ pub(super) fn decode(
         source,
     };
     let (model, spec) = (manifest.name.as_str(), &manifest.spec);
-    if format == ImageFormat::Raw {
+    if input.format == ImageFormat::Raw {
         return raw(field, bytes, model, spec);
     }
-    let size = codec::dimensions(&bytes).map_err(decode_error)?;
-    check_size(field, model, spec, size)?;
-    codec::decode(&bytes).map_err(decode_error)
+    let (width, height) = codec::dimensions(&bytes).map_err(decode_error)?;
+    let Some(way) = input.fit else {
+        check_size(field, model, spec, (width, height)).map_err(ImageError::Size)?;
+        return codec::decode(&bytes).map_err(decode_error);
+    };
+    if width.saturating_mul(height) > MAX_FIT_PIXELS {
+        let field = field.to_owned();
+        return Err(ImageError::TooManyPixels { field, width, height });
+    }
+    let frame = codec::decode(&bytes).map_err(decode_error)?;
+    fit(&frame, spec.frame_width_px, spec.frame_height_px, way).map_err(decode_error)
 }
 
 fn raw(field: &str, bytes: Vec<u8>, model: &str, spec: &ModelSpec) -> Result<Frame, ImageError> {
@@ -144,13 +178,13 @@ fn raw(field: &str, bytes: Vec<u8>, model: &str, spec: &ModelSpec) -> Result<Fra
     })
 }
 
-/// The frames in the format that answers `format`.
-pub(super) fn encode(frames: &[Frame], format: ImageFormat) -> Result<Vec<ImageBytes>, ImageError> {
+/// The frames in that format.
+pub(in crate::server) fn encode(frames: &[Frame], format: ImageFormat) -> Result<Vec<ImageBytes>, ImageError> {
     frames.iter().map(|frame| encode_one(frame, format)).collect()
 }
 
-/// A frame in that format.
-pub(super) fn encode_one(frame: &Frame, format: ImageFormat) -> Result<ImageBytes, ImageError> {
+/// The frame in that format.
+pub(in crate::server) fn encode_one(frame: &Frame, format: ImageFormat) -> Result<ImageBytes, ImageError> {
     match format {
         ImageFormat::Raw => Ok(ImageBytes(frame.pixels().to_vec())),
         ImageFormat::Png | ImageFormat::Jpeg => codec::encode_png(frame).map(ImageBytes).map_err(ImageError::Encode),

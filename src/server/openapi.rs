@@ -1,84 +1,39 @@
-//! The contract, from the code.
+//! The OpenAPI document: what all routes have in common. The routes describe themselves.
 
-use axum::extract::State;
-use axum::http::header;
-use axum::response::IntoResponse;
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use serde_json::Value;
+use utoipa::openapi::path::ParameterBuilder;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::openapi::{Content, Header, Ref, RefOr, Response, ResponseBuilder};
 use utoipa::{Modify, OpenApi};
 
-use super::{
-    App, dashboard, datasets, environments, error, events, health, jobs, metrics, models, predict, preview, rollouts,
-    sessions, stream,
-};
-
-const STREAMS: &str = include_str!("../../openapi/asyncapi.yaml");
+use super::http::problem::Problem;
 
 #[derive(OpenApi)]
 #[openapi(
     info(
         title = "Foreframe",
-        description = "Predicts the camera frames to come from frames, actions and state.",
+        description = "Predicts the next camera frames of a robot from frames, actions and state.",
         license(name = "Apache-2.0 OR MIT", identifier = "Apache-2.0 OR MIT"),
         contact()
     ),
-    paths(
-        health::livez,
-        health::readyz,
-        metrics::metrics,
-        models::list,
-        models::get,
-        models::activate,
-        models::delete,
-        predict::predict,
-        preview::preview,
-        environments::create,
-        environments::reset,
-        environments::step,
-        environments::delete,
-        rollouts::of_model,
-        stream::of_model,
-        sessions::create,
-        sessions::list,
-        sessions::get,
-        sessions::delete,
-        sessions::state,
-        rollouts::of_session,
-        stream::of_session,
-        jobs::create,
-        jobs::list,
-        jobs::get,
-        jobs::cancel,
-        jobs::resume,
-        jobs::logs,
-        jobs::metrics,
-        jobs::file,
-        events::events,
-        datasets::list,
-        datasets::get,
-        datasets::delete,
-        datasets::sheet,
-        datasets::animation,
-        openapi_json,
-        asyncapi_yaml,
-        dashboard::page,
-    ),
-    components(schemas(error::Problem)),
-    modifiers(&KeySecurity, &Problems),
+    components(schemas(Problem)),
     security((), ("key" = [])),
     tags(
         (name = "models", description = "Models and their predictions"),
         (name = "environments", description = "The simulator, with Gymnasium's reset and step"),
-        (name = "sessions", description = "Streams of frames that are remembered"),
+        (name = "sessions", description = "Sessions and their streams of frames"),
         (name = "jobs", description = "Collection, training and evaluation in the background"),
-        (name = "datasets", description = "What was collected"),
-        (name = "health", description = "Whether the server lives and is ready"),
+        (name = "datasets", description = "Collected data sets"),
+        (name = "health", description = "Whether the server is alive and ready"),
         (name = "about", description = "This contract and a page for people"),
     )
 )]
 struct Contract;
 
-/// How a request shows its key, where one is asked for; without a valid one the answer is 401.
+/// How a request sends its API key. If authentication is on, a request without a valid key gets 401.
 struct KeySecurity;
 
 impl Modify for KeySecurity {
@@ -86,7 +41,7 @@ impl Modify for KeySecurity {
         let scheme = HttpBuilder::new()
             .scheme(HttpAuthScheme::Bearer)
             .description(Some(
-                "A key of this server, as `foreframe keys create` prints it; without a valid one: 401.",
+                "An API key of this server, as `foreframe keys create` prints it. Without a valid key, the answer is 401.",
             ))
             .build();
         let components = contract.components.get_or_insert_default();
@@ -94,7 +49,7 @@ impl Modify for KeySecurity {
     }
 }
 
-/// What all refusals have in common: their media type, when to try again, and that a key may be missing.
+/// What all errors have in common: their media type, when to try again, and that an API key may be missing.
 struct Problems;
 
 impl Modify for Problems {
@@ -121,7 +76,7 @@ impl Modify for Problems {
 fn no_key() -> Response {
     let problem = Content::new(Some(Ref::from_schema_name("Problem")));
     ResponseBuilder::new()
-        .description("No valid key, where the server asks for one")
+        .description("No valid API key; only if authentication is on")
         .content("application/json", problem)
         .build()
 }
@@ -136,28 +91,64 @@ fn as_problem(status: &str, response: &mut Response) {
     }
 }
 
-/// The OpenAPI 3.1 document of the whole service, as JSON with a line break at its end.
-#[must_use]
-pub fn document() -> String {
-    let mut text = Contract::openapi().to_pretty_json().unwrap_or_default();
+/// Examples, so that the pages at `/docs` can send every request without editing. By path: a request body, and the model
+/// in the path if it is not the default one.
+const EXAMPLES: &str = include_str!("../../openapi/examples.json");
+/// The example of a model in a path.
+const EXAMPLE_MODEL: &str = "paper";
+
+#[derive(Deserialize)]
+struct PathExample {
+    model: Option<String>,
+    body: Value,
+}
+
+struct Examples;
+
+impl Modify for Examples {
+    #[expect(
+        clippy::expect_used,
+        reason = "the examples are part of the program, and a test sends each"
+    )]
+    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
+        let mut examples: BTreeMap<String, PathExample> =
+            serde_json::from_str(EXAMPLES).expect("examples that are not JSON are a bug");
+        for (path, item) in &mut contract.paths.paths {
+            let example = examples.remove(path);
+            let model = example.as_ref().and_then(|example| example.model.as_deref());
+            let operations = [&mut item.get, &mut item.post, &mut item.delete];
+            for operation in operations.into_iter().flatten() {
+                for parameter in operation.parameters.iter_mut().flatten() {
+                    if let RefOr::T(parameter) = parameter
+                        && parameter.name == "model"
+                    {
+                        let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
+                        *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
+                    }
+                }
+                if let (Some(RefOr::T(body)), Some(example)) = (&mut operation.request_body, &example)
+                    && let Some(RefOr::T(content)) = body.content.get_mut("application/json")
+                {
+                    content.example = Some(example.body.clone());
+                }
+            }
+        }
+        assert!(examples.is_empty(), "an example without a path is a bug");
+    }
+}
+
+/// The contract without its paths.
+pub(super) fn frame() -> utoipa::openapi::OpenApi {
+    Contract::openapi()
+}
+
+/// The contract with its paths, completed with what all paths have in common, as JSON with a line break at its end.
+#[expect(clippy::expect_used, reason = "the document is made of texts and maps")]
+pub(super) fn text(mut contract: utoipa::openapi::OpenApi) -> String {
+    KeySecurity.modify(&mut contract);
+    Problems.modify(&mut contract);
+    Examples.modify(&mut contract);
+    let mut text = contract.to_pretty_json().expect("a contract that is not JSON is a bug");
     text.push('\n');
     text
-}
-
-/// This contract.
-#[utoipa::path(
-    get, path = "/openapi.json", tag = "about",
-    responses((status = 200, description = "OpenAPI 3.1", content_type = "application/json"))
-)]
-pub(super) async fn openapi_json(State(app): State<App>) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, "application/json")], app.contract().to_owned())
-}
-
-/// The contract of the streams: their messages with examples.
-#[utoipa::path(
-    get, path = "/asyncapi.yaml", tag = "about",
-    responses((status = 200, description = "AsyncAPI 3.0", content_type = "application/yaml"))
-)]
-pub(super) async fn asyncapi_yaml() -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, "application/yaml")], STREAMS)
 }

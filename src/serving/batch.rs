@@ -1,33 +1,33 @@
-//! Who joins the next batch: a pure function of what waits, the time and the limit.
+//! Chooses the tasks of the next batch: a pure function of the waiting tasks, the time and the limit.
 
 use std::time::Instant;
 
-/// What the policy knows of a waiting task.
+/// A waiting task, as far as batching needs to know it.
 #[derive(Clone, Copy, Debug)]
 pub struct Candidate {
-    /// The version of a model that it asks for; equal if and only if it is the same.
+    /// Identifies the model version: equal numbers mean the same version.
     pub model: usize,
     /// The session that it is a step of.
     pub session: Option<u64>,
-    /// Futures that it asks for, or 1.
+    /// Number of rollouts that it asks for, at least 1.
     pub rows: usize,
-    /// Whether its client has gone.
+    /// Whether its client has disconnected.
     pub abandoned: bool,
-    /// When its answer would be too late.
+    /// After this time nobody needs the answer.
     pub deadline: Instant,
 }
 
-/// Positions in the queue, each in rising order and in at most one of the two.
+/// Positions in the queue, in rising order. No position is in both lists.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct BatchPlan {
-    /// Those whose answer nobody waits for any more.
+    /// Tasks whose answer nobody needs any more.
     pub discard: Vec<usize>,
-    /// Those to compute now, together.
+    /// Tasks to compute now, together.
     pub batch: Vec<usize>,
 }
 
-/// The oldest task that is still wanted chooses the model. Those behind it for the same model join in order as long as the
-/// rows stay within the limit, at most one of a session; the oldest goes even if it alone is over the limit.
+/// The oldest live task chooses the model. Later tasks of the same model join in order while the rows stay within the
+/// limit, at most one task of a session. The oldest task is always included, even if it alone exceeds the limit.
 #[must_use]
 pub fn plan(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchPlan {
     let mut plan = BatchPlan::default();
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn many_futures_go_alone_and_hold_nobody_small_back() {
+    fn a_large_task_runs_alone_and_small_tasks_pass_it() {
         let rows = |rows| TaskKind { rows, ..of(0) };
         assert_eq!(planned(&[rows(100), of(0)], 8).batch, [0]);
         assert_eq!(planned(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
@@ -145,7 +145,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_batch_is_of_one_model_in_order_within_the_limit_and_holds_the_oldest(kinds in kinds(), limit in 1usize..10) {
+        fn a_batch_holds_the_oldest_task_and_others_of_its_model(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now);
             let plan = plan(&waiting, now, limit);
@@ -160,7 +160,7 @@ mod tests {
         }
 
         #[test]
-        fn of_a_session_only_its_oldest_step_is_computed(kinds in kinds(), limit in 1usize..10) {
+        fn a_batch_holds_only_the_oldest_step_of_a_session(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now);
             for &position in &plan(&waiting, now, limit).batch {

@@ -1,25 +1,31 @@
-//! The models that answer, by name. A handle to one keeps that version alive after another has taken its name.
+//! The active version of each model, by name. A handle keeps its version loaded after another version becomes active.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::ServingError;
 use crate::registry::LoadedModel;
 
+/// After so many panics in a row the predictor is not ready.
+const MAX_PANICS: u32 = 3;
+
 pub(super) struct Catalog {
     models: RwLock<BTreeMap<String, Arc<LoadedModel>>>,
     ready: AtomicBool,
+    /// Panics of the inference thread since its last batch.
+    panics: AtomicU32,
 }
 
 impl Catalog {
-    pub(super) fn of(models: Vec<LoadedModel>) -> Self {
+    pub(super) fn new(models: Vec<LoadedModel>) -> Self {
         let named = models
             .into_iter()
             .map(|model| (model.manifest.name.clone(), Arc::new(model)));
         Self {
             models: RwLock::new(named.collect()),
             ready: AtomicBool::new(false),
+            panics: AtomicU32::new(0),
         }
     }
 
@@ -37,7 +43,7 @@ impl Catalog {
         let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
         models.get(name).cloned().ok_or_else(|| ServingError::UnknownModel {
             name: name.to_owned(),
-            known: models.keys().cloned().collect(),
+            available: models.keys().cloned().collect(),
         })
     }
 
@@ -46,6 +52,14 @@ impl Catalog {
     }
 
     pub(super) fn is_ready(&self) -> bool {
-        self.ready.load(Ordering::Acquire)
+        self.ready.load(Ordering::Acquire) && self.panics.load(Ordering::Acquire) < MAX_PANICS
+    }
+
+    pub(super) fn record_panic(&self) {
+        self.panics.fetch_add(1, Ordering::AcqRel);
+    }
+
+    pub(super) fn reset_panics(&self) {
+        self.panics.store(0, Ordering::Release);
     }
 }

@@ -1,4 +1,4 @@
-//! The computation: frames to tensors, through the model, and back. Blocks; runs on the thread that owns the models.
+//! The computation: frames to tensors, through the model, and back to frames. Blocks; runs on the inference thread.
 
 use std::sync::Arc;
 
@@ -11,19 +11,19 @@ use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
 use crate::types::{Action, RobotState};
 
-/// A frame as the model keeps it, `[F]`.
+/// The features of one frame, `[F]`.
 pub type Features = Arc<[f32]>;
 
-/// Frames that are decoded together at most, so that many futures take no more memory than their pixels.
+/// How many frames are decoded together at most. This bounds the memory that many rollouts need.
 const DECODED_FRAMES: usize = 1024;
 
-/// What came of a [`Task`].
+/// The output of one [`Task`] of a batch.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct BatchOutput {
-    /// Of the task's frames, in order.
+    /// The features of the task's frames, in order.
     pub(super) features: Vec<Features>,
-    /// One for each of the task's premises, in order.
-    pub(super) futures: Vec<Vec<Frame>>,
+    /// The predicted frames, one sequence for each conditioning input of the task, in order.
+    pub(super) predictions: Vec<Vec<Frame>>,
 }
 
 /// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
@@ -36,32 +36,33 @@ pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<
     let computed = run(loaded, &tasks.iter().collect::<Vec<_>>())?;
     Ok(computed
         .into_iter()
-        .flat_map(|computation| computation.futures)
+        .flat_map(|computation| computation.predictions)
         .collect())
 }
 
-/// Computes the tasks as one batch: all new frames are encoded in one product, all futures predicted in one.
-/// Errors: `Model` if one does not fit the model, `Tensor`, `Frame`.
+/// Computes the tasks as one batch: one matrix product encodes all new frames, and one predicts all rollouts.
+/// Errors: `Model` if a task does not fit the model, `Tensor`, `Frame`.
 pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<BatchOutput>, ServingError> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
     let mut computations: Vec<BatchOutput> = tasks
         .iter()
         .map(|task| BatchOutput {
             features: encoded.by_ref().take(task.frames.len()).collect(),
-            futures: Vec::with_capacity(task.premises.len()),
+            predictions: Vec::with_capacity(task.conditioning_inputs.len()),
         })
         .collect();
     let (mut windows, mut window_of) = (Vec::new(), Vec::new());
     for (task, computation) in tasks
         .iter()
         .zip(&computations)
-        .filter(|(task, _)| !task.premises.is_empty())
+        .filter(|(task, _)| !task.conditioning_inputs.is_empty())
     {
-        window_of.extend(vec![windows.len() as u32; task.premises.len()]);
-        windows.push(task.known.iter().chain(&computation.features));
+        window_of.extend(vec![windows.len() as u32; task.conditioning_inputs.len()]);
+        windows.push(task.past_features.iter().chain(&computation.features));
     }
-    let premises: Vec<&ConditioningInput> = tasks.iter().flat_map(|task| &task.premises).collect();
-    if premises.is_empty() {
+    let conditioning_inputs: Vec<&ConditioningInput> =
+        tasks.iter().flat_map(|task| &task.conditioning_inputs).collect();
+    if conditioning_inputs.is_empty() {
         return Ok(computations);
     }
     let values = windows
@@ -70,9 +71,11 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<BatchOutp
         .map(AsRef::as_ref)
         .collect::<Vec<&[f32]>>()
         .concat();
-    let mut futures = predict_windows(loaded, values, &window_of, &premises)?.into_iter();
+    let mut predictions = predict_windows(loaded, values, &window_of, &conditioning_inputs)?.into_iter();
     for (task, computation) in tasks.iter().zip(&mut computations) {
-        computation.futures.extend(futures.by_ref().take(task.premises.len()));
+        computation
+            .predictions
+            .extend(predictions.by_ref().take(task.conditioning_inputs.len()));
     }
     Ok(computations)
 }
@@ -99,12 +102,13 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
     .map_err(tensor_error)
 }
 
-/// The futures of the premises: `values` are the windows' features, one after the other.
+/// The predicted frames for each conditioning input. `values` holds the features of all windows, one after the other;
+/// `window_of` is the index of the window of each conditioning input.
 fn predict_windows(
     loaded: &LoadedModel,
     values: Vec<f32>,
     window_of: &[u32],
-    premises: &[&ConditioningInput],
+    conditioning_inputs: &[&ConditioningInput],
 ) -> Result<Vec<Vec<Frame>>, ServingError> {
     let spec = loaded.model.spec();
     let count = values.len() / (spec.context * spec.code_len());
@@ -112,10 +116,10 @@ fn predict_windows(
         Tensor::from_vec(values, (count, spec.context, spec.code_len()), &Device::Cpu).map_err(tensor_error)?;
     let predicted = loaded
         .model
-        .predict_futures(&features, window_of, &condition(spec, premises)?)
+        .predict_futures(&features, window_of, &condition(spec, conditioning_inputs)?)
         .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
         .map_err(|source| model_error(loaded, source))?;
-    let total = premises.len() * spec.horizon;
+    let total = conditioning_inputs.len() * spec.horizon;
     let mut frames = Vec::with_capacity(total);
     for first in (0..total).step_by(DECODED_FRAMES) {
         let part = predicted
@@ -128,7 +132,7 @@ fn predict_windows(
         frames.extend(with_values(&pixels, |values| images(loaded, values)).map_err(tensor_error)??);
     }
     let mut frames = frames.into_iter();
-    Ok(premises
+    Ok(conditioning_inputs
         .iter()
         .map(|_| frames.by_ref().take(spec.horizon).collect())
         .collect())
@@ -147,15 +151,18 @@ fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingErr
     })
 }
 
-/// Actions `[N, horizon, A]` and state `[N, S]` in raw units, where the model takes them.
-fn condition(spec: &ModelSpec, premises: &[&ConditioningInput]) -> Result<ConditioningTensors, ServingError> {
-    let actions = premises
+/// Actions `[N, horizon, A]` and states `[N, S]` in physical units, if the model takes them.
+fn condition(
+    spec: &ModelSpec,
+    conditioning_inputs: &[&ConditioningInput],
+) -> Result<ConditioningTensors, ServingError> {
+    let actions = conditioning_inputs
         .iter()
-        .flat_map(|premise| &premise.actions)
+        .flat_map(|conditioning| &conditioning.actions)
         .flat_map(Action::as_slice);
-    let states = premises
+    let states = conditioning_inputs
         .iter()
-        .flat_map(|premise| &premise.state)
+        .flat_map(|conditioning| &conditioning.state)
         .flat_map(RobotState::as_slice);
     let tensor = |values: Vec<f32>, shape: &[usize]| {
         let given = !values.is_empty();
@@ -166,9 +173,12 @@ fn condition(spec: &ModelSpec, premises: &[&ConditioningInput]) -> Result<Condit
     Ok(ConditioningTensors {
         actions: tensor(
             actions.copied().collect(),
-            &[premises.len(), spec.horizon, spec.actions.len()],
+            &[conditioning_inputs.len(), spec.horizon, spec.actions.len()],
         )?,
-        state: tensor(states.copied().collect(), &[premises.len(), spec.states.len()])?,
+        state: tensor(
+            states.copied().collect(),
+            &[conditioning_inputs.len(), spec.states.len()],
+        )?,
     })
 }
 

@@ -1,14 +1,15 @@
-//! What a prediction takes, and whether it fits a model.
+//! The input of a prediction, and the check that it fits a model.
 
-use super::task::{ConditioningInput, REQUEST, RawConditioning, Task};
+use super::task::{ConditioningInput, REQUEST_FIELDS, RawConditioning, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
 
-/// What does not fit, by the name of the field.
+/// Why an input does not fit a model. Names the field.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum InputError {
-    /// Not as many frames as the model's context.
+    /// The number of frames is not the model's context.
     #[error("frames holds {found} images; model \"{model}\" takes {expected}")]
     FrameCount {
         /// The model's name.
@@ -18,7 +19,7 @@ pub enum InputError {
         /// Frames needed.
         expected: usize,
     },
-    /// A frame of another size.
+    /// A frame has another size than the model's.
     #[error("{field} is {width}×{height} px; model \"{model}\" takes {model_width}×{model_height}")]
     FrameSize {
         /// The field, with its index.
@@ -42,7 +43,7 @@ pub enum InputError {
         /// Frames given.
         frames: usize,
     },
-    /// Not as many future actions as the model's horizon.
+    /// The number of future actions is not the model's horizon.
     #[error("{field} holds {found} actions; model \"{model}\" takes {expected}")]
     FutureActionCount {
         /// The field, with its index.
@@ -54,7 +55,7 @@ pub enum InputError {
         /// Actions needed.
         expected: usize,
     },
-    /// A vector of another length.
+    /// A vector has the wrong length.
     #[error("{field} holds {found} numbers; model \"{model}\" takes {expected}: {channels}")]
     Dimension {
         /// The field, with its index.
@@ -68,13 +69,13 @@ pub enum InputError {
         /// Their names and units.
         channels: String,
     },
-    /// Candidates to tell apart, and a model that is told nothing.
-    #[error("model \"{model}\" takes no actions, so every candidate has the same future; ask for one by predict")]
+    /// Plans to compare, but the model takes no actions.
+    #[error("model \"{model}\" takes no actions, so all candidates give the same prediction; use predict instead")]
     Unconditioned {
         /// The model's name.
         model: String,
     },
-    /// The model needs it and it was not given.
+    /// A field that the model needs is missing.
     #[error("{field} is missing; model \"{model}\" takes {channels}")]
     Missing {
         /// The field.
@@ -86,22 +87,22 @@ pub enum InputError {
     },
 }
 
-/// What a prediction starts from. A model takes what its conditioning says and ignores the rest.
+/// The input of a prediction. A model uses the fields that its conditioning names and ignores the others.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PredictionInput {
     /// The context, oldest first.
     pub frames: Vec<Frame>,
-    /// Past actions, oldest first, the last one under way at the last frame; may be empty. The last one is held where
-    /// there are no future actions.
+    /// Past actions, oldest first; the last one acts from the last frame on. May be empty. Without future actions, the
+    /// last one is held.
     pub actions: Vec<Action>,
-    /// What the robot says of itself at the last frame.
+    /// The robot's state at the last frame.
     pub state: Option<RobotState>,
-    /// The actions to predict under: the first acts from the last frame to the first predicted one.
+    /// The plan: the first action acts from the last frame to the first predicted one.
     pub future_actions: Option<Vec<Action>>,
 }
 
 impl PredictionInput {
-    /// Whether the model named `model` takes this. Errors name the field, what it is and what it should be.
+    /// Checks that the input fits the model named `model`. Errors name the field, its value and the expected value.
     pub fn check(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
         self.check_frames(model, spec)?;
         if self.actions.len() > self.frames.len() {
@@ -110,7 +111,7 @@ impl PredictionInput {
                 frames: self.frames.len(),
             });
         }
-        self.premise(model, spec).map(|_| ())
+        self.conditioning(model, spec).map(|_| ())
     }
 
     pub(super) fn check_frames(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
@@ -132,28 +133,28 @@ impl PredictionInput {
         Ok(())
     }
 
-    /// What the future is predicted under. Errors name the field, what it is and what it should be.
-    pub(crate) fn premise(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
-        let told = RawConditioning {
+    /// The conditioning input of the prediction. Errors name the field, its value and the expected value.
+    pub(crate) fn conditioning(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
+        let raw = RawConditioning {
             past: &self.actions,
             future: self.future_actions.as_deref(),
             state: self.state.as_ref(),
         };
-        ConditioningInput::new(told, &REQUEST, model, spec)
+        ConditioningInput::new(raw, &REQUEST_FIELDS, model, spec)
     }
 
-    /// All of it as a task of one future. Errors: as [`PredictionInput::check`].
+    /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
     pub(crate) fn into_task(self, model: &str, spec: &ModelSpec) -> Result<Task, InputError> {
         self.check(model, spec)?;
         Ok(Task {
-            premises: vec![self.premise(model, spec)?],
+            conditioning_inputs: vec![self.conditioning(model, spec)?],
             frames: self.frames,
             ..Task::default()
         })
     }
 }
 
-/// Whether the frame in `field`, of that width and height in pixels, is of the model's size.
+/// Checks that the frame in `field` has the model's width and height in pixels.
 pub(crate) fn check_size(
     field: &str,
     model: &str,

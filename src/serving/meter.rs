@@ -1,4 +1,4 @@
-//! What the predictor measures.
+//! The predictor's metrics.
 
 use std::time::{Duration, Instant};
 
@@ -6,8 +6,8 @@ use metrics::{counter, gauge, histogram};
 
 use crate::telemetry::names;
 
-/// Notes a batch of one model: when its tasks were accepted, when its computation started, and how long that took.
-pub(super) fn computed(model: &str, accepted: &[Instant], started: Instant, compute_us: u64) {
+/// Records a batch of one model: when its tasks were accepted, when its computation started, and how long that took.
+pub(super) fn record_batch(model: &str, accepted: &[Instant], started: Instant, compute_us: u64) {
     let model = model.to_owned();
     histogram!(names::PREDICTION_COMPUTE_SECONDS, "model" => model.clone()).record(Duration::from_micros(compute_us));
     histogram!(names::PREDICTION_BATCH_SIZE, "model" => model.clone()).record(accepted.len() as f64);
@@ -17,12 +17,17 @@ pub(super) fn computed(model: &str, accepted: &[Instant], started: Instant, comp
     }
 }
 
-/// Notes a prediction that was not computed.
-pub(super) fn refused(reason: &'static str) {
+/// Counts a prediction that was not computed.
+pub(super) fn record_refusal(reason: &'static str) {
     counter!(names::PREDICTIONS_REFUSED, "reason" => reason).increment(1);
 }
 
-/// Notes how many wait now.
-pub(super) fn waiting(count: usize) {
+/// Counts a panic of the inference thread.
+pub(super) fn record_panic() {
+    counter!(names::INFERENCE_PANICS).increment(1);
+}
+
+/// Sets how many predictions are waiting now.
+pub(super) fn set_waiting(count: usize) {
     gauge!(names::PREDICTIONS_WAITING).set(count as f64);
 }

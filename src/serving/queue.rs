@@ -1,4 +1,4 @@
-//! The bounded queue between the handles and the thread that owns the models.
+//! The bounded queue between the handles and the inference thread.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
@@ -11,10 +11,10 @@ use super::batch::{self, Candidate};
 use super::{ServingError, Task, TaskOutput, meter};
 use crate::registry::LoadedModel;
 
-/// A full queue of the reference model's predictions is worked off well within this.
+/// A full queue of the reference model's predictions is computed well within this time.
 const RETRY_AFTER_S: u64 = 1;
 
-/// A task that waits.
+/// A waiting task.
 pub(super) struct QueuedTask {
     pub(super) model: Arc<LoadedModel>,
     pub(super) task: Task,
@@ -22,18 +22,18 @@ pub(super) struct QueuedTask {
     pub(super) session: Option<u64>,
     pub(super) accepted: Instant,
     pub(super) deadline: Instant,
-    /// How long it may take in all, as whoever waits is told.
+    /// The whole time limit of the request, for the error message.
     pub(super) limit: Duration,
     pub(super) reply: oneshot::Sender<Result<TaskOutput, ServingError>>,
 }
 
-/// A model to take in.
+/// A model to load.
 pub(super) struct ModelLoad {
     pub(super) model: LoadedModel,
     pub(super) reply: SyncSender<Result<(), ServingError>>,
 }
 
-/// What the worker does next.
+/// What the inference thread does next.
 pub(super) enum WorkItem {
     ModelLoad(Box<ModelLoad>),
     Batch(Vec<QueuedTask>),
@@ -70,11 +70,11 @@ impl Queue {
             return Err(ServingError::Stopped);
         }
         if state.waiting.len() >= self.capacity {
-            // Those whose clients have gone hold no place.
+            // Disconnected clients do not occupy the queue.
             state.waiting.retain(|waiting| !waiting.reply.is_closed());
         }
         if state.waiting.len() >= self.capacity {
-            meter::refused("full");
+            meter::record_refusal("full");
             return Err(ServingError::QueueFull {
                 capacity: self.capacity,
                 retry_after_s: RETRY_AFTER_S,
@@ -82,10 +82,10 @@ impl Queue {
         }
         state.waiting.push_back(request);
         let count = state.waiting.len();
-        // Whoever is woken takes the lock.
+        // The woken thread needs the lock.
         drop(state);
         self.arrived.notify_one();
-        meter::waiting(count);
+        meter::set_waiting(count);
         Ok(())
     }
 
@@ -99,14 +99,18 @@ impl Queue {
         Ok(())
     }
 
-    /// Takes no more; what waits is still worked off.
+    /// Refuses new tasks; the waiting ones are still computed.
     pub(super) fn close(&self) {
         self.state().closed = true;
         self.arrived.notify_all();
     }
 
+    pub(super) fn is_closed(&self) -> bool {
+        self.state().closed
+    }
+
     /// Blocks until there is something to do.
-    pub(super) fn take(&self) -> WorkItem {
+    pub(super) fn next_work(&self) -> WorkItem {
         let mut state = self.state();
         loop {
             if let Some(load) = state.loads.pop_front() {
@@ -136,32 +140,32 @@ impl QueueState {
             .map(|waiting| Candidate {
                 model: Arc::as_ptr(&waiting.model).addr(),
                 session: waiting.session,
-                rows: waiting.task.premises.len().max(1),
+                rows: waiting.task.conditioning_inputs.len().max(1),
                 abandoned: waiting.reply.is_closed(),
                 deadline: waiting.deadline,
             })
             .collect();
         let plan = batch::plan(&candidates, now, limit);
         let mut batch = Vec::with_capacity(plan.batch.len());
-        let mut kept = VecDeque::with_capacity(self.waiting.len());
+        let mut remaining = VecDeque::with_capacity(self.waiting.len());
         for (position, waiting) in self.waiting.drain(..).enumerate() {
             if plan.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
             } else if plan.discard.binary_search(&position).is_ok() {
                 let limit_ms = waiting.limit.as_millis();
-                meter::refused(if waiting.reply.is_closed() {
+                meter::record_refusal(if waiting.reply.is_closed() {
                     "abandoned"
                 } else {
                     "deadline"
                 });
-                // Nobody listens if the client has gone.
+                // The receiver is gone if the client has disconnected.
                 let _ = waiting.reply.send(Err(ServingError::Deadline { limit_ms }));
             } else {
-                kept.push_back(waiting);
+                remaining.push_back(waiting);
             }
         }
-        self.waiting = kept;
-        meter::waiting(self.waiting.len());
+        self.waiting = remaining;
+        meter::set_waiting(self.waiting.len());
         batch
     }
 }
@@ -189,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_refuses_with_an_error_and_gives_its_size() {
+    fn a_full_queue_refuses_and_names_its_capacity() {
         let (queue, model) = (Queue::new(2, 8), Arc::new(test_model()));
         let (requests, _answers): (Vec<_>, Vec<_>) = (0..3).map(|_| request(&model)).unzip();
         let results: Vec<_> = requests.into_iter().map(|request| queue.push(request)).collect();
@@ -198,14 +202,16 @@ mod tests {
     }
 
     #[test]
-    fn an_abandoned_request_holds_no_place_and_is_never_computed() {
+    fn an_abandoned_request_is_removed_and_never_computed() {
         let (queue, one, other) = (Queue::new(1, 8), Arc::new(test_model()), Arc::new(test_model()));
         let (first, answer) = request(&one);
         queue.push(first).unwrap();
         drop(answer);
         let (second, _answer) = request(&other);
         queue.push(second).unwrap();
-        let WorkItem::Batch(batch) = queue.take() else { panic!() };
+        let WorkItem::Batch(batch) = queue.next_work() else {
+            panic!()
+        };
         assert_eq!(batch.len(), 1);
         assert!(Arc::ptr_eq(&batch[0].model, &other));
     }
@@ -217,18 +223,18 @@ mod tests {
         for request in requests {
             queue.push(request).unwrap();
         }
-        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 2));
-        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 1));
+        assert!(matches!(queue.next_work(), WorkItem::Batch(batch) if batch.len() == 2));
+        assert!(matches!(queue.next_work(), WorkItem::Batch(batch) if batch.len() == 1));
     }
 
     #[test]
-    fn a_closed_queue_is_worked_off_and_then_stops() {
+    fn a_closed_queue_is_emptied_and_then_stops() {
         let (queue, model) = (Queue::new(4, 1), Arc::new(test_model()));
         let (first, _answer) = request(&model);
         queue.push(first).unwrap();
         queue.close();
         assert!(matches!(queue.push(request(&model).0), Err(ServingError::Stopped)));
-        assert!(matches!(queue.take(), WorkItem::Batch(batch) if batch.len() == 1));
-        assert!(matches!(queue.take(), WorkItem::Stop));
+        assert!(matches!(queue.next_work(), WorkItem::Batch(batch) if batch.len() == 1));
+        assert!(matches!(queue.next_work(), WorkItem::Stop));
     }
 }

@@ -1,5 +1,5 @@
-//! What a stream of frames remembers from one to the next: features, so that no frame is encoded twice, and what the last
-//! future was predicted under. Knows no clock, no socket and no weights: state goes in and comes out.
+//! The state of a session: the features of the last frames, so that no frame is encoded twice, and the last conditioning
+//! input. Pure: it has no clock, socket or weights.
 
 use std::collections::VecDeque;
 
@@ -12,8 +12,9 @@ use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
 
-/// Why a memory is not one of the model's.
+/// Why an imported session state does not fit the model.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MemoryError {
     /// More frames than the context.
     #[error("memory.features holds {found} frames; the model keeps at most {most}")]
@@ -23,7 +24,7 @@ pub enum MemoryError {
         /// The model's context.
         most: usize,
     },
-    /// A frame of another length.
+    /// A frame has the wrong number of features.
     #[error("memory.features[{index}] holds {found} numbers; the model's frames have {expected} features")]
     FeatureCount {
         /// Which frame.
@@ -33,7 +34,7 @@ pub enum MemoryError {
         /// The model's features.
         expected: usize,
     },
-    /// What no frame can give.
+    /// A value that no frame can produce.
     #[error("memory.features[{index}][{place}] is {value}; a feature is -1 to 1")]
     Feature {
         /// Which frame.
@@ -43,45 +44,46 @@ pub enum MemoryError {
         /// Its value.
         value: f32,
     },
-    /// More frames than came, or none although some came.
-    #[error("memory.next_seq is {next_seq}; that does not go with {frames} frames in memory.features")]
+    /// `next_seq` contradicts the number of frames.
+    #[error("memory.next_seq is {next_seq}; that contradicts the {frames} frames in memory.features")]
     Count {
         /// As given.
         next_seq: u64,
         /// Frames given.
         frames: usize,
     },
-    /// Actions or state that do not fit.
+    /// The actions or the state do not fit the model.
     #[error("memory: {0}")]
     ConditioningInput(#[from] InputError),
 }
 
-/// A session's memory as it travels between servers.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// The exported state of a session: what another server needs to continue it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SessionMemory {
-    /// The number that the next frame shall have.
+    /// The expected sequence number of the next frame.
     pub next_seq: u64,
-    /// Of the last frames, oldest first, at most the model's context: the features of each, -1 to 1.
+    /// The features of the last frames, oldest first, -1 to 1; at most as many frames as the model's context.
     pub features: Vec<Vec<f32>>,
-    /// The actions that the last future was predicted under; empty if the model takes none.
-    #[schema(value_type = Vec<Vec<f32>>)]
+    /// The actions of the last conditioning input; empty if the model takes none.
+    #[cfg_attr(feature = "server", schema(value_type = Vec<Vec<f32>>))]
     pub actions: Vec<Action>,
-    /// What the robot said of itself at the last frame; absent if the model takes none.
-    #[schema(value_type = Option<Vec<f32>>)]
+    /// The robot's state at the last frame; absent if the model takes none.
+    #[cfg_attr(feature = "server", schema(value_type = Option<Vec<f32>>))]
     pub state: Option<RobotState>,
 }
 
-/// What a session of one model remembers.
+/// The state of a session with one model.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SessionState {
     next_seq: u64,
     features: VecDeque<Features>,
-    premise: ConditioningInput,
+    conditioning: ConditioningInput,
 }
 
 impl SessionState {
-    /// From a memory of the model named `model`. Errors name what does not fit.
+    /// Restores an exported state for the model named `model`. Errors name the field that does not fit.
     pub fn restore(memory: SessionMemory, model: &str, spec: &ModelSpec) -> Result<Self, MemoryError> {
         let frames = memory.features.len();
         if frames > spec.context {
@@ -99,7 +101,7 @@ impl SessionState {
         for (index, features) in memory.features.iter().enumerate() {
             check_features(index, features, spec)?;
         }
-        let premise = match frames {
+        let conditioning = match frames {
             0 => ConditioningInput::default(),
             _ => ConditioningInput::new(
                 RawConditioning {
@@ -107,7 +109,7 @@ impl SessionState {
                     future: Some(&memory.actions),
                     state: memory.state.as_ref(),
                 },
-                &MEMORY,
+                &MEMORY_FIELDS,
                 model,
                 spec,
             )?,
@@ -115,80 +117,80 @@ impl SessionState {
         Ok(Self {
             next_seq: memory.next_seq,
             features: memory.features.into_iter().map(Features::from).collect(),
-            premise,
+            conditioning,
         })
     }
 
-    /// All that is needed to go on elsewhere.
+    /// Exports the state, so that another server can continue the session.
     #[must_use]
     pub fn memory(&self) -> SessionMemory {
         SessionMemory {
             next_seq: self.next_seq,
             features: self.features.iter().map(|features| features.to_vec()).collect(),
-            actions: self.premise.actions.clone(),
-            state: self.premise.state.clone(),
+            actions: self.conditioning.actions.clone(),
+            state: self.conditioning.state.clone(),
         }
     }
 
-    /// The number that the next frame shall have.
+    /// The expected sequence number of the next frame.
     #[must_use]
     pub fn next_seq(&self) -> u64 {
         self.next_seq
     }
 
-    /// Frames in the context, at most the model's.
+    /// How many frames the context holds now, at most the model's context.
     #[must_use]
-    pub fn have(&self) -> usize {
+    pub fn frame_count(&self) -> usize {
         self.features.len()
     }
 
-    /// What the robot said of itself at the last frame, if the model takes it.
+    /// The robot's state at the last frame, if the model takes it.
     #[must_use]
     pub fn robot_state(&self) -> Option<&RobotState> {
-        self.premise.state.as_ref()
+        self.conditioning.state.as_ref()
     }
 
-    /// What to compute for the next frame: its features and, if it fills the context, its future under the premise.
+    /// The task for the next frame: encode it and, if it fills the context, predict under the conditioning input.
     #[must_use]
-    pub fn step(&self, frame: Frame, premise: Option<ConditioningInput>, spec: &ModelSpec) -> Task {
+    pub fn step(&self, frame: Frame, conditioning: Option<ConditioningInput>, spec: &ModelSpec) -> Task {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
-        let known: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
-        let is_full = known.len() + 1 == spec.context;
+        let past_features: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
+        let is_full = past_features.len() + 1 == spec.context;
         Task {
-            known,
+            past_features,
             frames: vec![frame],
-            premises: premise.filter(|_| is_full).into_iter().collect(),
+            conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
         }
     }
 
-    /// Keeps what came of the step of frame `seq`.
-    pub fn advance(&mut self, seq: u64, features: Features, premise: ConditioningInput, spec: &ModelSpec) {
+    /// Stores the result of the step of frame `seq`.
+    pub fn advance(&mut self, seq: u64, features: Features, conditioning: ConditioningInput, spec: &ModelSpec) {
         self.features.push_back(features);
         while self.features.len() > spec.context {
             self.features.pop_front();
         }
-        self.premise = premise;
+        self.conditioning = conditioning;
         self.next_seq = seq.saturating_add(1);
     }
 
-    /// What to compute for the last frame once more; `None` while the context is not full.
+    /// The task that repeats the last prediction; `None` while the context is not full.
     #[must_use]
-    pub fn again(&self, spec: &ModelSpec) -> Option<Task> {
-        (self.features.len() == spec.context).then(|| self.futures(vec![self.premise.clone()]))
+    pub fn repeat_task(&self, spec: &ModelSpec) -> Option<Task> {
+        (self.features.len() == spec.context).then(|| self.rollout_task(vec![self.conditioning.clone()]))
     }
 
-    /// What to compute for the futures that follow the last frame, if the context is full.
+    /// The task that predicts one rollout for each conditioning input from the last frame. The context must be full.
     #[must_use]
-    pub fn futures(&self, premises: Vec<ConditioningInput>) -> Task {
+    pub fn rollout_task(&self, conditioning_inputs: Vec<ConditioningInput>) -> Task {
         Task {
-            known: self.features.iter().cloned().collect(),
+            past_features: self.features.iter().cloned().collect(),
             frames: Vec::new(),
-            premises,
+            conditioning_inputs,
         }
     }
 }
 
-const MEMORY: FieldNames = FieldNames {
+const MEMORY_FIELDS: FieldNames = FieldNames {
     past: |_| "actions".to_owned(),
     future: "actions",
     missing: "actions",
@@ -202,7 +204,7 @@ fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<()
             expected: spec.code_len(),
         });
     }
-    // They come out of a hyperbolic tangent, or are a frame's pixels; NaN is in no range.
+    // Features are outputs of tanh, or pixels for the flow network; NaN is in no range.
     match features
         .iter()
         .enumerate()
@@ -229,7 +231,7 @@ mod tests {
         Action::try_from(vec![value]).unwrap()
     }
 
-    fn premise(value: f32) -> ConditioningInput {
+    fn conditioning(value: f32) -> ConditioningInput {
         ConditioningInput {
             actions: vec![action(value); 2],
             state: RobotState::try_from(vec![value]).ok(),
@@ -237,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_predict_what_whole_windows_do_and_forget_what_is_older() {
+    fn steps_predict_the_same_as_whole_windows() {
         for model in [test_model(), test_flow_model()] {
             check_steps(&model);
         }
@@ -248,17 +250,17 @@ mod tests {
         let spec = model.model.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
-            let task = state.step(frame(seq, width), Some(premise(f32::from(seq))), spec);
+            let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
             let computed = compute::run(model, &[&task]).unwrap().remove(0);
             state.advance(
                 u64::from(seq),
                 computed.features[0].clone(),
-                premise(f32::from(seq)),
+                conditioning(f32::from(seq)),
                 spec,
             );
             seen.push(frame(seq, width));
             let Some(start) = seen.len().checked_sub(3) else {
-                assert!(computed.futures.is_empty());
+                assert!(computed.predictions.is_empty());
                 continue;
             };
             let input = PredictionInput {
@@ -267,16 +269,19 @@ mod tests {
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
                 future_actions: None,
             };
-            assert_eq!(computed.futures, predict(model, &[&input]).unwrap());
-            let again = state.again(spec).unwrap();
-            assert_eq!(compute::run(model, &[&again]).unwrap()[0].futures, computed.futures);
+            assert_eq!(computed.predictions, predict(model, &[&input]).unwrap());
+            let repeated = state.repeat_task(spec).unwrap();
+            assert_eq!(
+                compute::run(model, &[&repeated]).unwrap()[0].predictions,
+                computed.predictions
+            );
         }
-        assert_eq!((state.next_seq(), state.have()), (8, 3));
+        assert_eq!((state.next_seq(), state.frame_count()), (8, 3));
     }
 
     proptest! {
         #[test]
-        fn a_memory_is_taken_whole_or_refused(
+        fn an_exported_state_is_restored_whole_or_refused(
             next_seq in 0u64..6,
             features in proptest::collection::vec(proptest::collection::vec(-1.2f32..1.2, 4..6), 0..5),
             actions in proptest::collection::vec(-2.0f32..2.0, 0..4),
@@ -306,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn a_memory_with_what_no_frame_gives_is_refused_with_its_place() {
+    fn a_feature_out_of_range_is_refused_with_its_position() {
         let spec = test_model().model.spec().clone();
         let mut memory = SessionMemory {
             next_seq: 1,

@@ -1,4 +1,4 @@
-//! What the thread that owns the models is given to do, checked before it waits.
+//! A task for the inference thread, checked before it is queued.
 
 use super::compute::Features;
 use super::input::{InputError, PredictionInput};
@@ -6,26 +6,25 @@ use crate::frame::Frame;
 use crate::nn::{ChannelScale, Conditioning, ModelSpec};
 use crate::types::{Action, RobotState};
 
-/// What a future is predicted under, checked, of what the model takes: an action for each predicted frame, and the state
-/// at the last frame seen.
+/// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ConditioningInput {
     pub(super) actions: Vec<Action>,
     pub(super) state: Option<RobotState>,
 }
 
-/// Actions and state as they were given.
+/// Actions and state as the client sent them.
 #[derive(Clone, Copy)]
 pub(crate) struct RawConditioning<'a> {
-    /// What acted so far, the last of it still under way.
+    /// The past actions; the last one acts from the last frame on.
     pub(crate) past: &'a [Action],
-    /// What will act; else the last of the past is held.
+    /// The plan; without one, the last past action is held.
     pub(crate) future: Option<&'a [Action]>,
-    /// What the robot says of itself at the last frame.
+    /// The robot's state at the last frame.
     pub(crate) state: Option<&'a RobotState>,
 }
 
-/// What errors call the fields.
+/// The names of the fields in error messages.
 pub(crate) struct FieldNames {
     pub(super) past: fn(usize) -> String,
     pub(super) future: &'static str,
@@ -33,22 +32,22 @@ pub(crate) struct FieldNames {
 }
 
 /// The fields of a request.
-pub(super) const REQUEST: FieldNames = FieldNames {
+pub(super) const REQUEST_FIELDS: FieldNames = FieldNames {
     past: |index| format!("actions[{index}]"),
     future: "future_actions",
     missing: "future_actions",
 };
 /// The fields of a stream's frame.
-pub(crate) const STEP: FieldNames = FieldNames {
+pub(crate) const STEP_FIELDS: FieldNames = FieldNames {
     past: |_| "action".to_owned(),
     future: "plan",
     missing: "action",
 };
 
 impl ConditioningInput {
-    /// Of what was told, that which the model takes. Errors name the field, what it is and what it should be.
+    /// Checks the input and keeps what the model takes. Errors name the field, its value and the expected value.
     pub(crate) fn new(
-        told: RawConditioning<'_>,
+        raw: RawConditioning<'_>,
         fields: &FieldNames,
         model: &str,
         spec: &ModelSpec,
@@ -56,10 +55,11 @@ impl ConditioningInput {
         if spec.conditioning == Conditioning::None {
             return Ok(Self::default());
         }
-        for (index, action) in told.past.iter().enumerate() {
+        for (index, action) in raw.past.iter().enumerate() {
             check_length(|| (fields.past)(index), model, action.as_slice(), &spec.actions)?;
         }
-        let actions = match (told.future, told.past.last()) {
+        let actions = match (raw.future, raw.past.last()) {
+            _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
                 check_actions(fields.future, model, spec, actions)?;
                 actions.to_vec()
@@ -75,49 +75,49 @@ impl ConditioningInput {
         };
         Ok(Self {
             actions,
-            state: check_state(model, spec, told.state.cloned())?,
+            state: check_state(model, spec, raw.state.cloned())?,
         })
     }
 
-    /// One for each of many sequences of future actions, called `candidates[i]` in errors, from the same state.
-    /// Errors: `Unconditioned` if the model takes no actions, and those of the values.
+    /// One conditioning input for each plan, all from the same state. Errors call the plans `candidates[i]`.
+    /// Errors: `Unconditioned` if the model takes no actions, and the errors of the values.
     pub(crate) fn candidates(
         candidates: Vec<Vec<Action>>,
         state: Option<RobotState>,
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Vec<Self>, InputError> {
-        if spec.conditioning == Conditioning::None {
+        if spec.action_inputs().is_none() {
             return Err(InputError::Unconditioned {
                 model: model.to_owned(),
             });
         }
         let state = check_state(model, spec, state)?;
-        let premise = |(index, actions): (usize, Vec<Action>)| {
+        let conditioning = |(index, actions): (usize, Vec<Action>)| {
             check_actions(&format!("candidates[{index}]"), model, spec, &actions)?;
             let state = state.clone();
             Ok(Self { actions, state })
         };
-        candidates.into_iter().enumerate().map(premise).collect()
+        candidates.into_iter().enumerate().map(conditioning).collect()
     }
 }
 
-/// What the thread that owns the models computes in one go. State goes in and comes out.
+/// A unit of work for the inference thread. It carries all the state that it needs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Task {
-    /// Of the frames encoded before, oldest first.
-    pub(super) known: Vec<Features>,
-    /// The frames that follow those, to be encoded.
+    /// The features of the frames that were encoded before, oldest first.
+    pub(super) past_features: Vec<Features>,
+    /// The frames to encode, which follow those.
     pub(super) frames: Vec<Frame>,
-    /// One for each future to predict; none where the context is not full.
-    pub(super) premises: Vec<ConditioningInput>,
+    /// One for each rollout; empty while the context is not full.
+    pub(super) conditioning_inputs: Vec<ConditioningInput>,
 }
 
 impl Task {
-    /// Futures of the context in `frames`, one for each premise. Errors: those of the frames.
-    pub(crate) fn futures(
+    /// One rollout for each conditioning input from the context in `frames`. Errors: those of the frames.
+    pub(crate) fn rollout(
         frames: Vec<Frame>,
-        premises: Vec<ConditioningInput>,
+        conditioning_inputs: Vec<ConditioningInput>,
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {
@@ -128,23 +128,25 @@ impl Task {
         input.check_frames(model, spec)?;
         Ok(Self {
             frames: input.frames,
-            premises,
+            conditioning_inputs,
             ..Self::default()
         })
     }
 
-    /// Takes out what is computed next: the frames, and the first futures up to a limit.
+    /// Splits off what is computed next: the frames, and the first rollouts up to a limit.
     pub(super) fn next_part(&mut self, limit: usize) -> Self {
-        let later = self.premises.split_off(limit.min(self.premises.len()));
+        let later = self
+            .conditioning_inputs
+            .split_off(limit.min(self.conditioning_inputs.len()));
         Self {
-            known: self.known.clone(),
+            past_features: self.past_features.clone(),
             frames: std::mem::take(&mut self.frames),
-            premises: std::mem::replace(&mut self.premises, later),
+            conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
         }
     }
 }
 
-/// Whether there is an action for each predicted frame, and of each action every number.
+/// Checks that there is an action for each predicted frame and that each action has all channels.
 fn check_actions(field: &str, model: &str, spec: &ModelSpec, actions: &[Action]) -> Result<(), InputError> {
     if actions.len() != spec.horizon {
         return Err(InputError::FutureActionCount {
@@ -160,9 +162,9 @@ fn check_actions(field: &str, model: &str, spec: &ModelSpec, actions: &[Action])
     Ok(())
 }
 
-/// The state, if the model takes one.
+/// Checks the state; `None` if the model takes none.
 fn check_state(model: &str, spec: &ModelSpec, state: Option<RobotState>) -> Result<Option<RobotState>, InputError> {
-    if spec.conditioning != Conditioning::StateAction {
+    if spec.state_inputs().is_none() {
         return Ok(None);
     }
     let Some(state) = state else {

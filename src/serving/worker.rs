@@ -1,9 +1,11 @@
-//! The one thread that computes with the models.
+//! The inference thread: the only thread that computes with the models.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Instant;
 
+use rayon::ThreadPool;
 use tracing::{error, info};
 
 use super::catalog::Catalog;
@@ -18,13 +20,13 @@ pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHand
     std::thread::Builder::new()
         .name("inference".to_owned())
         .spawn(move || {
-            // A pool of this thread alone, so that no prediction waits for the threads that train.
+            // A pool with this thread only, so that predictions do not wait for training threads.
             let pool = rayon::ThreadPoolBuilder::new()
                 .num_threads(1)
                 .use_current_thread()
                 .build();
             match pool {
-                Ok(pool) => pool.install(|| run(&queue, &catalog)),
+                Ok(pool) => supervise(&pool, &queue, &catalog),
                 Err(error) => error!(%error, "the predictor's thread pool could not be built"),
             }
             queue.close();
@@ -32,17 +34,37 @@ pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHand
         .map_err(ServingError::Thread)
 }
 
-fn run(queue: &Queue, catalog: &Catalog) {
-    for model in catalog.all() {
-        if let Err(error) = warm_up(&model) {
-            error!(model.id = %model.manifest.name, %error, "model failed its first prediction");
+/// Computes until the queue is closed. A panic fails the work that caused it, and the loop starts again.
+fn supervise(pool: &ThreadPool, queue: &Queue, catalog: &Catalog) {
+    // After a panic, no state of the computation is used again: a task carries all that it needs.
+    let guarded = |work: &(dyn Fn() + Sync)| {
+        let result = catch_unwind(AssertUnwindSafe(|| pool.install(work)));
+        if result.is_err() {
+            catalog.record_panic();
+            meter::record_panic();
+            error!("the inference thread panicked and was restarted");
         }
+        result.is_ok()
+    };
+    for model in catalog.all() {
+        guarded(&|| {
+            if let Err(error) = warm_up(&model) {
+                error!(model.id = %model.manifest.name, %error, "model failed its first prediction");
+            }
+        });
     }
     catalog.set_ready();
+    while !guarded(&|| run(queue, catalog)) {}
+}
+
+fn run(queue: &Queue, catalog: &Catalog) {
     loop {
-        match queue.take() {
+        match queue.next_work() {
             WorkItem::ModelLoad(load) => load_model(*load, catalog),
-            WorkItem::Batch(batch) => answer(batch),
+            WorkItem::Batch(batch) => {
+                answer(batch);
+                catalog.reset_panics();
+            }
             WorkItem::Stop => return,
         }
     }
@@ -53,11 +75,11 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
     if result.is_ok() {
         catalog.insert(model);
     }
-    // Whoever asked may have gone; the model serves all the same.
+    // The caller may be gone; the model is active all the same.
     let _ = reply.send(result);
 }
 
-/// Predicts once from black frames, so that memory and kernels are warm.
+/// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
     let started = Instant::now();
     compute::predict(model, &[&blank_input(model.model.spec())?])?;
@@ -94,20 +116,20 @@ fn answer(batch: Vec<QueuedTask>) {
             for (waiting, computation) in batch.into_iter().zip(computations) {
                 let computed = TaskOutput {
                     features: computation.features,
-                    futures: computation.futures,
+                    predictions: computation.predictions,
                     queue_us: micros(started.saturating_duration_since(waiting.accepted)),
                     compute_us,
                 };
-                // Nobody listens if the client has gone.
+                // The receiver is gone if the client has disconnected.
                 let _ = waiting.reply.send(Ok(computed));
             }
-            // Whoever waits for the answer does not wait for this.
-            meter::computed(&model.manifest.name, &accepted, started, compute_us);
+            // After the answers, so that no client waits for the metrics.
+            meter::record_batch(&model.manifest.name, &accepted, started, compute_us);
         }
-        // One bad task must not fail its neighbours.
+        // One bad task must not fail the others of its batch.
         Err(_) if batch.len() > 1 => batch.into_iter().for_each(|waiting| answer(vec![waiting])),
         Err(error) => {
-            meter::refused("error");
+            meter::record_refusal("error");
             if let Some(waiting) = batch.into_iter().next() {
                 let _ = waiting.reply.send(Err(error));
             }
@@ -121,4 +143,62 @@ fn micros_since(started: Instant) -> u64 {
 
 fn micros(duration: std::time::Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use crate::nn::{Model, ModelSpec, Parameters};
+    use crate::registry::LoadedModel;
+    use crate::serving::{Predictor, PredictorConfig, ServingError, Task, test_model};
+    use crate::types::Seed;
+
+    /// A model without context: its computation divides by zero.
+    fn panicking_model() -> LoadedModel {
+        let model = test_model();
+        let parameters = Parameters::initialize(model.model.spec(), Seed(1)).unwrap();
+        let spec = ModelSpec {
+            context: 0,
+            ..model.model.spec().clone()
+        };
+        LoadedModel {
+            model: Model::detached(spec, &parameters).unwrap(),
+            ..model
+        }
+    }
+
+    fn task(model: &LoadedModel) -> Task {
+        let input = super::blank_input(model.model.spec()).unwrap();
+        Task {
+            conditioning_inputs: vec![input.conditioning("test", model.model.spec()).unwrap()],
+            frames: input.frames,
+            ..Task::default()
+        }
+    }
+
+    #[tokio::test]
+    async fn a_panic_fails_its_batch_and_the_thread_restarts() {
+        let config = PredictorConfig {
+            deadline: Duration::from_secs(60),
+            ..PredictorConfig::default()
+        };
+        let predictor = Predictor::start(vec![test_model()], config).unwrap();
+        let (good, bad) = (
+            predictor.active("test").unwrap(),
+            std::sync::Arc::new(panicking_model()),
+        );
+        for _ in 0..3 {
+            let failed = predictor.compute(&bad, task(&bad), None).await;
+            assert!(matches!(failed, Err(ServingError::Panicked)), "{failed:?}");
+        }
+        while predictor.is_ready() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        let computed = predictor.compute(&good, task(&good), None).await.unwrap();
+        assert_eq!(computed.predictions.len(), 1);
+        while !predictor.is_ready() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    }
 }

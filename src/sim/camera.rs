@@ -1,5 +1,5 @@
-//! Tb1's pinhole camera: casts rays through parry's `RayCast`, shades what they hit (Lambert and distance), casts more
-//! rays where neighbouring pixels hit different things, and tells whose pixel is whose.
+//! Tb1's pinhole camera. It casts rays with parry's `RayCast`, shades the points that they hit (Lambert and distance), casts
+//! more rays at edges, and makes the segmentation mask.
 
 use std::sync::LazyLock;
 
@@ -9,37 +9,38 @@ use rapier3d::parry::query::{Ray, RayCast};
 use rapier3d::parry::shape::Cuboid;
 use rapier3d::prelude::Vector;
 
-use super::cast::UprightCylinder;
-use super::mover::{Mover, MoverView, NearestHit, face};
+use super::ray_cast::UprightCylinder;
+use super::rendered_robot::{NearestHit, RenderedRobot, RobotView, face};
 use super::{PlanarPose, SimError, WorldConfig, arena};
 use crate::frame::Frame;
 
-/// A pixel at an edge is the mean of a grid of this many rays a side.
+/// A pixel at an edge is the mean of a square grid of rays with this many rays on each side.
 const EDGE_RAYS: usize = 3;
-/// Neighbours that differ by more than this are an edge though they hit the same thing.
+/// Neighbouring pixels whose gray values differ by more than this are an edge, also if they show the same surface.
 const EDGE_STEP: f32 = 0.06;
-/// Share of the light that comes from everywhere.
+/// Share of ambient light.
 const AMBIENT: f32 = 0.6;
-/// Towards the lamp.
+/// Direction to the light source.
 static LIGHT: LazyLock<Vector> = LazyLock::new(|| Vector::new(-0.45, 0.35, 0.82).normalize());
 
-/// What one ray brings back.
+/// The result of one ray.
 #[derive(Clone, Copy)]
 struct RaySample {
     gray: f32,
-    /// Which face of which solid; differs between any two.
+    /// Identifies one face of one solid.
     surface: u16,
-    owner: u8,
+    /// Id in the segmentation mask.
+    robot_id: u8,
 }
 
-/// A pinhole camera at its place.
+/// A pinhole camera at a fixed pose.
 #[derive(Clone, Debug)]
 pub struct Camera {
     position: Vector,
     forward: Vector,
     left: Vector,
     up: Vector,
-    /// Size of a pixel at one metre's depth.
+    /// Size of a pixel at a depth of one metre.
     pixel_m: f32,
     width: usize,
     height: usize,
@@ -47,7 +48,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// The camera of a robot that stands there. Pixels are square; the vertical field of view follows.
+    /// The camera of a robot with this pose. Pixels are square, which determines the vertical field of view.
     #[must_use]
     pub fn new(config: &WorldConfig, pose: PlanarPose) -> Self {
         let (sin, cos) = pose.heading_rad.sin_cos();
@@ -64,8 +65,8 @@ impl Camera {
         }
     }
 
-    /// Where a point [x, y, z] of the room appears, [column, row] in pixels from the top left corner (the first pixel's
-    /// middle is 0.5, 0.5); nothing if it is behind the camera.
+    /// Projects a point [x, y, z] of the room to [column, row] in pixels from the top left corner (the center of the first
+    /// pixel is 0.5, 0.5); none if the point is behind the camera.
     #[must_use]
     pub fn project(&self, point_m: [f32; 3]) -> Option<[f32; 2]> {
         let to = Vector::from_array(point_m) - self.position;
@@ -79,9 +80,13 @@ impl Camera {
         })
     }
 
-    /// The picture and whose pixel is whose. Errors: `Frame` if the size is out of range.
-    pub(super) fn take(&self, movers: &[Mover], mut noise: ChaCha8Rng) -> Result<(Frame, Vec<u8>), SimError> {
-        let samples = self.render(movers);
+    /// Renders an image with noise, and its segmentation mask. Errors: `Frame` if the size is out of range.
+    pub(super) fn capture(
+        &self,
+        robots: &[RenderedRobot],
+        mut noise: ChaCha8Rng,
+    ) -> Result<(Frame, Vec<u8>), SimError> {
+        let samples = self.render(robots);
         let pixels = samples
             .iter()
             .map(|sample| {
@@ -94,27 +99,27 @@ impl Camera {
             })
             .collect();
         let frame = Frame::new(self.width as u32, self.height as u32, pixels)?;
-        Ok((frame, samples.iter().map(|sample| sample.owner).collect()))
+        Ok((frame, samples.iter().map(|sample| sample.robot_id).collect()))
     }
 
-    /// One ray through each pixel's middle, then more where they disagree.
-    fn render(&self, movers: &[Mover]) -> Vec<RaySample> {
-        let seen: Vec<MoverView> = movers
+    /// Casts one ray through each pixel's center, then more rays at edges.
+    fn render(&self, robots: &[RenderedRobot]) -> Vec<RaySample> {
+        let views: Vec<RobotView> = robots
             .iter()
-            .map(|mover| MoverView::new(mover, self.position))
+            .map(|robot| RobotView::new(robot, self.position))
             .collect();
-        let mut middles = Vec::with_capacity(self.width * self.height);
+        let mut centers = Vec::with_capacity(self.width * self.height);
         for row in 0..self.height {
             for column in 0..self.width {
-                middles.push(self.sample(&seen, column as f32 + 0.5, row as f32 + 0.5));
+                centers.push(self.sample(&views, column as f32 + 0.5, row as f32 + 0.5));
             }
         }
-        (0..middles.len())
+        (0..centers.len())
             .map(|index| {
-                if self.is_edge(&middles, index) {
-                    self.average(&seen, index)
+                if self.is_edge(&centers, index) {
+                    self.average(&views, index)
                 } else {
-                    middles[index]
+                    centers[index]
                 }
             })
             .collect()
@@ -133,32 +138,32 @@ impl Camera {
             || (row + 1 < self.height && differs(index + self.width))
     }
 
-    /// The mean of a grid of rays; the pixel belongs to whom most of them hit.
-    fn average(&self, seen: &[MoverView], index: usize) -> RaySample {
+    /// The mean of a grid of rays. In the segmentation mask, the pixel gets the id that most of the rays hit.
+    fn average(&self, views: &[RobotView], index: usize) -> RaySample {
         let (row, column) = (index / self.width, index % self.width);
         let mut sum = 0.0;
-        let mut owners = [0u8; EDGE_RAYS * EDGE_RAYS];
-        for (ray, owner) in owners.iter_mut().enumerate() {
+        let mut ids = [0u8; EDGE_RAYS * EDGE_RAYS];
+        for (ray, id) in ids.iter_mut().enumerate() {
             let right = (ray % EDGE_RAYS) as f32 + 0.5;
             let down = (ray / EDGE_RAYS) as f32 + 0.5;
             let sample = self.sample(
-                seen,
+                views,
                 column as f32 + right / EDGE_RAYS as f32,
                 row as f32 + down / EDGE_RAYS as f32,
             );
             sum += sample.gray;
-            *owner = sample.owner;
+            *id = sample.robot_id;
         }
-        owners.sort_unstable();
+        ids.sort_unstable();
         RaySample {
-            gray: sum / owners.len() as f32,
+            gray: sum / ids.len() as f32,
             surface: 0,
-            owner: most_frequent(&owners),
+            robot_id: most_frequent(&ids),
         }
     }
 
-    /// Casts the ray through a point of the image and shades what it hits.
-    fn sample(&self, seen: &[MoverView], column: f32, row: f32) -> RaySample {
+    /// Casts the ray through a point of the image and shades the point that it hits.
+    fn sample(&self, views: &[RobotView], column: f32, row: f32) -> RaySample {
         let right = (column - self.width as f32 / 2.0) * self.pixel_m;
         let down = (row - self.height as f32 / 2.0) * self.pixel_m;
         let direction = self.forward - self.left * right - self.up * down;
@@ -177,35 +182,35 @@ impl Camera {
                     normal: found.normal,
                     albedo: pillar.albedo,
                     surface: index,
-                    owner: 0,
+                    robot_id: 0,
                 };
             }
         }
-        for seen in seen {
-            seen.cast(direction, &mut hit);
+        for view in views {
+            view.cast(direction, &mut hit);
         }
         if hit.surface == FLOOR {
             let point = self.position + direction * hit.time;
-            hit.albedo *= seen
+            hit.albedo *= views
                 .iter()
-                .map(|seen| seen.mover.shade(point.x, point.y))
+                .map(|view| view.robot.shade(point.x, point.y))
                 .product::<f32>();
         }
         let lambert = hit.normal.dot(*LIGHT).max(0.0);
-        let way_squared = direction.length_squared() * hit.time * hit.time;
-        let near = 1.0 / (1.0 + 0.012 * way_squared);
+        let distance_squared = direction.length_squared() * hit.time * hit.time;
+        let falloff = 1.0 / (1.0 + 0.012 * distance_squared);
         RaySample {
-            gray: hit.albedo * (AMBIENT + (1.0 - AMBIENT) * lambert) * near,
+            gray: hit.albedo * (AMBIENT + (1.0 - AMBIENT) * lambert) * falloff,
             surface: hit.surface,
-            owner: hit.owner,
+            robot_id: hit.robot_id,
         }
     }
 
-    /// The room is a box seen from within, so every ray meets one of its sides.
+    /// Casts a ray against the room. The camera is inside this box, so every ray hits one of its sides.
     fn cast_room(&self, direction: Vector) -> NearestHit {
         let half = Vector::new(arena::LENGTH_M, arena::WIDTH_M, arena::HEIGHT_M) / 2.0;
-        let middle = Vector::new(arena::LENGTH_M / 2.0, 0.0, arena::HEIGHT_M / 2.0);
-        let ray = Ray::new(self.position - middle, direction);
+        let center = Vector::new(arena::LENGTH_M / 2.0, 0.0, arena::HEIGHT_M / 2.0);
+        let ray = Ray::new(self.position - center, direction);
         let found = Cuboid::new(half).cast_local_ray_and_get_normal(&ray, f32::MAX, false);
         let (time, axis) = found.map_or((0.0, 2), |found| (found.time_of_impact, face(&found) % 3));
         let far = direction[axis] > 0.0;
@@ -218,15 +223,15 @@ impl Camera {
             normal,
             albedo: arena::side_albedo(side, point.x, point.y, point.z),
             surface: side,
-            owner: 0,
+            robot_id: 0,
         }
     }
 }
 
-/// The room's side that is the floor.
+/// The side of the room that is the floor.
 const FLOOR: u16 = 4;
 
-/// The value that occurs most often in a sorted list, the smallest where several do.
+/// The most frequent value of a sorted list; the smallest one if several are equally frequent.
 fn most_frequent(sorted: &[u8]) -> u8 {
     let mut best = (0, 0);
     for run in sorted.chunk_by(u8::eq) {

@@ -4,9 +4,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{SimError, arena};
 use crate::frame::MAX_SIDE_PX;
+use crate::frame::warp::CameraModel;
 
 /// Tb1's camera.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Height of the pinhole above the floor, in metres.
@@ -15,8 +17,19 @@ pub struct CameraConfig {
     pub tilt_down_rad: f64,
     /// Angle between the left and the right edge of the image, in radians.
     pub horizontal_fov_rad: f64,
-    /// Standard deviation of the sensor's Gaussian noise; 1 is the step from black to white.
+    /// Standard deviation of the sensor's Gaussian noise, where black is 0 and white is 1.
     pub noise_std: f64,
+}
+
+impl CameraConfig {
+    /// How it projects.
+    #[must_use]
+    pub fn model(&self) -> CameraModel {
+        CameraModel {
+            horizontal_fov_rad: self.horizontal_fov_rad as f32,
+            tilt_down_rad: self.tilt_down_rad as f32,
+        }
+    }
 }
 
 impl Default for CameraConfig {
@@ -30,19 +43,20 @@ impl Default for CameraConfig {
     }
 }
 
-/// How a world is run and seen.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// Settings of a world.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldConfig {
     /// Width of a frame in pixels.
     pub frame_width_px: u32,
     /// Height of a frame in pixels.
     pub frame_height_px: u32,
-    /// From one frame to the next, in seconds.
+    /// Seconds from one frame to the next.
     pub frame_period_s: f64,
     /// Tb1's camera.
     pub camera: CameraConfig,
-    /// A trial has the frames from 0 up to, but without, this many seconds.
+    /// Time limit of a trial, in seconds. A trial has the frames before this time; the first frame is at 0 s.
     pub max_duration_s: f64,
 }
 
@@ -78,21 +92,21 @@ impl WorldConfig {
         in_range("max_duration_s", self.max_duration_s, 2.0 * self.frame_period_s, 3600.0)
     }
 
-    /// Frames of a trial that is not ended before its time, the first included.
+    /// Frames of a trial that runs until its time limit, including the first frame.
     #[must_use]
     pub fn frame_limit(&self) -> u64 {
         (self.max_duration_s / self.frame_period_s + 1e-6).floor() as u64
     }
 }
 
-/// Errors: `Setting` with the range if the value is not in it.
-pub(super) fn in_range(name: &'static str, value: f64, least: f64, most: f64) -> Result<(), SimError> {
-    if value.is_finite() && (least..=most).contains(&value) {
+/// Errors: `Setting` with the range if the value is out of range.
+pub(super) fn in_range(name: &'static str, value: f64, min: f64, max: f64) -> Result<(), SimError> {
+    if value.is_finite() && (min..=max).contains(&value) {
         return Ok(());
     }
     Err(SimError::Setting {
         name,
         value,
-        rule: format!("a finite number from {least} to {most}"),
+        rule: format!("a finite number from {min} to {max}"),
     })
 }

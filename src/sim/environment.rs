@@ -1,9 +1,9 @@
-//! Gymnasium's face of a [`World`]: `reset` begins an episode, `step` acts in it.
+//! The Gymnasium interface of a [`World`]: `reset` starts an episode, `step` acts in it.
 
 use super::{Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
 use crate::types::{Action, Seed};
 
-/// An environment with one scenario, which runs one trial after another.
+/// An environment for one scenario. It runs one trial after another.
 pub struct Environment {
     scenario: Scenario,
     config: WorldConfig,
@@ -13,7 +13,7 @@ pub struct Environment {
 }
 
 impl Environment {
-    /// An environment that waits for its first reset. Errors: as [`WorldConfig::validate`].
+    /// An environment before its first reset. Errors: as [`WorldConfig::validate`].
     pub fn new(scenario: Scenario, config: WorldConfig) -> Result<Self, SimError> {
         config.validate()?;
         Ok(Self {
@@ -25,8 +25,9 @@ impl Environment {
         })
     }
 
-    /// Begins an episode: with a seed the first of its sequence, without one the next of the present sequence (of seed 0
-    /// at first). Returns what Tb1 sees and what was drawn, Gymnasium's `info`.
+    /// Starts an episode. With a seed, it is the seed's first trial; without a seed, the next trial of the current seed
+    /// (initially 0). Returns the first observation and the trial's parameters (Gymnasium's `info`). Errors: as
+    /// [`World::new`].
     pub fn reset(&mut self, seed: Option<Seed>) -> Result<(Observation, TrialParameters), SimError> {
         if let Some(seed) = seed {
             self.seed = seed;
@@ -34,17 +35,17 @@ impl Environment {
         }
         let world = World::new(self.scenario, &self.config, self.seed, self.next_trial)?;
         self.next_trial += 1;
-        let begun = (world.observe(), world.parameters().clone());
+        let first = (world.observe(), world.parameters().clone());
         self.world = Some(world);
-        Ok(begun)
+        Ok(first)
     }
 
-    /// Acts for one frame period. Errors: `NotReset` before the first reset, and as [`World::step`].
+    /// Simulates one frame period with this action. Errors: `NotReset` before the first reset, and as [`World::step`].
     pub fn step(&mut self, action: &Action) -> Result<StepResult, SimError> {
         self.world.as_mut().ok_or(SimError::NotReset)?.step(action)
     }
 
-    /// The trial that runs, for its own driver's action or its true poses.
+    /// The current trial, for example for the policy's action or the true poses.
     #[must_use]
     pub fn world(&self) -> Option<&World> {
         self.world.as_ref()

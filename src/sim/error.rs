@@ -1,13 +1,14 @@
-//! Why a world was not made or a step not taken.
+//! Errors of the simulator.
 
 use super::scenario;
 use crate::frame::{FrameError, MAX_SIDE_PX};
 use crate::types::ValueError;
 
-/// Why a world was not made or a step not taken.
+/// Why a world could not be created or a step could not be simulated.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum SimError {
-    /// No scenario has that name.
+    /// No scenario has this name.
     #[error("there is no scenario \"{name}\"; there are {}", scenario::names())]
     UnknownScenario {
         /// The name given.
@@ -32,21 +33,21 @@ pub enum SimError {
         rule: String,
     },
     /// An action has the wrong number of components.
-    #[error("an action of {found} components was given; it takes 2: linear (m/s) and angular (rad/s)")]
+    #[error("the action has {found} components; it must have 2: linear (m/s) and angular (rad/s)")]
     ActionLength {
         /// Components given.
         found: usize,
     },
     /// The trial has ended.
-    #[error("the trial has ended; reset to begin another")]
+    #[error("the trial has ended; reset the environment to start another trial")]
     Ended,
-    /// A step was asked of an environment that was never reset.
-    #[error("the environment was never reset; reset it before the first step")]
+    /// An environment got a step before its first reset.
+    #[error("the environment has not been reset; reset it before the first step")]
     NotReset,
-    /// A number that is not finite reached an action or a state.
+    /// An action or a state contains an invalid number.
     #[error(transparent)]
     Value(#[from] ValueError),
-    /// The camera's picture is no frame.
+    /// The camera's image is not a valid frame.
     #[error(transparent)]
     Frame(#[from] FrameError),
 }

@@ -1,4 +1,5 @@
-//! Drives a mover to its goal with two PID controllers: heading error to angular, distance to linear velocity.
+//! Drives a robot to its goal with two PID controllers: from heading error to angular velocity, from distance to linear
+//! velocity.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -7,12 +8,12 @@ use super::pid::Pid;
 use super::scenario::Route;
 use super::{PlanarPose, arena, robot};
 
-/// A mover is at its goal within this distance, in metres.
+/// A robot has reached its goal at this distance, in metres.
 pub(super) const ARRIVAL_M: f32 = 0.1;
-/// The next goal of an unending drive is at least this far, in metres.
+/// A new goal is at least this far away, in metres.
 const NEXT_GOAL_M: f32 = 0.8;
 
-/// A mover's goal and its controllers.
+/// A robot's goal and its controllers.
 pub(super) struct Navigator {
     goal_m: [f32; 2],
     heading: Pid,
@@ -30,12 +31,12 @@ impl Navigator {
         }
     }
 
-    /// What the wheels are told next, [m/s, rad/s]. It slows down where the goal is not ahead, and never backs up.
+    /// The next velocity command, [m/s, rad/s]. The robot drives slowly if the goal is not ahead, and never backward.
     pub(super) fn command(&mut self, pose: PlanarPose, dt: f32) -> [f32; 2] {
-        let away = arena::distance(arena::position(pose), self.goal_m);
+        let distance = arena::distance(arena::position(pose), self.goal_m);
         let bearing = arena::bearing(pose, self.goal_m);
         let angular = self.heading.update(bearing, dt);
-        let linear = self.distance.update(away, dt);
+        let linear = self.distance.update(distance, dt);
         [linear.max(0.0) * bearing.cos().max(0.0), angular]
     }
 
@@ -43,14 +44,16 @@ impl Navigator {
         arena::distance(arena::position(pose), self.goal_m) < ARRIVAL_M
     }
 
-    /// Draws another of the starts and goals to go to.
+    /// Draws a new goal from the start and goal positions.
     pub(super) fn choose_goal(&mut self, pose: PlanarPose) {
-        let places: Vec<[f32; 2]> = arena::STARTS_M
+        let positions: Vec<[f32; 2]> = arena::STARTS_M
             .into_iter()
             .chain(arena::GOALS_M)
-            .filter(|&place| place != self.goal_m && arena::distance(arena::position(pose), place) >= NEXT_GOAL_M)
+            .filter(|&position| {
+                position != self.goal_m && arena::distance(arena::position(pose), position) >= NEXT_GOAL_M
+            })
             .collect();
-        if let Some(&goal) = places.get(self.random.random_range(0..places.len().max(1))) {
+        if let Some(&goal) = positions.get(self.random.random_range(0..positions.len().max(1))) {
             self.goal_m = goal;
         }
         self.heading.reset();

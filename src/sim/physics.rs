@@ -1,10 +1,10 @@
 //! The robots as rigid bodies in rapier.
 //!
-//! Each robot is a dynamic body that keeps its height and turns about the vertical only. Its collider is a ball at one
-//! height with all others, which in that plane is the disc of its round base, and the cheapest shape there is. Tyres are
-//! modelled, not wheels: before each step the tyres change the body's velocity towards what the wheels' speeds ask for,
-//! at most by what their friction can do in a step; then rapier resolves contacts. So a robot that meets a wall stops
-//! though its wheels go on turning, one that is pushed yields, and an undisturbed one follows the exact arc.
+//! Each robot is a dynamic body with a fixed height that rotates only around the vertical axis. Its collider is a ball, the
+//! cheapest shape; all balls have the same height, so in that plane they act as the discs of the round bases. The model
+//! contains tyre friction instead of wheels: before each step, the body's velocity changes towards the velocity of the wheels,
+//! at most by what friction allows in one step; then rapier resolves contacts. So a robot at a wall stops although its wheels
+//! still turn, a pushed robot moves, and an undisturbed robot follows the exact arc.
 
 use rapier3d::prelude::{
     ColliderBuilder, ColliderHandle, LockedAxes, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
@@ -13,10 +13,10 @@ use rapier3d::prelude::{
 use super::robot::{DifferentialDrive, WHEEL_BASE_M, mean_velocity};
 use super::{PlanarPose, arena};
 
-/// Height of all colliders' centres, in metres.
+/// Height of the centers of all colliders, in metres.
 const PLANE_M: f32 = 0.2;
 const MASS_KG: f32 = 6.0;
-/// Most that the tyres accelerate the body, in metres a second squared: friction 0.6.
+/// Largest acceleration by the tyres, in m/s²: friction coefficient 0.6.
 const GRIP_M_S2: f32 = 0.6 * 9.81;
 const WALL_THICKNESS_M: f32 = 0.5;
 
@@ -27,7 +27,7 @@ struct Body {
     drive: DifferentialDrive,
 }
 
-/// The arena with its robots, in the order they were added.
+/// The arena with its robots, in the order in which they were added.
 pub(super) struct PhysicsScene {
     physics: PhysicsWorld,
     robots: Vec<Body>,
@@ -60,7 +60,7 @@ impl PhysicsScene {
         }
     }
 
-    /// Puts a robot there, wheels at rest.
+    /// Adds a robot at this pose, with its wheels at rest.
     pub(super) fn add_robot(&mut self, pose: PlanarPose, radius_m: f32) {
         let upright = LockedAxes::TRANSLATION_LOCKED_Z | LockedAxes::ROTATION_LOCKED_X | LockedAxes::ROTATION_LOCKED_Y;
         let body = RigidBodyBuilder::dynamic()
@@ -78,14 +78,14 @@ impl PhysicsScene {
         });
     }
 
-    /// Tells the robot's wheels a body velocity, [m/s, rad/s], clamped to the base's limits.
+    /// Sets the robot's velocity command, [m/s, rad/s], clamped to the limits of the base.
     pub(super) fn command(&mut self, robot: usize, [linear, angular]: [f32; 2]) {
         if let Some(body) = self.robots.get_mut(robot) {
             body.drive.command(linear, angular);
         }
     }
 
-    /// Moves everything on by `dt` seconds.
+    /// Simulates `dt` seconds.
     pub(super) fn advance(&mut self, dt: f32) {
         self.physics.integration_parameters.dt = dt;
         for robot in &mut self.robots {
@@ -97,29 +97,31 @@ impl PhysicsScene {
             let [x, y] = mean_velocity(heading(body.rotation()), linear, angular, dt);
             let slip = Vector::new(x, y, 0.0) - body.linvel();
             body.set_linvel(body.linvel() + slip.clamp_length_max(GRIP_M_S2 * dt), true);
-            // A uniform ball's inertia, 2/5 m r², turned by the tyres half a wheel base off the middle.
-            let most = GRIP_M_S2 * (WHEEL_BASE_M / 2.0) / (0.4 * robot.radius_m * robot.radius_m) * dt;
+            // The inertia of a uniform ball is 2/5 m r². The tyres act half a wheel base from the center.
+            let max_change = GRIP_M_S2 * (WHEEL_BASE_M / 2.0) / (0.4 * robot.radius_m * robot.radius_m) * dt;
             let spin = body.angvel().z;
-            let spin = spin + (angular - spin).clamp(-most, most);
+            let spin = spin + (angular - spin).clamp(-max_change, max_change);
             body.set_angvel(Vector::new(0.0, 0.0, spin), true);
         }
         self.physics.step();
     }
 
-    /// Where the robot truly stands.
+    /// The robot's true pose. `robot` is the number of an added robot.
+    #[expect(clippy::expect_used, reason = "the caller numbers the robots as it added them")]
     pub(super) fn pose(&self, robot: usize) -> PlanarPose {
         let body = self
             .robots
             .get(robot)
             .and_then(|robot| self.physics.bodies.get(robot.handle));
-        body.map_or(arena::OBSERVER, |body| PlanarPose {
+        let body = body.expect("the pose of a robot that was not added is a bug");
+        PlanarPose {
             x_m: body.translation().x,
             y_m: body.translation().y,
             heading_rad: heading(body.rotation()),
-        })
+        }
     }
 
-    /// What the robot's wheels say, as [`super::state_channels`] names it.
+    /// The robot's wheel odometry, with the components of [`super::state_channels`].
     pub(super) fn odometry(&self, robot: usize) -> Vec<f32> {
         let Some(body) = self.robots.get(robot) else {
             return Vec::new();

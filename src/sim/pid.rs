@@ -1,9 +1,10 @@
-//! A PID controller whose output is limited and whose integral does not wind up at the limit.
+//! A PID controller with limited output and anti-windup.
 
 use serde::{Deserialize, Serialize};
 
 /// The three gains.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Gains {
     /// Output per unit of error.
@@ -14,7 +15,7 @@ pub struct Gains {
     pub derivative: f32,
 }
 
-/// The controller's gains and memory.
+/// The controller: its gains and its state.
 #[derive(Clone, Debug)]
 pub struct Pid {
     gains: Gains,
@@ -24,7 +25,7 @@ pub struct Pid {
 }
 
 impl Pid {
-    /// A controller at rest, whose output stays within ±`limit`.
+    /// A controller in its initial state, with its output limited to ±`limit`.
     #[must_use]
     pub fn new(gains: Gains, limit: f32) -> Self {
         Self {
@@ -35,14 +36,14 @@ impl Pid {
         }
     }
 
-    /// Forgets what was, for a new goal.
+    /// Resets the state, for a new goal.
     pub fn reset(&mut self) {
         self.integral = 0.0;
         self.last_error = None;
     }
 
-    /// The output for this error, `dt` seconds after the last one. Anti-windup: while the output is at its limit, error
-    /// that would drive it further is not integrated.
+    /// The output for this error, `dt` seconds after the previous one. Anti-windup: while the output is at its limit, an
+    /// error that would increase it further is not integrated.
     pub fn update(&mut self, error: f32, dt: f32) -> f32 {
         let rate = self.last_error.map_or(0.0, |last| (error - last) / dt);
         self.last_error = Some(error);
@@ -69,7 +70,7 @@ mod tests {
         }
     }
 
-    /// Positions of x' = u, driven from 0 to 1, every millisecond.
+    /// Positions of the system x' = u, controlled from 0 to 1, every millisecond.
     fn step_response(mut pid: Pid, steps: usize) -> Vec<f32> {
         let mut x = 0.0;
         (0..steps)
@@ -81,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_proportional_step_response_is_the_exponential() {
+    fn the_p_step_response_is_exponential() {
         for (step, x) in step_response(Pid::new(gains(2.0, 0.0, 0.0), 100.0), 2000)
             .iter()
             .enumerate()
@@ -92,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn a_proportional_integral_step_response_is_the_damped_oscillation() {
+    fn the_pi_step_response_is_a_damped_oscillation() {
         // e'' + kp e' + ki e = 0 with e(0) = 1, e'(0) = −kp.
         let (kp, ki) = (1.5f32, 3.0f32);
         let damping = kp / 2.0;
@@ -108,8 +109,8 @@ mod tests {
     }
 
     #[test]
-    fn a_proportional_derivative_step_response_is_the_slowed_exponential() {
-        // x' = kp e + kd e' with e' = −x' gives e = exp(−kp t / (1 + kd)), from e(0) = 1 as the first update sees no rate.
+    fn the_pd_step_response_is_a_slower_exponential() {
+        // x' = kp e + kd e' with e' = −x' gives e = exp(−kp t / (1 + kd)), from e(0) = 1, because the first update has no rate.
         let (kp, kd) = (2.0f32, 0.5f32);
         for (step, x) in step_response(Pid::new(gains(kp, 0.0, kd), 100.0), 3000)
             .iter()
@@ -127,12 +128,12 @@ mod tests {
         for _ in 0..10_000 {
             assert_eq!(pid.update(1.0, DT), 0.5);
         }
-        // Ten seconds at the limit left nothing behind: the output follows the error's sign at once.
+        // After ten seconds at the limit, the output still follows the error's sign at once.
         assert!(pid.update(-0.1, DT) < -0.09);
     }
 
     #[test]
-    fn the_integral_gathers_below_the_limit() {
+    fn the_integral_grows_below_the_limit() {
         let mut pid = Pid::new(gains(0.0, 2.0, 0.0), 1.0);
         let output = (0..250).map(|_| pid.update(1.0, DT)).last().unwrap();
         assert!((output - 0.5).abs() < 1e-4, "{output}");

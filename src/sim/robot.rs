@@ -1,4 +1,4 @@
-//! A Kobuki base: two driven wheels with limits, and the odometry that counts their turns.
+//! A Kobuki base: two driven wheels with limits, and wheel odometry.
 
 use std::f32::consts::{PI, TAU};
 
@@ -8,14 +8,14 @@ use super::PlanarPose;
 pub const WHEEL_RADIUS_M: f32 = 0.035;
 /// Distance between the driven wheels, in metres.
 pub const WHEEL_BASE_M: f32 = 0.23;
-/// Fastest the base drives, in metres a second.
+/// Highest linear velocity of the base, in m/s.
 pub const MAX_LINEAR_M_S: f32 = 0.7;
-/// Fastest the base turns, in radians a second (110° a second).
+/// Highest angular velocity of the base, in rad/s (110°/s).
 pub const MAX_ANGULAR_RAD_S: f32 = 110.0 * PI / 180.0;
-/// Fastest a wheel changes its speed at the rim, in metres a second squared.
+/// Highest acceleration of a wheel's rim, in m/s².
 pub const MAX_RIM_ACCELERATION_M_S2: f32 = 1.2;
 
-/// The wheels of one robot: what they are told, how fast they turn, and where they think they are.
+/// The wheels of one robot: target speeds, current speeds and odometry.
 #[derive(Clone, Debug)]
 pub struct DifferentialDrive {
     target_rad_s: [f32; 2],
@@ -24,7 +24,7 @@ pub struct DifferentialDrive {
 }
 
 impl DifferentialDrive {
-    /// Wheels at rest; odometry begins at `pose`.
+    /// Wheels at rest; the odometry starts at `pose`.
     #[must_use]
     pub fn new(pose: PlanarPose) -> Self {
         Self {
@@ -34,7 +34,7 @@ impl DifferentialDrive {
         }
     }
 
-    /// Wheel speeds for that body velocity, each part clamped to the base's limits.
+    /// Sets the target wheel speeds for this body velocity; each component is clamped to the limits of the base.
     pub fn command(&mut self, linear_m_s: f32, angular_rad_s: f32) {
         let linear = linear_m_s.clamp(-MAX_LINEAR_M_S, MAX_LINEAR_M_S);
         let angular = angular_rad_s.clamp(-MAX_ANGULAR_RAD_S, MAX_ANGULAR_RAD_S);
@@ -42,32 +42,32 @@ impl DifferentialDrive {
         self.target_rad_s = [(linear - turn) / WHEEL_RADIUS_M, (linear + turn) / WHEEL_RADIUS_M];
     }
 
-    /// Turns the wheels for `dt` seconds and counts the way in the odometry.
+    /// Turns the wheels for `dt` seconds and updates the odometry.
     pub fn advance(&mut self, dt: f32) {
-        let most = MAX_RIM_ACCELERATION_M_S2 / WHEEL_RADIUS_M * dt;
+        let max_change = MAX_RIM_ACCELERATION_M_S2 / WHEEL_RADIUS_M * dt;
         for (speed, target) in self.wheel_rad_s.iter_mut().zip(self.target_rad_s) {
-            *speed += (target - *speed).clamp(-most, most);
+            *speed += (target - *speed).clamp(-max_change, max_change);
         }
         let (linear, angular) = self.velocity();
         self.odometry = roll(self.odometry, linear, angular, dt);
     }
 
-    /// Velocity of a body that rolls without slipping: metres and radians a second.
+    /// Velocity of a body that rolls without slipping, in m/s and rad/s.
     #[must_use]
     pub fn velocity(&self) -> (f32, f32) {
         let [left, right] = self.wheel_rad_s.map(|speed| speed * WHEEL_RADIUS_M);
         (f32::midpoint(left, right), (right - left) / WHEEL_BASE_M)
     }
 
-    /// Where the turns of the wheels say the robot is.
+    /// The pose estimated from the wheels.
     #[must_use]
     pub fn odometry(&self) -> PlanarPose {
         self.odometry
     }
 }
 
-/// The pose after rolling for `dt` seconds at constant wheel speeds: the exact arc of a unicycle, written with its chord
-/// so that it also holds for a straight line.
+/// The pose after rolling for `dt` seconds at constant wheel speeds: the exact arc of a unicycle. The formula uses the arc's
+/// chord, so it also works for a straight line.
 #[must_use]
 pub fn roll(pose: PlanarPose, linear_m_s: f32, angular_rad_s: f32, dt: f32) -> PlanarPose {
     let [x, y] = mean_velocity(pose.heading_rad, linear_m_s, angular_rad_s, dt);
@@ -78,7 +78,7 @@ pub fn roll(pose: PlanarPose, linear_m_s: f32, angular_rad_s: f32, dt: f32) -> P
     }
 }
 
-/// The constant velocity in x and y that goes along the arc's chord in `dt` seconds.
+/// The constant velocity in x and y that moves along the arc's chord in `dt` seconds.
 #[must_use]
 pub fn mean_velocity(heading_rad: f32, linear_m_s: f32, angular_rad_s: f32, dt: f32) -> [f32; 2] {
     let half_turn = angular_rad_s * dt / 2.0;

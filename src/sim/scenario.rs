@@ -1,4 +1,5 @@
-//! The scenarios, what is drawn for a trial of one, and which trials are kept for the test on unseen ways and gains.
+//! The scenarios, the random parameters of a trial, and which trials are held out for the test on unseen start/goal pairs and
+//! PID gains.
 
 use std::fmt;
 use std::ops::Range;
@@ -13,34 +14,35 @@ use super::pid::Gains;
 use super::{PlanarPose, SimError, arena, robot};
 use crate::types::Seed;
 
-/// (start, goal) pairs of Tb2 that no training sees; their ways cross others.
+/// (start, goal) pairs of Tb2 that are never used for training. Their routes cross routes of the other pairs.
 pub const HELD_OUT_PAIRS: [(usize, usize); 2] = [(1, 0), (2, 3)];
-/// Tb2's proportional heading gains, drawn evenly.
+/// Range of Tb2's proportional heading gain, drawn uniformly.
 pub const HEADING_GAIN: Range<f32> = 1.2..4.0;
-/// The tenth of [`HEADING_GAIN`] that no training sees.
+/// The tenth of [`HEADING_GAIN`] that is never used for training.
 pub const HELD_OUT_HEADING_GAIN: Range<f32> = 2.44..2.72;
-/// Movers in `crowded` besides Tb2.
+/// Robots in `crowded` besides Tb1 and Tb2.
 const CROWD: usize = 3;
-/// Most movers besides Tb2 that parameters written by hand may ask for.
+/// Largest number of robots besides Tb1 and Tb2 in parameters written by hand.
 const MAX_CROWD: usize = 16;
 
-/// Who moves, and when a trial ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+/// Which robots move, and when a trial ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Scenario {
-    /// The paper's: Tb1 stands still; the trial ends when Tb2 reaches its goal.
+    /// The paper's scenario: Tb1 stands still; the trial ends when Tb2 reaches its goal.
     StaticObserver,
-    /// Tb1 drives too; Tb2 takes another goal when it reaches one, until the time is over.
+    /// Tb1 drives too. When Tb2 reaches its goal, it gets another one; the trial ends at its time limit.
     MovingObserver,
-    /// Like `moving-observer` with three more movers.
+    /// Like `moving-observer`, with three more robots.
     Crowded,
 }
 
 impl Scenario {
-    /// All there are.
+    /// All scenarios.
     pub const ALL: [Self; 3] = [Self::StaticObserver, Self::MovingObserver, Self::Crowded];
 
-    /// Its name on the command line and on disk.
+    /// The scenario's name, on the command line and on disk.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -50,14 +52,14 @@ impl Scenario {
         }
     }
 
-    /// Whether Tb1 moves.
+    /// Whether Tb1 drives.
     #[must_use]
     pub fn observer_drives(self) -> bool {
         self != Self::StaticObserver
     }
 }
 
-/// The scenarios' names, as a list for messages.
+/// Names of all scenarios, separated by commas, for messages.
 pub(super) fn names() -> String {
     Scenario::ALL.map(Scenario::name).join(", ")
 }
@@ -77,15 +79,16 @@ impl FromStr for Scenario {
     }
 }
 
-/// How a mover is driven: a controller for its heading, one for its distance, and its own top speed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// Gains of a robot's two PID controllers, for heading and distance, and its highest speed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PidGains {
     /// From heading error (rad) to angular velocity (rad/s).
     pub heading: Gains,
     /// From distance to the goal (m) to linear velocity (m/s).
     pub distance: Gains,
-    /// The linear velocity's limit, in metres a second.
+    /// Highest linear velocity, in m/s.
     pub max_linear_m_s: f32,
 }
 
@@ -107,45 +110,47 @@ impl PidGains {
     }
 }
 
-/// Where a mover begins, where it goes first, and how.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// Start pose, first goal and controller gains of a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Route {
-    /// At the beginning.
+    /// Pose at the start.
     pub pose: PlanarPose,
     /// The first goal, [x, y].
     pub goal_m: [f32; 2],
-    /// How it is driven.
+    /// Gains of its controllers.
     pub gains: PidGains,
 }
 
-/// All that was drawn for a trial.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// All random parameters of a trial.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct TrialParameters {
-    /// Who moves.
+    /// The scenario.
     pub scenario: Scenario,
-    /// Position in the seed's sequence.
+    /// Number of the trial, counted from 0 for each seed.
     pub trial: u64,
-    /// Of the sequence.
-    #[schema(value_type = u64)]
+    /// The seed of all trials.
+    #[cfg_attr(feature = "server", schema(value_type = u64))]
     pub seed: Seed,
     /// Tb2's start, an index of [`arena::STARTS_M`].
     pub start: usize,
     /// Tb2's (first) goal, an index of [`arena::GOALS_M`].
     pub goal: usize,
-    /// How Tb2 is driven.
+    /// Gains of Tb2's controllers.
     pub gains: PidGains,
     /// Tb2's heading at the start, in radians.
     pub start_heading_rad: f32,
-    /// Where Tb1 begins.
+    /// Tb1's pose at the start.
     pub observer: PlanarPose,
-    /// The further movers (`crowded`).
+    /// The robots besides Tb1 and Tb2 (`crowded`).
     pub crowd: Vec<Route>,
 }
 
 impl TrialParameters {
-    /// Draws trial `trial` of the seed's sequence, without drawing those before it.
+    /// Draws the parameters of trial number `trial` of the seed. Other trials need not be drawn first.
     #[must_use]
     pub fn draw(scenario: Scenario, seed: Seed, trial: u64) -> Self {
         let mut random = seed.derive("trial", trial).rng();
@@ -157,20 +162,20 @@ impl TrialParameters {
         let start_heading_rad = robot::wrap(ahead + random.random_range(-1.5..1.5));
         let mut taken = vec![start_m];
         let observer = if scenario.observer_drives() {
-            let place = free_place(&mut random, &taken, 1.0);
-            taken.push(place);
-            let heading = facing(place, start_m) + random.random_range(-0.6..0.6);
-            pose(place, robot::wrap(heading))
+            let position = free_position(&mut random, &taken, 1.0);
+            taken.push(position);
+            let heading = facing(position, start_m) + random.random_range(-0.6..0.6);
+            pose(position, robot::wrap(heading))
         } else {
             arena::OBSERVER
         };
         let crowd_size = if scenario == Scenario::Crowded { CROWD } else { 0 };
         let crowd = (0..crowd_size)
             .map(|_| {
-                let place = free_place(&mut random, &taken, 0.6);
-                taken.push(place);
+                let position = free_position(&mut random, &taken, 0.6);
+                taken.push(position);
                 Route {
-                    pose: pose(place, random.random_range(-3.1..3.1)),
+                    pose: pose(position, random.random_range(-3.1..3.1)),
                     goal_m: arena::GOALS_M[random.random_range(0..arena::GOALS_M.len())],
                     gains: PidGains::draw(&mut random),
                 }
@@ -189,8 +194,8 @@ impl TrialParameters {
         }
     }
 
-    /// Errors: `Setting` where parameters that were written by hand name a start or goal that is not there, place a robot
-    /// outside the room, or crowd it.
+    /// Checks parameters that were written by hand. Errors: `Setting` if a start or goal does not exist, a robot is outside
+    /// the room, or there are too many robots.
     pub fn validate(&self) -> Result<(), SimError> {
         in_range("start", self.start as f64, 0.0, arena::STARTS_M.len() as f64 - 1.0)?;
         in_range("goal", self.goal as f64, 0.0, arena::GOALS_M.len() as f64 - 1.0)?;
@@ -204,8 +209,8 @@ impl TrialParameters {
         Ok(())
     }
 
-    /// Whether the trial belongs to those that no training may see, by its start/goal pair or its heading gain. Where
-    /// Tb2 goes on to further goals, the first pair counts.
+    /// Whether the trial must not be used for training, because of its start/goal pair or its heading gain. If Tb2 drives to
+    /// several goals, the first pair counts.
     #[must_use]
     pub fn is_held_out(&self) -> bool {
         self.has_held_out_pair() || HELD_OUT_HEADING_GAIN.contains(&self.gains.heading.proportional)
@@ -217,10 +222,13 @@ impl TrialParameters {
         HELD_OUT_PAIRS.contains(&(self.start, self.goal))
     }
 
-    /// Tb2's way first, then the crowd's.
+    /// The route of Tb2, then those of the other robots. Call it only after [`Self::validate`] has passed.
+    #[expect(clippy::expect_used, reason = "validate() has checked both indexes")]
     pub(super) fn routes(&self) -> Vec<Route> {
-        let start_m = arena::STARTS_M.get(self.start).copied().unwrap_or(arena::STARTS_M[0]);
-        let goal_m = arena::GOALS_M.get(self.goal).copied().unwrap_or(arena::GOALS_M[0]);
+        let start_m = arena::STARTS_M.get(self.start).copied();
+        let start_m = start_m.expect("an unknown start after validate() is a bug");
+        let goal_m = arena::GOALS_M.get(self.goal).copied();
+        let goal_m = goal_m.expect("an unknown goal after validate() is a bug");
         let tb2 = Route {
             pose: pose(start_m, self.start_heading_rad),
             goal_m,
@@ -229,7 +237,7 @@ impl TrialParameters {
         std::iter::once(tb2).chain(self.crowd.iter().copied()).collect()
     }
 
-    /// A generator of the trial's own for that use.
+    /// A separate random generator of this trial for the named use.
     pub(super) fn stream(&self, name: &str, index: u64) -> ChaCha8Rng {
         self.seed.derive("trial", self.trial).derive(name, index).rng()
     }
@@ -244,15 +252,19 @@ fn facing(from: [f32; 2], to: [f32; 2]) -> f32 {
     (to[1] - from[1]).atan2(to[0] - from[0])
 }
 
-/// A place in the room away from walls and pillars, `apart` metres from those taken.
-fn free_place(random: &mut ChaCha8Rng, taken: &[[f32; 2]], apart: f32) -> [f32; 2] {
+/// A random position away from walls and pillars, at least `min_distance` metres from the positions `taken`.
+fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32) -> [f32; 2] {
     loop {
         let x = random.random_range(0.4..arena::LENGTH_M - 0.4);
         let y = random.random_range(0.4 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.4);
-        let pillars = arena::PILLARS
+        let is_clear_of_pillars = arena::PILLARS
             .iter()
             .all(|pillar| arena::distance(pillar.position_m, [x, y]) > pillar.radius_m + 0.3);
-        if pillars && taken.iter().all(|&other| arena::distance(other, [x, y]) >= apart) {
+        if is_clear_of_pillars
+            && taken
+                .iter()
+                .all(|&other| arena::distance(other, [x, y]) >= min_distance)
+        {
             return [x, y];
         }
     }

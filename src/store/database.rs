@@ -1,4 +1,4 @@
-//! The two databases behind one face: the same statements and values go to either. Whatever differs is here.
+//! SQLite and PostgreSQL behind one interface: both get the same statements and values. All differences are here.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -14,15 +14,23 @@ use sqlx::{
 };
 
 use super::StoreError;
+use crate::files::open_lock;
 
-/// Connections to the database at most.
+/// The maximum number of connections to the database.
 const MAX_CONNECTIONS: u32 = 8;
 /// How long a statement waits for a connection or, on SQLite, for another writer.
-const PATIENCE: Duration = Duration::from_secs(10);
+const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 
-const MIGRATIONS: &[(i64, &str, &str)] = &[(1, "initial", include_str!("migrations/0001_initial.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "initial", include_str!("migrations/0001_initial.sql")),
+    (
+        2,
+        "attempts and metrics",
+        include_str!("migrations/0002_attempts_and_metrics.sql"),
+    ),
+];
 
-/// What a statement is given for `$1`, `$2`, …
+/// A parameter of a statement: `$1`, `$2`, …
 #[derive(Clone, Debug)]
 pub(super) enum DatabaseValue {
     Text(Option<String>),
@@ -44,14 +52,14 @@ value_from!(Text: &str => |text: &str| Some(text.to_owned()), String => Some, Op
 value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::from(int)));
 value_from!(Real: f64 => Some, Option<f64> => |real| real);
 
-/// A row that came back.
+/// A row of a result.
 pub(super) enum DatabaseRow {
     Sqlite(SqliteRow),
     Postgres(PgRow),
 }
 
 impl DatabaseRow {
-    /// The value in a column. Errors: `Query` if there is none of that name and type.
+    /// The value in a column. Errors: `Query` if there is no column of that name and type.
     pub(super) fn get<T>(&self, column: &str) -> Result<T, StoreError>
     where
         T: for<'r> Decode<'r, Sqlite> + Type<Sqlite> + for<'r> Decode<'r, Postgres> + Type<Postgres>,
@@ -70,7 +78,7 @@ pub(super) enum Database {
     Postgres(PgPool),
 }
 
-/// A transaction that is rolled back unless committed. On SQLite nobody else writes meanwhile.
+/// A transaction. It is rolled back unless committed. On SQLite, only one transaction writes at a time.
 pub(super) enum Tx {
     Sqlite(Transaction<'static, Sqlite>),
     Postgres(Transaction<'static, Postgres>),
@@ -90,7 +98,7 @@ where
 }
 
 impl Database {
-    pub(super) async fn open(url: &str) -> Result<Self, StoreError> {
+    pub(super) async fn open(url: &str, is_first: bool) -> Result<Self, StoreError> {
         let scheme = url.split(':').next().unwrap_or_default();
         match scheme {
             "sqlite" => {
@@ -98,66 +106,99 @@ impl Database {
                     database: "SQLite",
                     source,
                 })?;
-                Self::open_sqlite(options).await
+                Self::open_sqlite(options, is_first).await
             }
             "postgres" | "postgresql" => Box::pin(Self::open_postgres(url)).await,
             _ => Err(StoreError::Url {
                 flag: "database",
                 scheme: scheme.chars().take(16).collect(),
-                known: "sqlite:FILE or postgres://USER@HOST/NAME",
+                expected: "sqlite:FILE or postgres://USER@HOST/NAME",
             }),
         }
     }
 
-    pub(super) async fn open_file(path: &Path) -> Result<Self, StoreError> {
-        Self::open_sqlite(SqliteConnectOptions::new().filename(path)).await
+    pub(super) async fn open_file(path: &Path, is_first: bool) -> Result<Self, StoreError> {
+        Self::open_sqlite(SqliteConnectOptions::new().filename(path), is_first).await
     }
 
-    async fn open_sqlite(options: SqliteConnectOptions) -> Result<Self, StoreError> {
-        // SQLite's migrations lock nothing, and two processes may start at once.
+    async fn open_sqlite(options: SqliteConnectOptions, is_first: bool) -> Result<Self, StoreError> {
+        let path = options.get_filename().to_owned();
+        // SQLite's migrations take no lock, and two processes can start at the same time.
         let lock_path = options.get_filename().with_extension("lock");
         let failed = StoreError::io("lock", &lock_path);
         let locked = tokio::task::spawn_blocking(move || {
-            let lock = std::fs::File::create(&lock_path)?;
+            let lock = open_lock(&lock_path)?;
             lock.lock().map(|()| lock)
         });
         let _lock = locked.await.unwrap_or_else(|error| Err(error.into())).map_err(failed)?;
         let options = options
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
-            .busy_timeout(PATIENCE);
+            .busy_timeout(BUSY_TIMEOUT);
         let pool = SqlitePoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
-            .acquire_timeout(PATIENCE)
+            .acquire_timeout(BUSY_TIMEOUT)
+            // A failed commit or rollback, for example on a full disk, leaves the connection unusable: discard it.
+            .after_release(|connection, _| {
+                Box::pin(async move {
+                    connection.ping().await?;
+                    Ok(!connection.is_in_transaction())
+                })
+            })
             .connect_with(options)
             .await
-            .map_err(|source| StoreError::Open {
-                database: "SQLite",
-                source,
-            })?;
+            .map_err(|source| sqlite_failed(&path, source))?;
+        if is_first {
+            check_integrity(&pool, &path).await?;
+        }
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Sqlite(pool))
+    }
+
+    /// The database's time in seconds since 1970, so that the clocks of several machines need not agree.
+    pub(super) async fn now_s(&self) -> Result<f64, StoreError> {
+        let sql = match self {
+            Self::Sqlite(_) => "SELECT (julianday('now') - 2440587.5) * 86400.0 AS now_s",
+            Self::Postgres(_) => "SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION) AS now_s",
+        };
+        let rows = self.fetch(sql, vec![]).await?;
+        rows.first()
+            .ok_or(StoreError::Query(sqlx::Error::RowNotFound))?
+            .get("now_s")
+    }
+
+    /// Moves everything from the write-ahead log into the database file and closes all connections.
+    pub(super) async fn close(&self) -> Result<(), StoreError> {
+        let checkpointed = match self {
+            Self::Sqlite(_) => self.fetch("PRAGMA wal_checkpoint(TRUNCATE)", vec![]).await.map(drop),
+            Self::Postgres(_) => Ok(()),
+        };
+        match self {
+            Self::Sqlite(pool) => pool.close().await,
+            Self::Postgres(pool) => pool.close().await,
+        }
+        checkpointed
     }
 
     async fn open_postgres(url: &str) -> Result<Self, StoreError> {
         let pool = PgPoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
-            .acquire_timeout(PATIENCE)
+            .acquire_timeout(BUSY_TIMEOUT)
             .connect(url);
         let pool = match pool.await {
             Ok(pool) => pool,
-            // A pool that got no connection in time does not say why; a connection of its own does.
+            // The pool's timeout hides the reason; a single connection reports it.
             Err(sqlx::Error::PoolTimedOut) => {
                 let reason = PgConnection::connect(url).await.err();
-                return Err(unopened(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
+                return Err(open_failed(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
             }
-            Err(error) => return Err(unopened(error)),
+            Err(error) => return Err(open_failed(error)),
         };
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Postgres(pool))
     }
 
-    /// The rows that a statement gives.
+    /// The rows of a query.
     pub(super) async fn fetch(
         &self,
         sql: &'static str,
@@ -179,7 +220,7 @@ impl Database {
         })
     }
 
-    /// Begins a transaction that will write.
+    /// Begins a write transaction.
     pub(super) async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(match self {
             Self::Sqlite(pool) => Tx::Sqlite(pool.begin_with("BEGIN IMMEDIATE").await?),
@@ -197,7 +238,7 @@ impl Tx {
         self.fetch_any(sql.into_sql_str(), values).await
     }
 
-    /// As `fetch`, but holds the rows and passes over those that another transaction holds.
+    /// As `fetch`, but locks the rows and skips those that another transaction has locked.
     pub(super) async fn fetch_free(
         &mut self,
         sql: &'static str,
@@ -242,7 +283,73 @@ fn postgres_rows(rows: Vec<PgRow>) -> Vec<DatabaseRow> {
     rows.into_iter().map(DatabaseRow::Postgres).collect()
 }
 
-fn unopened(source: sqlx::Error) -> StoreError {
+fn sqlite_failed(path: &Path, source: sqlx::Error) -> StoreError {
+    match sqlite_code(&source) {
+        Some(SQLITE_CORRUPT | SQLITE_NOTADB) => StoreError::Damaged {
+            path: path.to_owned(),
+            reason: source.to_string(),
+        },
+        _ => StoreError::Open {
+            database: "SQLite",
+            source,
+        },
+    }
+}
+
+/// Errors: `Damaged` if the database's structure is not sound.
+async fn check_integrity(pool: &SqlitePool, path: &Path) -> Result<(), StoreError> {
+    let found: Result<String, sqlx::Error> = sqlx::query_scalar("PRAGMA quick_check(1)").fetch_one(pool).await;
+    match found {
+        Ok(found) if found == "ok" => Ok(()),
+        Ok(reason) => Err(StoreError::Damaged {
+            path: path.to_owned(),
+            reason: reason.replace('\n', "; "),
+        }),
+        Err(error) => Err(sqlite_failed(path, error)),
+    }
+}
+
+const SQLITE_BUSY: i32 = 5;
+const SQLITE_READONLY: i32 = 8;
+const SQLITE_IOERR: i32 = 10;
+const SQLITE_CORRUPT: i32 = 11;
+const SQLITE_FULL: i32 = 13;
+const SQLITE_CANTOPEN: i32 = 14;
+const SQLITE_NOTADB: i32 = 26;
+
+/// SQLite's primary error code.
+fn sqlite_code(error: &sqlx::Error) -> Option<i32> {
+    let database = error
+        .as_database_error()?
+        .try_downcast_ref::<sqlx::sqlite::SqliteError>()?;
+    let code: i32 = sqlx::error::DatabaseError::code(database)?.parse().ok()?;
+    Some(code & 0xff)
+}
+
+/// Whether the database cannot be reached or written now, but may be later.
+pub(super) fn is_unavailable(error: &sqlx::Error) -> bool {
+    match error {
+        sqlx::Error::Io(_)
+        | sqlx::Error::Tls(_)
+        | sqlx::Error::PoolTimedOut
+        | sqlx::Error::PoolClosed
+        | sqlx::Error::WorkerCrashed => true,
+        sqlx::Error::Database(_) => match sqlite_code(error) {
+            Some(code) => matches!(
+                code,
+                SQLITE_BUSY | SQLITE_READONLY | SQLITE_IOERR | SQLITE_FULL | SQLITE_CANTOPEN
+            ),
+            // Connection exceptions, lack of resources, and operator intervention, for example a shutdown.
+            None => error
+                .as_database_error()
+                .and_then(|error| error.code())
+                .is_some_and(|code| ["08", "53", "57"].iter().any(|class| code.starts_with(class))),
+        },
+        _ => false,
+    }
+}
+
+fn open_failed(source: sqlx::Error) -> StoreError {
     match source {
         sqlx::Error::Tls(_) if !cfg!(feature = "cloud") => StoreError::NoTls,
         source => StoreError::Open {

@@ -1,39 +1,45 @@
-//! Jobs as rows: enqueued, taken up under a lease, reported on and ended by whoever holds the lease's token.
+//! The rows of jobs: enqueue, claim under a lease, report, end.
 //!
-//! A lease runs out unless renewed. Each taking up raises the row's token, and every write of a job's work names the
-//! token it was given, so that one who was thought dead and comes back writes nothing.
+//! A lease expires unless it is renewed. Each claim increments the row's fencing token, and every write names the token of
+//! its claim. So a worker whose lease expired cannot write any more.
 
-use super::accounts::{JobUpdate, write_account};
+use serde::{Deserialize, Serialize};
+
 use super::database::{DatabaseRow, DatabaseValue, Tx};
-use super::{Store, StoreError};
+use super::reports::{JobReport, write_report};
+use super::{ModelMetrics, Store, StoreError};
 
-/// A job as it is kept. Structured values are JSON of the one who wrote them.
+/// The row of a job. Structured values are JSON.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JobRow {
-    /// Counts the jobs, from 1.
+    /// The job's number, from 1.
     pub number: i64,
     /// `collect`, `train`, …
     pub kind: String,
     /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
     pub state: String,
-    /// What is to be done.
+    /// Its specification.
     pub spec: String,
-    /// How far it is.
+    /// Its progress.
     pub progress: String,
-    /// What came of it.
+    /// Its result.
     pub outcome: Option<String>,
     /// Why it failed.
     pub error: Option<String>,
-    /// Whether it was asked to stop and has not yet.
+    /// Whether it is running and was asked to stop.
     pub cancelling: bool,
-    /// When it was asked for, in seconds since 1970.
+    /// When it was enqueued, in seconds since 1970.
     pub queued_s: f64,
-    /// When it was taken up first, in seconds since 1970.
+    /// When its first attempt started, in seconds since 1970.
     pub started_s: Option<f64>,
     /// When it ended, in seconds since 1970.
     pub ended_s: Option<f64>,
-    /// How often it was taken up.
+    /// How often it was claimed.
     pub token: i64,
+    /// How many units of work are saved.
+    pub checkpoint: i64,
+    /// How many attempts in a row ended abnormally without saving more.
+    pub stalled_attempts: i64,
 }
 
 impl JobRow {
@@ -51,6 +57,8 @@ impl JobRow {
             started_s: row.get("started_s")?,
             ended_s: row.get("ended_s")?,
             token: row.get("token")?,
+            checkpoint: row.get("checkpoint")?,
+            stalled_attempts: row.get("stalled_attempts")?,
         })
     }
 }
@@ -60,31 +68,31 @@ impl JobRow {
 pub struct NewJob {
     /// `collect`, `train`, …
     pub kind: String,
-    /// What no other job that has not ended may make.
-    pub makes: Option<String>,
-    /// What is to be done.
+    /// An output that only one queued or running job can have.
+    pub exclusive_output: Option<String>,
+    /// Its specification.
     pub spec: String,
-    /// How far a job is that has not begun.
+    /// Its initial progress.
     pub progress: String,
-    /// The caller's own name for it: the same key never makes two jobs.
+    /// The caller's idempotency key: one key never makes two jobs.
     pub idempotency_key: Option<String>,
 }
 
-/// What came of enqueueing.
+/// The result of enqueueing.
 #[derive(Clone, Debug, PartialEq)]
 pub enum EnqueueResult {
-    /// It waits.
+    /// The job was enqueued.
     New(JobRow),
-    /// A job of that idempotency key is there.
+    /// A job with this idempotency key exists.
     Same(JobRow),
-    /// As many wait as may.
+    /// The queue is full.
     Full,
-    /// Another that has not ended makes the same.
+    /// A queued or running job has the same output.
     Taken,
 }
 
-/// The right to work on a job: its number, and how often it had been taken up then.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// The right to work on a job: its number and the fencing token of the claim.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Lease {
     /// The job.
     pub number: i64,
@@ -92,22 +100,26 @@ pub struct Lease {
     pub token: i64,
 }
 
-/// How a job's work ended.
+/// How an attempt of a job ended.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JobOutcome {
     /// The state that follows.
     pub state: &'static str,
     /// Why it failed.
     pub error: Option<String>,
-    /// What came of it.
+    /// Its result.
     pub outcome: Option<String>,
-    /// When, in seconds since 1970; none if it goes back to wait.
+    /// When, in seconds since 1970; `None` if the job goes back to the queue.
     pub ended_s: Option<f64>,
-    /// The model's name, version, and whether that serves unless another does already.
+    /// The published model's name and version, and whether it becomes active if no version is.
     pub published: Option<(String, u32, bool)>,
+    /// What an evaluation measured.
+    pub measured: Option<ModelMetrics>,
+    /// Whether the attempt ended abnormally.
+    pub crashed: bool,
 }
 
-/// Which jobs to list: the newest below a number first.
+/// Which jobs to list, the newest first.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct JobPage {
     /// Only of that kind.
@@ -116,19 +128,23 @@ pub struct JobPage {
     pub state: Option<String>,
     /// Only below that number.
     pub before: Option<i64>,
-    /// At most so many.
+    /// The maximum number of jobs.
     pub limit: i64,
 }
 
-/// Takes the lock under which jobs are enqueued.
+/// Takes the lock for enqueueing.
 async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
     let sql = "UPDATE counters SET value = value WHERE name = 'job'";
     tx.execute(sql, vec![]).await.map(drop)
 }
 
-/// Whether one more may wait, and none that has not ended makes the same.
-async fn has_place(tx: &mut Tx, makes: Option<&str>, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
-    // Nothing equals NULL, so that a job that makes nothing of its own is never in another's way.
+/// Checks that the queue has room and that no queued or running job has the same output.
+async fn check_capacity(
+    tx: &mut Tx,
+    makes: Option<&str>,
+    max_queued: i64,
+) -> Result<Option<EnqueueResult>, StoreError> {
+    // In SQL nothing equals NULL, so a job without an exclusive output never conflicts.
     let sql = "SELECT number FROM jobs WHERE makes = $1 AND state IN ('queued', 'running')";
     if !tx.fetch(sql, vec![makes.into()]).await?.is_empty() {
         return Ok(Some(EnqueueResult::Taken));
@@ -140,22 +156,22 @@ async fn has_place(tx: &mut Tx, makes: Option<&str>, max_queued: i64) -> Result<
     Ok((queued as i64 >= max_queued).then_some(EnqueueResult::Full))
 }
 
-fn first(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
+fn first_job(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
     rows.first().map(JobRow::of).transpose()
 }
 
 impl Store {
-    /// Enqueues a job unless as many wait as may. Errors: `Query`.
+    /// Enqueues a job unless the queue is full. Errors: `Query`.
     pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<EnqueueResult, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
         if let Some(key) = &new.idempotency_key {
             let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
-            if let Some(row) = first(&tx.fetch(sql, vec![key.as_str().into()]).await?)? {
+            if let Some(row) = first_job(&tx.fetch(sql, vec![key.as_str().into()]).await?)? {
                 return Ok(EnqueueResult::Same(row));
             }
         }
-        if let Some(refused) = has_place(&mut tx, new.makes.as_deref(), max_queued).await? {
+        if let Some(refused) = check_capacity(&mut tx, new.exclusive_output.as_deref(), max_queued).await? {
             return Ok(refused);
         }
         tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'job'", vec![])
@@ -164,19 +180,19 @@ impl Store {
              SELECT value, $1, $2, 'queued', $3, $4, $5, $6 FROM counters WHERE name = 'job' RETURNING *";
         let values: Vec<DatabaseValue> = vec![
             new.kind.into(),
-            new.makes.into(),
+            new.exclusive_output.into(),
             new.spec.into(),
             new.progress.into(),
             new.idempotency_key.into(),
             now_s.into(),
         ];
-        let row = first(&tx.fetch(sql, values).await?)?;
+        let row = first_job(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;
         row.map(EnqueueResult::New)
             .ok_or(StoreError::Query(sqlx::Error::RowNotFound))
     }
 
-    /// Puts a job that failed or was cancelled back among those that wait. Errors: `Query`.
+    /// Enqueues a failed or cancelled job again; `None` if it is neither. Errors: `Query`.
     pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
@@ -184,36 +200,36 @@ impl Store {
         let rows = tx.fetch(sql, vec![number.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let makes: Option<String> = row.get("makes")?;
-        if let Some(refused) = has_place(&mut tx, makes.as_deref(), max_queued).await? {
+        if let Some(refused) = check_capacity(&mut tx, makes.as_deref(), max_queued).await? {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
-             lease_until_s = NULL WHERE number = $1 RETURNING *";
-        let row = first(&tx.fetch(sql, vec![number.into()]).await?)?;
+             stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
+        let row = first_job(&tx.fetch(sql, vec![number.into()]).await?)?;
         tx.commit().await?;
         Ok(row.map(EnqueueResult::New))
     }
 
-    /// Forgets ended jobs but the latest `kept`; returns their numbers. Errors: `Query`.
-    pub async fn forget_ended(&self, kept: i64) -> Result<Vec<i64>, StoreError> {
-        // Both look at the state: one may be resumed between them.
+    /// Deletes all ended jobs except the latest `keep`; returns their numbers. Errors: `Query`.
+    pub async fn forget_ended(&self, keep: i64) -> Result<Vec<i64>, StoreError> {
+        // Both conditions check the state, because a job can be resumed between them.
         let sql = "DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND number IN (SELECT number \
              FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') ORDER BY ended_s DESC, number DESC \
              LIMIT 1000000 OFFSET $1) RETURNING number";
-        let rows = self.database.fetch(sql, vec![kept.into()]).await?;
+        let rows = self.database.fetch(sql, vec![keep.into()]).await?;
         rows.iter().map(|row| row.get("number")).collect()
     }
 
     /// One job. Errors: `Query`.
     pub async fn job(&self, number: i64) -> Result<Option<JobRow>, StoreError> {
         let sql = "SELECT * FROM jobs WHERE number = $1";
-        first(&self.database.fetch(sql, vec![number.into()]).await?)
+        first_job(&self.database.fetch(sql, vec![number.into()]).await?)
     }
 
     /// The job that was enqueued with that idempotency key. Errors: `Query`.
     pub async fn job_of_key(&self, key: &str) -> Result<Option<JobRow>, StoreError> {
         let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
-        first(&self.database.fetch(sql, vec![key.into()]).await?)
+        first_job(&self.database.fetch(sql, vec![key.into()]).await?)
     }
 
     /// Jobs, the newest first. Errors: `Query`.
@@ -231,7 +247,7 @@ impl Store {
         rows.iter().map(JobRow::of).collect()
     }
 
-    /// How many jobs there are of each kind and state, where there are any. Errors: `Query`.
+    /// The number of jobs of each kind and state, without zeros. Errors: `Query`.
     pub async fn count_jobs(&self) -> Result<Vec<(String, String, i64)>, StoreError> {
         let sql = "SELECT kind, state, COUNT(*) AS jobs FROM jobs GROUP BY kind, state";
         let rows = self.database.fetch(sql, vec![]).await?;
@@ -240,8 +256,15 @@ impl Store {
             .collect()
     }
 
-    /// Takes up the job that has waited longest, or one whose lease has run out. Errors: `Query`.
-    pub async fn claim(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+    /// Claims the oldest job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds.
+    /// Errors: `Query`.
+    pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.claim_at(owner, now_s, now_s + lease_s).await
+    }
+
+    /// As [`Self::claim`], at a given time. Errors: `Query`.
+    pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
              ORDER BY number LIMIT 1";
@@ -249,9 +272,11 @@ impl Store {
         let Some(row) = rows.first() else { return Ok(None) };
         let number: i64 = row.get("number")?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
+             claimed_checkpoint = checkpoint, stalled_attempts = CASE \
+             WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4) WHERE number = $1 RETURNING *";
         let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
-        let row = first(&tx.fetch(sql, values).await?)?;
+        let row = first_job(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;
         Ok(row.map(|row| {
             let lease = Lease {
@@ -262,66 +287,89 @@ impl Store {
         }))
     }
 
-    /// Lets every lease of that owner run out now: to be called by one who knows that the owner is dead. Errors: `Query`.
+    /// Expires all leases of an owner. The caller must know that the owner has ended. Errors: `Query`.
     pub async fn release_leases(&self, owner: &str) -> Result<u64, StoreError> {
         let sql = "UPDATE jobs SET lease_until_s = 0 WHERE state = 'running' AND owner = $1";
         self.database.execute(sql, vec![owner.into()]).await
     }
 
-    /// Renews a lease and writes what happened since; says whether the job was asked to stop, or `None` if the lease is
-    /// lost, and then nothing is written. Errors: `Query`.
-    pub async fn renew(&self, lease: Lease, until_s: f64, account: JobUpdate) -> Result<Option<bool>, StoreError> {
+    /// Renews a lease and writes the report. Returns whether the job was asked to stop; if the lease is lost, writes nothing
+    /// and returns `None`. Errors: `Query`.
+    pub async fn renew(&self, lease: Lease, lease_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
+        let now_s = self.database.now_s().await?;
+        self.renew_at(lease, now_s + lease_s, report).await
+    }
+
+    /// As [`Self::renew`], until a given time. Errors: `Query`.
+    pub async fn renew_at(&self, lease: Lease, until_s: f64, report: JobReport) -> Result<Option<bool>, StoreError> {
         let mut tx = self.database.begin().await?;
-        let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4 \
+        let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4, \
+             checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \
              WHERE number = $1 AND token = $2 AND state = 'running' RETURNING cancelling";
         let values = vec![
             lease.number.into(),
             lease.token.into(),
             until_s.into(),
-            account.progress.as_str().into(),
+            report.progress.as_str().into(),
+            report.checkpoint.into(),
         ];
         let rows = tx.fetch(sql, values).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let cancelling = row.get::<i64>("cancelling")? != 0;
-        write_account(&mut tx, lease.number, account).await?;
+        write_report(&mut tx, lease.number, report).await?;
         tx.commit().await?;
         Ok(Some(cancelling))
     }
 
-    /// Ends a job's work; says whether the lease still held, and writes nothing if not. Errors: `Query`.
-    pub async fn end(&self, lease: Lease, ending: JobOutcome, account: JobUpdate) -> Result<bool, StoreError> {
+    /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
+    pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
+        let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
+        let values = vec![lease.number.into(), lease.token.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
+    /// Writes the outcome of an attempt. If the lease is lost, writes nothing and returns false. Errors: `Query`.
+    pub async fn end(&self, lease: Lease, outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = $3, error = $4, outcome = $5, ended_s = $6, progress = $7, \
              cancelling = CASE WHEN $3 = 'queued' THEN cancelling ELSE 0 END, \
+             checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
+             stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
+             WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
         let values = vec![
             lease.number.into(),
             lease.token.into(),
-            ending.state.into(),
-            ending.error.into(),
-            ending.outcome.into(),
-            ending.ended_s.into(),
-            account.progress.as_str().into(),
+            outcome.state.into(),
+            outcome.error.into(),
+            outcome.outcome.into(),
+            outcome.ended_s.into(),
+            report.progress.as_str().into(),
+            report.checkpoint.into(),
+            i64::from(outcome.crashed).into(),
         ];
         if tx.execute(sql, values).await? == 0 {
             return Ok(false);
         }
-        if let Some((model, version, activates)) = ending.published {
-            let now_s = ending.ended_s.unwrap_or_default();
+        if let Some((model, version, activates)) = outcome.published {
+            let now_s = outcome.ended_s.unwrap_or_default();
             super::models::write_published(&mut tx, (&model, version), activates, now_s).await?;
         }
-        write_account(&mut tx, lease.number, account).await?;
+        if let Some(measured) = outcome.measured {
+            super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;
+        }
+        write_report(&mut tx, lease.number, report).await?;
         tx.commit().await?;
         Ok(true)
     }
 
-    /// Ends a job that waits. Says whether it did. Errors: `Query`.
+    /// Cancels a queued job. Returns whether it was queued. Errors: `Query`.
     pub async fn cancel_queued(&self, number: i64, now_s: f64) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET state = 'cancelled', ended_s = $2 WHERE number = $1 AND state = 'queued'";
         Ok(self.database.execute(sql, vec![number.into(), now_s.into()]).await? > 0)
     }
 
-    /// Asks a job that runs to stop. Says whether it runs. Errors: `Query`.
+    /// Asks a running job to stop. Returns whether it is running. Errors: `Query`.
     pub async fn ask_to_cancel(&self, number: i64) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running'";
         Ok(self.database.execute(sql, vec![number.into()]).await? > 0)

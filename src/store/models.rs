@@ -1,4 +1,6 @@
-//! Which versions of the models were published, and which of them serves. The files are in the objects.
+//! The published versions of the models, and which version is active. Their files are in the object store.
+
+use serde::{Deserialize, Serialize};
 
 use super::database::{DatabaseRow, Tx};
 use super::jobs::Lease;
@@ -9,10 +11,23 @@ use super::{Store, StoreError};
 pub struct VersionRow {
     /// The model's name.
     pub model: String,
-    /// Counts the publications of the name.
+    /// The version's number.
     pub version: u32,
     /// When it was published, in seconds since 1970.
     pub published_s: f64,
+}
+
+/// What an evaluation measured of a version.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelMetrics {
+    /// The model's name.
+    pub model: String,
+    /// Its version.
+    pub version: u32,
+    /// The hash of the weights that were measured.
+    pub weights_sha256: String,
+    /// The metrics, as JSON.
+    pub metrics: String,
 }
 
 fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
@@ -21,8 +36,8 @@ fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
 }
 
 impl Store {
-    /// The version that a job is to publish: the next of the name above `shipped`; asked again, the same.
-    /// `None` if the lease is lost. Errors: `Query`.
+    /// Reserves the version that a job publishes: the next number above `shipped`. A second call of the same job returns the
+    /// same number. `None` if the lease is lost. Errors: `Query`.
     pub async fn reserve_version(&self, lease: Lease, model: &str, shipped: u32) -> Result<Option<u32>, StoreError> {
         let mut tx = self.database.begin().await?;
         // Held until the commit, so that two jobs never reserve one number.
@@ -44,7 +59,35 @@ impl Store {
         rows.first().map(version_of).transpose()
     }
 
-    /// Every version that was published and not deleted, by name and number. Errors: `Query`.
+    /// The next version of a name, above `shipped`, for a model that no job trained. Errors: `Query`.
+    pub async fn reserve_next_version(&self, model: &str, shipped: u32) -> Result<u32, StoreError> {
+        let mut tx = self.database.begin().await?;
+        // The row is locked until the commit, so that a number is never given twice.
+        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
+            .await?;
+        let sql = "INSERT INTO model_versions (model, version) \
+             SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1 \
+             FROM model_versions WHERE model = $1 RETURNING version";
+        let rows = tx.fetch(sql, vec![model.into(), shipped.into()]).await?;
+        tx.commit().await?;
+        rows.first()
+            .map_or(Err(StoreError::Query(sqlx::Error::RowNotFound)), version_of)
+    }
+
+    /// Records that the files of a reserved version are there. Errors: `Query`.
+    pub async fn publish_version(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
+        let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
+        let values = vec![model.into(), version.into(), now_s.into()];
+        self.database.execute(sql, values).await.map(drop)
+    }
+
+    /// Forgets which version of a model was chosen to serve. Errors: `Query`.
+    pub async fn clear_active(&self, model: &str) -> Result<(), StoreError> {
+        let sql = "DELETE FROM active_versions WHERE model = $1";
+        self.database.execute(sql, vec![model.into()]).await.map(drop)
+    }
+
+    /// All published versions that are not deleted, by name and number. Errors: `Query`.
     pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
         let sql = "SELECT model, version, published_s FROM model_versions \
              WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
@@ -59,7 +102,7 @@ impl Store {
         rows.iter().map(version).collect()
     }
 
-    /// The name and version of every model of which one was chosen to serve. Errors: `Query`.
+    /// The active version of each model that has one. Errors: `Query`.
     pub async fn active_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
         let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;
         rows.iter()
@@ -67,7 +110,21 @@ impl Store {
             .collect()
     }
 
-    /// Has a version serve from now on. Errors: `Query`.
+    /// The latest metrics of all versions that were evaluated. Errors: `Query`.
+    pub async fn model_metrics(&self) -> Result<Vec<ModelMetrics>, StoreError> {
+        let rows = self.database.fetch("SELECT * FROM model_metrics", vec![]).await?;
+        let metrics = |row: &DatabaseRow| {
+            Ok(ModelMetrics {
+                model: row.get("model")?,
+                version: version_of(row)?,
+                weights_sha256: row.get("weights_sha256")?,
+                metrics: row.get("metrics")?,
+            })
+        };
+        rows.iter().map(metrics).collect()
+    }
+
+    /// Makes a version active. Errors: `Query`.
     pub async fn set_active(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
              ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s";
@@ -75,7 +132,7 @@ impl Store {
         self.database.execute(sql, values).await.map(drop)
     }
 
-    /// Deletes a version unless it serves; says whether it did. Errors: `Query`.
+    /// Marks a version as deleted unless it is active. Returns whether it did. Errors: `Query`.
     pub async fn delete_version(&self, model: &str, version: u32, now_s: f64) -> Result<bool, StoreError> {
         let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
              AND published_s IS NOT NULL AND deleted_s IS NULL \
@@ -99,4 +156,19 @@ pub(super) async fn write_published(
         tx.execute(sql, values()).await?;
     }
     Ok(())
+}
+
+/// Replaces the metrics of a version.
+pub(super) async fn write_metrics(tx: &mut Tx, measured: ModelMetrics, now_s: f64) -> Result<(), StoreError> {
+    let sql = "INSERT INTO model_metrics (model, version, weights_sha256, metrics, measured_s) \
+         VALUES ($1, $2, $3, $4, $5) ON CONFLICT (model, version) DO UPDATE SET \
+         weights_sha256 = excluded.weights_sha256, metrics = excluded.metrics, measured_s = excluded.measured_s";
+    let values = vec![
+        measured.model.into(),
+        measured.version.into(),
+        measured.weights_sha256.into(),
+        measured.metrics.into(),
+        now_s.into(),
+    ];
+    tx.execute(sql, values).await.map(drop)
 }

@@ -1,5 +1,5 @@
-//! Files that several machines may share: models, runs' checkpoints, data sets, reports. Work always happens in the data
-//! directory; where objects are kept elsewhere, directories are pushed there and pulled from there, under the same names.
+//! Files that several machines can share: models, checkpoints, data sets, reports. Work always happens in the local data
+//! directory. With a shared object store, directories are pushed to it and pulled from it under the same keys.
 
 use std::collections::HashMap;
 use std::io;
@@ -13,14 +13,14 @@ use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::{files_below, if_there, is_partial, remove_abandoned, remove_dir, write_atomically};
+use crate::files::{files_below, is_partial, none_if_missing, remove_dir, remove_stale_partials, write_atomically};
 
-/// The data directory, and where it is mirrored.
+/// The data directory, and the shared object store if there is one.
 #[derive(Clone)]
 pub struct Objects {
     data_dir: PathBuf,
     shared: Option<Arc<dyn ObjectStore>>,
-    /// The directories that are being pulled.
+    /// A lock for each directory that is being pulled.
     pulls: Arc<Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>>,
 }
 
@@ -33,7 +33,7 @@ impl Objects {
                 return Err(StoreError::Url {
                     flag: "objects",
                     scheme: url.split("://").next().unwrap_or_default().chars().take(16).collect(),
-                    known: "a directory or s3://BUCKET/PREFIX",
+                    expected: "a directory or s3://BUCKET/PREFIX",
                 });
             }
             Some(dir) => Some(directory(Path::new(dir))?),
@@ -51,19 +51,19 @@ impl Objects {
         &self.data_dir
     }
 
-    /// Whether objects are kept elsewhere than in the data directory.
+    /// Whether there is a shared object store besides the data directory.
     #[must_use]
     pub fn are_shared(&self) -> bool {
         self.shared.is_some()
     }
 
-    /// Copies the files of a directory below the data directory to where objects are kept, that of the name `last` last:
-    /// it says that the others are there. Errors: `Io`, `Object`.
+    /// Copies a directory to the object store. The file `last` is copied last: it marks the copy as complete.
+    /// Errors: `Io`, `Object`.
     pub async fn push(&self, dir: &str, last: &str) -> Result<(), StoreError> {
         let Some(shared) = &self.shared else { return Ok(()) };
         let root = self.data_dir.join(dir);
         let mut paths = on_disk("list", &root, files_below).await?;
-        paths.retain(|path| !is_partial(path) && path.extension().is_none_or(|ending| ending != "tmp"));
+        paths.retain(|path| !is_partial(path) && path.extension().is_none_or(|extension| extension != "tmp"));
         paths.sort_by_key(|path| path.file_name().is_some_and(|name| name == last));
         for path in paths {
             let bytes = tokio::fs::read(&path).await.map_err(StoreError::io("read", &path))?;
@@ -74,34 +74,34 @@ impl Objects {
         Ok(())
     }
 
-    /// Copies a directory from where objects are kept into the data directory, the file `last` last, unless that is not
-    /// there; says whether it is. The others are taken never to change: one that is here in its size is not copied again.
-    /// Errors: `Io`, `Object`.
+    /// Copies a directory from the object store into the data directory, the file `last` last. Returns false, and copies
+    /// nothing, if the object store has no `last`. The other files never change, so a local file of the same size is not
+    /// copied again. Errors: `Io`, `Object`.
     pub async fn pull(&self, dir: &str, last: &str) -> Result<bool, StoreError> {
-        let _turn = self.turn(dir).await;
+        let _lock = self.lock_pull(dir).await;
         self.copy(dir, last).await
     }
 
-    /// As [`Self::pull`], of a directory that may have been replaced by another under the same name: unless its file
-    /// `identity` is the same here, what is here is deleted first. Errors: `Io`, `Object`.
+    /// As [`Self::pull`], for a directory that can be replaced by another one of the same name: if the local file
+    /// `identity` differs from the one in the object store, the local directory is deleted first. Errors: `Io`, `Object`.
     pub async fn pull_same(&self, dir: &str, identity: &str, last: &str) -> Result<bool, StoreError> {
-        let _turn = self.turn(dir).await;
+        let _lock = self.lock_pull(dir).await;
         let identity = format!("{dir}/{identity}");
         if self.shared.is_some() && !self.is_same(&identity).await? {
-            let Some(kept) = self.read(&identity).await? else {
+            let Some(remote) = self.read(&identity).await? else {
                 return Ok(false);
             };
             on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
-            // First, so that a copy that breaks off is gone on with only as long as it is of the same directory.
-            write(&self.data_dir.join(identity), kept).await?;
+            // First, so that an interrupted copy is continued only if it is of the same directory.
+            write(&self.data_dir.join(identity), remote).await?;
         }
         self.copy(dir, last).await
     }
 
-    /// Whether a file in the data directory is as the one where objects are kept. Errors: `Io`, `Object`.
+    /// Whether a file is the same in the data directory and in the object store. Errors: `Io`, `Object`.
     pub async fn is_same(&self, path: &str) -> Result<bool, StoreError> {
         let here = self.data_dir.join(path);
-        let found = if_there(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
+        let found = none_if_missing(tokio::fs::read(&here).await).map_err(StoreError::io("read", &here))?;
         Ok(found.is_some() && found == self.read(path).await?)
     }
 
@@ -113,7 +113,7 @@ impl Objects {
             return Ok(false);
         }
         on_disk("list", &self.data_dir.join(dir), |dir| {
-            remove_abandoned(dir);
+            remove_stale_partials(dir);
             Ok(())
         })
         .await?;
@@ -128,8 +128,8 @@ impl Objects {
         Ok(true)
     }
 
-    /// Waits until nobody else in this process pulls the directory, and keeps others from it.
-    async fn turn(&self, dir: &str) -> OwnedMutexGuard<()> {
+    /// Locks a directory against other pulls in this process.
+    async fn lock_pull(&self, dir: &str) -> OwnedMutexGuard<()> {
         let turn = {
             let mut pulls = self.pulls.lock().unwrap_or_else(PoisonError::into_inner);
             pulls.retain(|_, turn| Arc::strong_count(turn) > 1);
@@ -138,11 +138,11 @@ impl Objects {
         turn.lock_owned().await
     }
 
-    /// What a file holds where objects are kept, if it is there. Errors: `Io`, `Object`.
+    /// Reads a file from the object store; `None` if it does not exist. Errors: `Io`, `Object`.
     pub async fn read(&self, path: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let Some(shared) = &self.shared else {
             let path = self.data_dir.join(path);
-            return if_there(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
+            return none_if_missing(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
         };
         match read(shared, &Key::from(path)).await {
             Ok(bytes) => Ok(Some(bytes)),
@@ -154,7 +154,7 @@ impl Objects {
         }
     }
 
-    /// Whether a file is where objects are kept. Errors: `Object`.
+    /// Whether a file is in the object store. Errors: `Object`.
     pub async fn has(&self, path: &str) -> Result<bool, StoreError> {
         let Some(shared) = &self.shared else {
             return Ok(self.data_dir.join(path).is_file());
@@ -167,7 +167,7 @@ impl Objects {
         }
     }
 
-    /// The directories right below one, where objects are kept. Errors: `Object`.
+    /// The subdirectories of a directory in the shared object store. Errors: `Object`.
     pub async fn directories(&self, dir: &str) -> Result<Vec<String>, StoreError> {
         let Some(shared) = &self.shared else {
             return Ok(Vec::new());
@@ -178,8 +178,7 @@ impl Objects {
         Ok(names.iter().filter_map(Key::filename).map(str::to_owned).collect())
     }
 
-    /// Deletes a directory, here and where objects are kept; one that is not there is deleted already.
-    /// Errors: `Io`, `Object`.
+    /// Deletes a directory from the data directory and the object store, if it exists. Errors: `Io`, `Object`.
     pub async fn delete(&self, dir: &str) -> Result<(), StoreError> {
         on_disk("delete", &self.data_dir.join(dir), remove_dir).await?;
         let Some(shared) = &self.shared else { return Ok(()) };
@@ -213,7 +212,7 @@ async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
     written.await
 }
 
-/// Works on files off the runtime's threads.
+/// Does file work on a blocking thread.
 async fn on_disk<T: Send + 'static>(
     action: &'static str,
     path: &Path,
@@ -259,6 +258,6 @@ fn bucket(_: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
     Err(StoreError::Url {
         flag: "objects",
         scheme: "s3".to_owned(),
-        known: "a directory; this program was built without the feature cloud, which knows S3",
+        expected: "a directory; this program was built without S3, which needs --features cloud",
     })
 }

@@ -1,4 +1,4 @@
-//! Traces to an OpenTelemetry collector: every span of the log becomes one of a trace.
+//! Sends traces to an OpenTelemetry collector: every log span becomes a trace span.
 
 use opentelemetry::trace::TracerProvider as _;
 use opentelemetry_otlp::{SpanExporter, WithExportConfig as _};
@@ -10,14 +10,14 @@ use tracing_subscriber::registry::LookupSpan;
 
 use super::TelemetryError;
 
-/// The exporter and its thread; dropping it sends what waits.
+/// The exporter and its thread. Dropping it sends the spans that are still in memory.
 pub(super) struct Traces {
     provider: SdkTracerProvider,
 }
 
 impl Traces {
-    /// Sends to `endpoint`/v1/traces by HTTP. Errors: `Otlp`.
-    pub(super) fn to(endpoint: &str) -> Result<Self, TelemetryError> {
+    /// Sends over HTTP to `endpoint`/v1/traces. Errors: `Otlp`.
+    pub(super) fn new(endpoint: &str) -> Result<Self, TelemetryError> {
         let exporter = SpanExporter::builder()
             .with_http()
             .with_endpoint(format!("{}/v1/traces", endpoint.trim_end_matches('/')))
@@ -38,7 +38,7 @@ impl Traces {
 
 impl Drop for Traces {
     fn drop(&mut self) {
-        // What cannot be sent at the end is lost; nobody is left to be told.
+        // Ignore errors: the program is ending and nobody can handle them.
         let _ = self.provider.shutdown();
     }
 }

@@ -1,4 +1,4 @@
-//! The recorder of all metrics and its text for Prometheus. One a process, as the `metrics` crate has it.
+//! The metrics recorder and its text output for Prometheus. There is one per process, because the `metrics` crate has one.
 
 use std::fs;
 use std::sync::OnceLock;
@@ -10,7 +10,7 @@ use tracing::error;
 
 use super::names;
 
-/// From half a millisecond, a small model's time, to the longest deadline there should be.
+/// Histogram buckets in seconds: from half a millisecond (a small model) to the longest sensible deadline.
 const SECONDS: [f64; 16] = [
     0.0005, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.033, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0,
 ];
@@ -18,12 +18,12 @@ const BATCH_SIZES: [f64; 10] = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256
 
 static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
 
-/// Starts recording; what is recorded before is lost. A second call changes nothing.
-pub fn record() {
+/// Starts recording. Values recorded earlier are lost. A second call changes nothing.
+pub fn install_recorder() {
     HANDLE.get_or_init(|| match install() {
         Ok(handle) => Some(handle),
         Err(error) => {
-            error!(%error, "metrics cannot be recorded");
+            error!(%error, "could not install the metrics recorder; no metrics are recorded");
             None
         }
     });
@@ -35,7 +35,7 @@ fn install() -> Result<PrometheusHandle, BuildError> {
         .set_buckets_for_metric(Matcher::Full(names::PREDICTION_BATCH_SIZE.to_owned()), &BATCH_SIZES)?
         .install_recorder()?;
     names::describe();
-    names::begin();
+    names::initialize_counters();
     let commit = env!("GIT_COMMIT_AT_BUILD");
     gauge!(names::BUILD_INFO, "version" => env!("CARGO_PKG_VERSION"), "commit" => commit).set(1.0);
     let started = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
@@ -43,7 +43,7 @@ fn install() -> Result<PrometheusHandle, BuildError> {
     Ok(handle)
 }
 
-/// All metrics in Prometheus' text format; empty before [`record`].
+/// All metrics in the Prometheus text format; empty before [`install_recorder`].
 #[must_use]
 pub fn render() -> String {
     let Some(Some(handle)) = HANDLE.get() else {
@@ -54,14 +54,15 @@ pub fn render() -> String {
     handle.render()
 }
 
-/// Folds what histograms have gathered into their buckets, so that their memory is bounded where nobody reads them.
-pub fn fold() {
+/// Moves the samples of histograms into their buckets. Call it regularly, so that their memory stays bounded even if
+/// nobody reads the metrics.
+pub fn run_upkeep() {
     if let Some(Some(handle)) = HANDLE.get() {
         handle.run_upkeep();
     }
 }
 
-/// Where there is no `/proc`, nothing is measured.
+/// Measures memory, threads and open files of this process. Without `/proc` it measures nothing.
 fn measure_process() {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let field = |name: &str| -> Option<f64> {
@@ -75,7 +76,7 @@ fn measure_process() {
         gauge!(names::PROCESS_THREADS).set(threads);
     }
     if let Ok(open) = fs::read_dir("/proc/self/fd") {
-        // The listing itself holds one.
+        // Listing the directory opens one file.
         gauge!(names::PROCESS_OPEN_FDS).set(open.count().saturating_sub(1) as f64);
     }
 }

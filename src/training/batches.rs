@@ -1,4 +1,4 @@
-//! Batches of frames and windows as tensors, and the order in which they are drawn.
+//! Makes batches of frames and windows as tensors, and shuffles the training data.
 
 use candle_core::{Device, Tensor};
 use rand::seq::SliceRandom;
@@ -13,7 +13,7 @@ use crate::frame::preprocess::Preprocess;
 use crate::nn::ConditioningTensors;
 use crate::types::Seed;
 
-/// A data set's frames in the model's space.
+/// A data set's frames, converted to the model's value range.
 pub(super) struct FrameSource<'a> {
     dataset: &'a Dataset,
     preprocess: Preprocess,
@@ -22,15 +22,15 @@ pub(super) struct FrameSource<'a> {
 
 /// One batch of windows.
 pub(super) struct WindowBatch {
-    /// `[B, T, P]`, as the encoder reads them.
+    /// Context frames as inputs of the encoder, `[B, T, P]`.
     pub(super) inputs: Tensor,
-    /// `[B, T, P]`, as the reconstruction is to write them.
+    /// Context frames as targets of the reconstruction, `[B, T, P]`.
     pub(super) input_targets: Tensor,
-    /// `[B, horizon, P]`, as the prediction is to write them.
+    /// Future frames as targets of the prediction, `[B, horizon, P]`.
     pub(super) targets: Tensor,
-    /// `[B, horizon, P]`, the same as the encoder would read them, if asked for.
+    /// Future frames as inputs of the encoder, `[B, horizon, P]`; only for teacher forcing.
     pub(super) future: Option<Tensor>,
-    /// The actions that lead to the targets, and the state at the last input.
+    /// The actions that lead to the future frames, and the state at the last context frame.
     pub(super) condition: ConditioningTensors,
     /// The states at the targets `[B, horizon, S]`, where the data set has states.
     pub(super) future_states: Option<Tensor>,
@@ -52,17 +52,17 @@ impl<'a> FrameSource<'a> {
         }
     }
 
-    /// The frames as the encoder reads them, `[N, P]`.
-    pub(super) fn frames(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.through(self.preprocess, frames)
+    /// The frames as inputs of the encoder, `[N, P]`.
+    pub(super) fn inputs(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
+        self.preprocessed(self.preprocess, frames)
     }
 
-    /// The frames as the decoder is to write them, `[N, P]`.
+    /// The frames as targets of the decoder, `[N, P]`.
     pub(super) fn targets(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.through(self.target, frames)
+        self.preprocessed(self.target, frames)
     }
 
-    fn through(&self, preprocess: Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
+    fn preprocessed(&self, preprocess: Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
         let info = self.dataset.info();
         let pixels = info.frame_pixels();
         let mut values = vec![0.0; frames.len() * pixels];
@@ -78,7 +78,7 @@ impl<'a> FrameSource<'a> {
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
     }
 
-    /// The windows' inputs, targets and conditions. The future as the encoder would read it is made only if asked for.
+    /// One batch of windows. `future` is made only if `with_future`.
     pub(super) fn windows(
         &self,
         windows: &[&Window],
@@ -92,17 +92,17 @@ impl<'a> FrameSource<'a> {
                 .flat_map(|w| w.first_frame + from..w.first_frame + from + length)
                 .collect()
         };
-        let (seen, to_come) = (span(0, context), span(context, horizon));
+        let (past, future) = (span(0, context), span(context, horizon));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         Ok(WindowBatch {
-            inputs: batched(self.frames(&seen)?, context)?,
-            input_targets: batched(self.targets(&seen)?, context)?,
+            inputs: batched(self.inputs(&past)?, context)?,
+            input_targets: batched(self.targets(&past)?, context)?,
             future: with_future
-                .then(|| self.frames(&to_come))
+                .then(|| self.inputs(&future))
                 .transpose()?
                 .map(|f| batched(f, horizon))
                 .transpose()?,
-            targets: batched(self.targets(&to_come)?, horizon)?,
+            targets: batched(self.targets(&future)?, horizon)?,
             condition: self.condition(windows, shape)?,
             future_states: self.future_states(windows, shape)?,
         })
@@ -129,7 +129,7 @@ impl<'a> FrameSource<'a> {
             self.dataset.info().state_channels.len(),
         );
         let last_inputs = || windows.iter().map(|window| window.first_frame + shape.context - 1);
-        // The action of a frame acts from it to the next, so the first target's is that of the last input.
+        // An action acts from its frame to the next one, so the action of the last input leads to the first target.
         let future: Vec<f32> = last_inputs()
             .flat_map(|last| (last..last + shape.horizon).flat_map(|frame| self.dataset.action(frame)))
             .copied()
@@ -150,19 +150,20 @@ impl<'a> FrameSource<'a> {
     }
 }
 
-/// Draws positions `0..count`, each once an epoch, in an order that depends on the seed and the draw alone, so that a
-/// resumed training draws as the unbroken one would.
+/// Draws positions `0..count`, each once per epoch. The order depends only on the seed and the number of the draw, so that a
+/// resumed training draws the same positions as an uninterrupted one.
 pub(super) struct Shuffle {
     count: usize,
     seed: Seed,
 }
 
 impl Shuffle {
+    /// Shuffles `count` positions. `count` is at least 1: a training without windows is refused earlier.
     pub(super) fn new(count: usize, seed: Seed) -> Self {
         Self { count, seed }
     }
 
-    /// The positions of batch `step`.
+    /// The positions of batch number `step`. A batch larger than the number of positions continues in the next epoch.
     pub(super) fn batch(&self, step: usize, batch_size: usize) -> Vec<usize> {
         let draws = step * batch_size..(step + 1) * batch_size;
         let mut epoch = usize::MAX;
@@ -193,7 +194,14 @@ mod tests {
     }
 
     #[test]
-    fn a_batch_does_not_depend_on_those_before_it() {
+    fn a_batch_larger_than_the_data_repeats_positions() {
+        let mut batch = Shuffle::new(3, Seed(1)).batch(0, 6);
+        batch.sort_unstable();
+        assert_eq!(batch, [0, 0, 1, 1, 2, 2]);
+    }
+
+    #[test]
+    fn a_batch_does_not_depend_on_earlier_batches() {
         let (early, late) = (Shuffle::new(7, Seed(1)), Shuffle::new(7, Seed(1)));
         (0..9).for_each(|step| drop(early.batch(step, 4)));
         assert_eq!(early.batch(9, 4), late.batch(9, 4));

@@ -1,4 +1,4 @@
-//! A run's directory: its configuration, and the state of its last checkpoint in one safetensors file, replaced whole.
+//! A run's directory: its configuration, and its last checkpoint in one safetensors file that is replaced atomically.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File, TryLockError};
@@ -10,17 +10,23 @@ use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
-use super::observer::TrainingStage;
+use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{is_partial_of, remove_abandoned, sha256_hex, write_atomically};
+use crate::files::{none_if_missing, is_partial_of, remove_stale_partials, sha256_hex, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
-/// The file of a run that says how far it is.
+/// Name of the checkpoint file of a run.
 pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
-/// The key of the state's numbers in the file's metadata.
+/// The checkpoint before it. A training resumes from this one if the latest is damaged.
+const PREVIOUS_FILE: &str = "checkpoint.previous.safetensors";
+/// The key of the file's SHA-256 in its metadata. The hash is computed with zeros in its own place.
+const HASH_KEY: &str = "foreframe.sha256";
+/// The length of a SHA-256 in hexadecimal digits.
+const HASH_LENGTH: usize = 64;
+/// Key of the training state in the file's metadata.
 const META_KEY: &str = "foreframe.training";
-/// Names the data that the run trains on.
+/// Name of the file with the hash of the training data.
 const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
 const BEST: &str = "best.";
@@ -34,7 +40,7 @@ pub(super) struct RunFiles {
 }
 
 impl RunFiles {
-    /// Checks that the directory is free, or that the run in it is of the same configuration and data; writes nothing.
+    /// Checks that the directory is unused, or contains a run with the same configuration and data. Writes nothing.
     /// Errors: `NotARun`, `OtherRun`, `Io`.
     pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let files = Self {
@@ -57,10 +63,10 @@ impl RunFiles {
             return Ok(files);
         }
         let (config, data) = (files.config(), files.data());
-        let left_by_a_killed_start =
+        let is_left_by_a_killed_start =
             |path: &Path| path == data || is_partial_of(&data, path) || is_partial_of(&config, path);
         let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
-            entries.any(|entry| entry.is_ok_and(|entry| !left_by_a_killed_start(&entry.path())))
+            entries.any(|entry| entry.is_ok_and(|entry| !is_left_by_a_killed_start(&entry.path())))
         });
         if is_occupied || run_dir.is_file() {
             return Err(TrainError::NotARun(run_dir.to_owned()));
@@ -68,18 +74,18 @@ impl RunFiles {
         Ok(files)
     }
 
-    /// Makes the directory of a new run. Nobody else trains in it until the file is dropped. Errors: `Busy`, `Io`.
-    pub(super) fn claim(&self) -> Result<File, TrainError> {
+    /// Creates the directory of a new run, if needed, and locks it until the returned file is dropped. Errors: `Busy`, `Io`.
+    pub(super) fn lock(&self) -> Result<File, TrainError> {
         let (config, data) = (self.config(), self.data());
         if !config.is_file() {
-            fs::create_dir_all(&self.run_dir).map_err(io_failed("make", &self.run_dir))?;
+            fs::create_dir_all(&self.run_dir).map_err(io_failed("create", &self.run_dir))?;
             write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
             write_atomically(&config, self.config_text.as_bytes()).map_err(io_failed("write", &config))?;
         }
         let lock = File::open(&config).map_err(io_failed("read", &config))?;
         match lock.try_lock() {
             Ok(()) => {
-                remove_abandoned(&self.run_dir);
+                remove_stale_partials(&self.run_dir);
                 Ok(lock)
             }
             Err(TryLockError::WouldBlock) => Err(TrainError::Busy(self.run_dir.clone())),
@@ -87,7 +93,7 @@ impl RunFiles {
         }
     }
 
-    /// What two runs must share for one to go on from the other's checkpoint.
+    /// Identifies configuration and data. A checkpoint can be resumed only with the same fingerprint.
     fn fingerprint(&self) -> String {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
@@ -100,18 +106,22 @@ impl RunFiles {
         self.run_dir.join(DATA_FILE)
     }
 
-    /// Where the trained model is published.
+    /// The directory of the published model.
     pub(super) fn model_dir(&self) -> PathBuf {
         self.run_dir.join("model")
     }
 
-    /// Where the loss curves are written.
+    /// The file of the loss curves.
     pub(super) fn history(&self) -> PathBuf {
         self.run_dir.join("history.json")
     }
 
     fn checkpoint(&self) -> PathBuf {
         self.run_dir.join(CHECKPOINT_FILE)
+    }
+
+    fn previous_checkpoint(&self) -> PathBuf {
+        self.run_dir.join(PREVIOUS_FILE)
     }
 }
 
@@ -124,7 +134,7 @@ fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> Tr
     }
 }
 
-/// The numbers beside the tensors.
+/// The training state without the tensors.
 #[derive(Serialize, Deserialize)]
 struct CheckpointMeta {
     fingerprint: String,
@@ -135,31 +145,75 @@ struct CheckpointMeta {
     history: Vec<HistoryPoint>,
 }
 
-/// How far a training is: the later, the greater.
+/// How far a training is. A later position is greater.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 pub struct CheckpointPosition {
-    /// In this stage.
+    /// The stage.
     pub stage: TrainingStage,
-    /// Updates made in it.
+    /// Completed updates of the stage.
     pub step: usize,
 }
 
 impl CheckpointPosition {
-    /// How far the training was whose checkpoint these bytes are; none if they are no checkpoint.
+    /// The position of the checkpoint in these bytes; none if they are not a checkpoint.
     #[must_use]
     pub fn of(checkpoint: &[u8]) -> Option<Self> {
+        if !is_intact(checkpoint) {
+            return None;
+        }
         let (_, header) = SafeTensors::read_metadata(checkpoint).ok()?;
         serde_json::from_str(header.metadata().as_ref()?.get(META_KEY)?).ok()
     }
 }
 
-/// A training's state as read from disk.
+/// Where the hash of a checkpoint is in its bytes.
+fn hash_range(checkpoint: &[u8]) -> Option<std::ops::Range<usize>> {
+    let length = u64::from_le_bytes(*checkpoint.first_chunk::<8>()?);
+    let header = checkpoint.get(8..usize::try_from(length).ok()?.checked_add(8)?)?;
+    let key = format!("\"{HASH_KEY}\":\"");
+    let start = header.windows(key.len()).position(|part| part == key.as_bytes())? + 8 + key.len();
+    let range = start..start + HASH_LENGTH;
+    checkpoint.get(range.clone()).map(|_| range)
+}
+
+/// The hash of a checkpoint, with zeros in its own place.
+fn hash_of(checkpoint: &[u8], range: &std::ops::Range<usize>) -> String {
+    let mut bytes = checkpoint.to_vec();
+    if let Some(digits) = bytes.get_mut(range.clone()) {
+        digits.fill(b'0');
+    }
+    sha256_hex(&bytes)
+}
+
+/// Whether a checkpoint has the bytes that were written.
+fn is_intact(checkpoint: &[u8]) -> bool {
+    hash_range(checkpoint)
+        .is_some_and(|range| checkpoint.get(range.clone()) == Some(hash_of(checkpoint, &range).as_bytes()))
+}
+
+/// Writes the hash into a checkpoint whose metadata has zeros in its place.
+pub(crate) fn seal(mut checkpoint: Vec<u8>) -> Vec<u8> {
+    if let Some(range) = hash_range(&checkpoint) {
+        let hash = hash_of(&checkpoint, &range);
+        if let Some(digits) = checkpoint.get_mut(range) {
+            digits.copy_from_slice(hash.as_bytes());
+        }
+    }
+    checkpoint
+}
+
+/// The metadata entry that [`seal`] fills.
+pub(crate) fn hash_entry() -> (String, String) {
+    (HASH_KEY.to_owned(), "0".repeat(HASH_LENGTH))
+}
+
+/// A training state that was read from disk.
 pub(super) struct Checkpoint {
     state: TrainState,
 }
 
 impl Checkpoint {
-    /// Replaces the run's checkpoint by this state. Errors: `Io`, `Checkpoint`.
+    /// Replaces the run's checkpoint with this state. Errors: `Io`, `Checkpoint`.
     pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
         let path = files.checkpoint();
         let meta = CheckpointMeta {
@@ -184,41 +238,65 @@ impl Checkpoint {
             .chain(prefixed(BEST, state.best.clone()))
             .chain(prefixed(OPTIMIZER, state.optimizer.export()?))
             .collect();
-        let bytes = safetensors::serialize(&tensors, Some(HashMap::from([(META_KEY.to_owned(), text)])))
-            .map_err(|error| failed(error.to_string()))?;
-        write_atomically(&path, &bytes).map_err(io_failed("write", &path))
+        let metadata = HashMap::from([(META_KEY.to_owned(), text), hash_entry()]);
+        let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(error.to_string()))?;
+        let previous = files.previous_checkpoint();
+        // If the process is killed between the two, the previous one is the latest.
+        none_if_missing(fs::rename(&path, &previous)).map_err(io_failed("rename", &path))?;
+        write_atomically(&path, &seal(bytes)).map_err(io_failed("write", &path))
     }
 
-    /// The run's last checkpoint, if it has one. Errors: `Checkpoint` if it is damaged or of another run.
-    pub(super) fn load(files: &RunFiles, spec: &ModelSpec, run: &RunConfig) -> Result<Option<Self>, TrainError> {
-        let path = files.checkpoint();
-        if !path.is_file() {
-            return Ok(None);
+    /// The run's last intact checkpoint, if it has one. Reports damaged ones to the observer.
+    /// Errors: `Checkpoint` if it is of another run, `Io`.
+    pub(super) fn load_latest(
+        files: &RunFiles,
+        (spec, run): (&ModelSpec, &RunConfig),
+        observer: &mut dyn Observer,
+    ) -> Result<Option<Self>, TrainError> {
+        for (path, is_previous) in [(files.checkpoint(), false), (files.previous_checkpoint(), true)] {
+            let Some(bytes) = none_if_missing(fs::read(&path)).map_err(io_failed("read", &path))? else {
+                continue;
+            };
+            if is_intact(&bytes) {
+                return Self::load(files, (&path, &bytes), spec, run).map(Some);
+            }
+            observer.on_event(TrainingEvent::CheckpointDamaged { is_previous });
+            // The next save must not replace the intact one by it.
+            none_if_missing(fs::remove_file(&path)).map_err(io_failed("delete", &path))?;
         }
+        Ok(None)
+    }
+
+    /// The state in an intact checkpoint. Errors: `Checkpoint` if it is of another run.
+    fn load(
+        files: &RunFiles,
+        (path, bytes): (&Path, &[u8]),
+        spec: &ModelSpec,
+        run: &RunConfig,
+    ) -> Result<Self, TrainError> {
         let failed = |reason: String| TrainError::Checkpoint {
-            path: path.clone(),
+            path: path.to_owned(),
             reason,
         };
-        let bytes = fs::read(&path).map_err(io_failed("read", &path))?;
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| failed(error.to_string()))?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| failed(error.to_string()))?;
         let text = header
             .metadata()
             .as_ref()
             .and_then(|metadata| metadata.get(META_KEY))
-            .ok_or_else(|| failed("it carries no training state".to_owned()))?;
+            .ok_or_else(|| failed("it contains no training state".to_owned()))?;
         let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
         if meta.fingerprint != files.fingerprint() {
             return Err(failed("it belongs to another run".to_owned()));
         }
-        let tensors = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)?;
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?;
         let group = |prefix: &str| -> BTreeMap<String, Tensor> {
             tensors
                 .iter()
                 .filter_map(|(name, tensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone())))
                 .collect()
         };
-        let misfit = |error: crate::nn::NnError| failed(error.to_string());
-        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(misfit)?;
+        let wrong_weights = |error: crate::nn::NnError| failed(error.to_string());
+        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(wrong_weights)?;
         let optimizer = Adam::import(run.adam(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
         let state = TrainState {
             stage: meta.stage,
@@ -226,17 +304,39 @@ impl Checkpoint {
             parameters,
             optimizer,
             best: Parameters::from_tensors(spec, group(BEST))
-                .map_err(misfit)?
+                .map_err(wrong_weights)?
                 .snapshot()?,
             best_step: meta.best_step,
             best_loss: meta.best_loss,
             history: meta.history,
         };
-        Ok(Some(Self { state }))
+        Ok(Self { state })
     }
 
-    /// The state to go on from.
+    /// The training state.
     pub(super) fn into_state(self) -> TrainState {
         self.state
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_flipped_bit_damages_a_checkpoint() {
+        let tensor = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu).unwrap();
+        let metadata = HashMap::from([
+            (META_KEY.to_owned(), r#"{"stage":"fit","step":7}"#.to_owned()),
+            hash_entry(),
+        ]);
+        let bytes = seal(safetensors::serialize([("a", tensor)], Some(metadata)).unwrap());
+        assert_eq!(CheckpointPosition::of(&bytes).map(|reached| reached.step), Some(7));
+        for index in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[index] ^= 4;
+            assert!(CheckpointPosition::of(&damaged).is_none(), "byte {index}");
+        }
+        assert!(CheckpointPosition::of(&bytes[..bytes.len() - 1]).is_none());
     }
 }

@@ -1,4 +1,4 @@
-//! What a training is told: every setting, and its range.
+//! The configuration of a training: all settings and their ranges.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,17 +6,17 @@ use super::TrainError;
 use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
-use crate::nn::loss::Loss;
 use crate::frame::warp::CameraModel;
+use crate::nn::loss::Loss;
 use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, Reconstruction};
 use crate::types::{Channel, Seed};
 
-/// The most steps of one stage.
+/// Largest number of steps of one stage.
 const MAX_STEPS: usize = 10_000_000;
-/// The most windows or frames in one batch.
+/// Largest number of windows or frames in one batch.
 const MAX_BATCH_SIZE: usize = 4096;
 
-/// Everything that, with a data set, decides the weights.
+/// All settings of a training. Together with the data set, they determine the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainConfig {
@@ -24,52 +24,48 @@ pub struct TrainConfig {
     pub name: String,
     /// The origin of all randomness.
     pub seed: Seed,
-    /// The network.
+    /// Settings of the network.
     pub model: ModelConfig,
-    /// Which windows.
+    /// Settings of the windows.
     pub data: DataConfig,
-    /// Stage 1: the dense codec alone, as an autoencoder of single frames.
+    /// Stage 1, pre-training: the dense codec alone, as an autoencoder of single frames.
     pub pretrain: PretrainConfig,
-    /// Stage 2: the recurrent network.
+    /// Stage 2, sequence training: the recurrent network.
     pub fit: FitConfig,
-    /// What both stages share.
+    /// Settings of both stages.
     pub run: RunConfig,
 }
 
-/// The network's free choices; the data set gives the rest of the [`ModelSpec`].
+/// Settings of the network. The other values of the [`ModelSpec`] come from the data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
     /// The kind of network.
-    #[serde(default = "dense")]
+    #[serde(default = "Architecture::dense")]
     pub architecture: Architecture,
-    /// Frames that the encoder reads.
+    /// Number of context frames.
     pub context: usize,
-    /// Frames that the predictor writes.
+    /// Number of predicted frames.
     pub horizon: usize,
-    /// Units of the dense codec.
+    /// Features of a frame (dense network).
     #[serde(default = "default_features")]
     pub features: usize,
-    /// Units of each recurrent layer.
+    /// Hidden units of each LSTM (dense network).
     #[serde(default = "default_hidden")]
     pub hidden: usize,
-    /// Which of the paper's two ways to reconstruct.
+    /// Which of the paper's two approaches reconstructs the context (dense network).
     #[serde(default = "default_reconstruction")]
     pub reconstruction: Reconstruction,
-    /// What the predictor is told.
+    /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
-    /// How frames enter the model's space.
+    /// How frames are converted to the model's value range.
     pub preprocess: Preprocess,
-    /// Sizes of the flow network.
+    /// Layer sizes of the flow network.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flow: Option<FlowLayers>,
-    /// The camera, where the data set does not describe it or is to be overruled. Only the flow network uses it.
+    /// The camera model; it replaces the data set's. Only the flow network uses it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraModel>,
-}
-
-fn dense() -> Architecture {
-    Architecture::Dense
 }
 
 fn default_features() -> usize {
@@ -84,25 +80,25 @@ fn default_reconstruction() -> Reconstruction {
     ModelSpec::default().reconstruction
 }
 
-/// The windows that are trained on.
+/// Settings of the windows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataConfig {
-    /// How many, drawn at random, or `"all"`.
+    /// Number of training windows, drawn at random, or `"all"`.
     pub windows: WindowBudget,
-    /// How many windows of the validation split choose the best weights, at most.
+    /// Largest number of validation windows used to choose the best weights.
     pub validation_windows: usize,
-    /// The seed of the split into training, validation and test.
+    /// The seed of the split into training, validation and test parts.
     pub split_seed: Seed,
 }
 
-/// A number of windows, or all there are.
+/// A number of windows, or all windows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum WindowBudget {
-    /// So many.
+    /// This number of windows.
     Count(usize),
-    /// Every one.
+    /// All windows.
     All(All),
 }
 
@@ -114,108 +110,110 @@ pub enum All {
     All,
 }
 
-/// Stage 1.
+/// Settings of pre-training (stage 1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PretrainConfig {
-    /// Where the codec's weights start.
+    /// The initial weights of the codec.
     pub start: CodecStart,
-    /// Updates.
+    /// Number of updates.
     pub steps: usize,
-    /// Frames an update.
+    /// Frames per update.
     pub batch_size: usize,
-    /// Adam's, at its highest.
+    /// Adam's highest learning rate.
     pub learning_rate: f64,
 }
 
-/// Where the codec's weights start.
+/// The initial weights of the codec.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CodecStart {
-    /// At the principal components of the training frames.
+    /// The principal components of the training frames.
     Principal,
-    /// At random.
+    /// Random weights.
     Random,
 }
 
-/// Stage 2.
+/// Settings of sequence training (stage 2).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FitConfig {
-    /// Updates.
+    /// Number of updates.
     pub steps: usize,
-    /// Windows an update.
+    /// Windows per update.
     pub batch_size: usize,
-    /// Adam's, at its highest.
+    /// Adam's highest learning rate.
     pub learning_rate: f64,
-    /// Whether the pre-trained codec is trained on.
+    /// Whether the pre-trained codec is trained further.
     pub codec: CodecTraining,
-    /// What is minimized, in the model's space.
+    /// The loss function, computed in the model's value range.
     pub loss: Loss,
-    /// Which frames the decoder learns to write.
+    /// The target frames of the decoder, in both stages.
     pub target: Target,
-    /// What the predictor reads after its first step while it is trained.
+    /// What the predictor gets as the previous frame in training, after its first step.
     pub feedback: TrainingFeedback,
-    /// Weight of the reconstruction's loss beside the prediction's; 0 leaves the reconstruction decoder untrained.
+    /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
+    /// trained.
     pub reconstruction_weight: f64,
-    /// Weight of the scene's own loss (flow network): how far the surroundings alone are from the true frames.
+    /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
     #[serde(default)]
     pub scene_weight: f64,
-    /// Weight of the loss of the camera's motion (flow network) against the poses measured later, where there are any.
+    /// Weight of the motion loss (flow network): the difference between the predicted camera motion and the motion between
+    /// the measured poses, if the states have a pose.
     #[serde(default)]
     pub motion_weight: f64,
 }
 
-/// Which frames the decoder learns to write, in both stages.
+/// The target frames of the decoder, in both stages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Target {
-    /// As the camera took them, inverted where the model inverts.
+    /// The camera's frames without smoothing, inverted if the model inverts.
     Sharp,
-    /// As the encoder reads them: smoothed too.
+    /// The same frames as the encoder's inputs: smoothed.
     Smoothed,
 }
 
-/// What becomes of the pre-trained codec in stage 2.
+/// How the pre-trained codec is used in stage 2.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CodecTraining {
-    /// It stays as pre-trained.
+    /// Its weights do not change.
     Frozen,
-    /// It is trained on with the rest.
+    /// It is trained together with the recurrent network.
     FineTuned,
 }
 
-/// What the predictor reads after its first step while it is trained.
+/// What the predictor gets as the previous frame in training, after its first step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TrainingFeedback {
-    /// Its own last prediction, as when it is used.
+    /// Its own last prediction, as in use (autoregressive).
     Prediction,
     /// The true frame's features (teacher forcing).
     TeacherForcing,
 }
 
-/// What both stages share.
+/// Settings of both stages.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
     /// Updates over which the learning rate rises from 0.
     pub warmup_steps: usize,
-    /// The last learning rate as a share of the highest, reached along a cosine.
+    /// The final learning rate as a share of the highest one; the rate decreases along a cosine.
     pub final_learning_rate: f64,
-    /// The largest norm of all gradients together.
+    /// The largest norm of all gradients together; larger gradients are scaled down.
     pub clip_norm: f64,
-    /// Equal parts of a batch that are differentiated side by side, each on a core.
+    /// Number of equal parts of a batch whose gradients are computed in parallel, each on one core.
     pub batch_parts: usize,
-    /// Updates from one validation to the next.
+    /// Updates between two validations.
     pub validate_every_steps: usize,
-    /// Updates from one checkpoint to the next.
+    /// Updates between two checkpoints.
     pub checkpoint_every_steps: usize,
 }
 
 impl RunConfig {
-    /// The optimizer's constants.
+    /// Adam's constants.
     pub(super) fn adam(&self) -> AdamConfig {
         AdamConfig {
             clip_norm: self.clip_norm,
@@ -225,12 +223,12 @@ impl RunConfig {
 }
 
 impl TrainConfig {
-    /// The configuration as a TOML text.
+    /// The configuration as TOML text. Errors: `Config`.
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string_pretty(self).map_err(|error| TrainError::Config(error.to_string()))
     }
 
-    /// Errors: `Config` with the first field that is out of range and its range.
+    /// Checks all settings. Errors: `Config` with the first field that is out of range, and its range.
     pub fn validate(&self) -> Result<(), TrainError> {
         if !crate::registry::is_valid_name(&self.name) {
             return Err(crate::registry::RegistryError::Name(self.name.clone()).into());
@@ -247,10 +245,10 @@ impl TrainConfig {
             ("run.checkpoint_every_steps", run.checkpoint_every_steps, 1, MAX_STEPS),
             ("run.warmup_steps", run.warmup_steps, 0, MAX_STEPS),
         ];
-        for (field, value, least, most) in counts {
-            if !(least..=most).contains(&value) {
+        for (field, value, min, max) in counts {
+            if !(min..=max).contains(&value) {
                 return Err(TrainError::Config(format!(
-                    "{field} is {value}; it must be {least} to {most}"
+                    "{field} is {value}; it must be {min} to {max}"
                 )));
             }
         }
@@ -263,11 +261,9 @@ impl TrainConfig {
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
             ("run.clip_norm", run.clip_norm, 1e6),
         ];
-        for (field, value, most) in numbers {
-            if !(0.0..=most).contains(&value) {
-                return Err(TrainError::Config(format!(
-                    "{field} is {value}; it must be 0 to {most}"
-                )));
+        for (field, value, max) in numbers {
+            if !(0.0..=max).contains(&value) {
+                return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {max}")));
             }
         }
         for (field, size) in [
@@ -289,7 +285,7 @@ impl TrainConfig {
         Ok(())
     }
 
-    /// Inputs and targets of one window.
+    /// Context and horizon of a window.
     #[must_use]
     pub fn window_shape(&self) -> WindowShape {
         WindowShape {
@@ -298,7 +294,7 @@ impl TrainConfig {
         }
     }
 
-    /// The model's description on that data set, channels scaled by the given training frames.
+    /// The model specification for this data set. Channels are scaled by their statistics over the given training frames.
     #[must_use]
     pub fn model_spec(&self, dataset: &Dataset, frames: &[usize]) -> ModelSpec {
         let (info, model) = (dataset.info(), &self.model);

@@ -1,4 +1,4 @@
-//! Stage 2: the encoder with its two decoders, the prediction's and the reconstruction's, trained together.
+//! Stage 2, sequence training: trains the encoder together with its two decoders, for prediction and for reconstruction.
 
 use candle_core::Tensor;
 
@@ -11,12 +11,12 @@ use crate::dataset::Window;
 use crate::nn::loss::Loss;
 use crate::nn::{Architecture, Feedback, Model, Parameters};
 
-/// What the names of the codec's tensors start with.
+/// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
-/// Windows that are validated in one batch.
+/// Validation windows per batch.
 const VALIDATION_BATCH_SIZE: usize = 64;
 
-/// The error of prediction and reconstruction.
+/// The loss of prediction and reconstruction.
 pub(super) struct SequenceObjective<'a> {
     plan: &'a TrainingPlan<'a>,
     config: &'a TrainConfig,
@@ -36,7 +36,7 @@ impl<'a> SequenceObjective<'a> {
         self.config.fit.codec == CodecTraining::Frozen
     }
 
-    /// The features of `[B, T, P]` frames as `[B, T, F]`.
+    /// Encodes frames `[B, T, P]` to features `[B, T, F]`.
     fn features(&self, model: &Model, frames: &Tensor) -> Result<Tensor, TrainError> {
         let (batch, time, pixels) = frames.dims3()?;
         let features = model.encode_frames(&frames.reshape((batch * time, pixels))?)?;
@@ -64,7 +64,7 @@ impl<'a> SequenceObjective<'a> {
         Ok(loss)
     }
 
-    /// The frames of `[B, T, F]` features as `[B, T, P]`.
+    /// Decodes features `[B, T, F]` to frames `[B, T, P]`.
     fn frames(model: &Model, features: &Tensor) -> Result<Tensor, TrainError> {
         let (batch, time, width) = features.dims3()?;
         let frames = model.decode_frames(&features.reshape((batch * time, width))?)?;
@@ -89,23 +89,25 @@ impl Objective for SequenceObjective<'_> {
         let fit = &self.config.fit;
         let drawn = part.of(self.shuffle.batch(step, fit.batch_size));
         let windows: Vec<&Window> = drawn.into_iter().map(|position| &self.plan.train[position]).collect();
-        let is_forced = fit.feedback == TrainingFeedback::TeacherForcing;
+        let is_teacher_forced = fit.feedback == TrainingFeedback::TeacherForcing;
         let batch = self
             .plan
             .source
-            .windows(&windows, self.config.window_shape(), is_forced)?;
+            .windows(&windows, self.config.window_shape(), is_teacher_forced)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
         if self.plan.spec.architecture == Architecture::Flow {
             return self.flow_loss(&model, &batch);
         }
         let inputs = self.features(&model, &batch.inputs)?;
-        let truth = batch
+        let true_features = batch
             .future
             .as_ref()
             .map(|future| self.features(&model, future))
             .transpose()?;
-        let feedback = truth.as_ref().map_or(Feedback::Prediction, Feedback::TeacherForcing);
+        let feedback = true_features
+            .as_ref()
+            .map_or(Feedback::Prediction, Feedback::TeacherForcing);
         let predicted = model.predict(&inputs, &batch.condition, feedback)?;
         let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
         if fit.reconstruction_weight == 0.0 {

@@ -1,14 +1,15 @@
-//! What a training tells whoever watches.
+//! Events of a training, for progress displays and reports.
 
 use serde::{Deserialize, Serialize};
 
 /// The two stages of a training.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum TrainingStage {
-    /// The dense codec alone.
+    /// Stage 1, pre-training: the dense codec alone.
     Pretrain,
-    /// The recurrent network.
+    /// Stage 2, sequence training: the recurrent network.
     Fit,
 }
 
@@ -21,63 +22,69 @@ impl std::fmt::Display for TrainingStage {
     }
 }
 
-/// Something that happened.
+/// An event of a training.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum TrainingEvent {
-    /// The run starts, or goes on, here.
+    /// The training starts or resumes.
     Started {
-        /// In this stage.
+        /// The stage.
         stage: TrainingStage,
-        /// After so many updates of it.
+        /// After this number of updates of the stage.
         step: usize,
-        /// Training windows there are.
+        /// Number of training windows.
         windows: usize,
     },
-    /// A validation of an earlier call, as the checkpoint recalls it; told before `Started` where a run goes on.
-    Recalled {
-        /// In this stage.
+    /// A validation result of an earlier call, restored from the checkpoint. Sent before `Started` if a training resumes.
+    Restored {
+        /// The stage.
         stage: TrainingStage,
-        /// After so many updates.
+        /// After this number of updates.
         step: usize,
         /// The loss of that update's batch.
         train_loss: f64,
         /// The mean squared error on the validation windows.
         validation_loss: f64,
     },
-    /// An update was made.
+    /// An update was completed.
     Step {
-        /// In this stage.
+        /// The stage.
         stage: TrainingStage,
-        /// Updates made, this one included.
+        /// Number of completed updates, including this one.
         step: usize,
-        /// Updates to make.
+        /// Number of updates of the stage.
         steps: usize,
-        /// The loss of its batch.
+        /// The loss of the update's batch.
         loss: f64,
     },
-    /// The validation windows were predicted.
+    /// A validation was completed.
     Validated {
-        /// In this stage.
+        /// The stage.
         stage: TrainingStage,
-        /// After so many updates.
+        /// After this number of updates.
         step: usize,
-        /// Their mean squared error against the target frames.
+        /// The mean squared error against the target frames.
         loss: f64,
-        /// Whether it is the lowest so far, whose weights are kept.
+        /// Whether this is the lowest error so far, so that these weights are kept.
         is_best: bool,
     },
-    /// The state was written to disk.
+    /// A checkpoint is damaged and is not used.
+    CheckpointDamaged {
+        /// Whether it is the one before the latest; then the training starts from the beginning.
+        is_previous: bool,
+    },
+    /// A checkpoint was written.
     Checkpointed {
-        /// In this stage.
+        /// The stage.
         stage: TrainingStage,
-        /// After so many updates.
+        /// After this number of updates.
         step: usize,
     },
 }
 
-/// Whoever watches a training.
+/// Receives the events of a training.
 pub trait Observer {
-    /// Is told of each event on the training's thread; a slow answer slows the training.
+    /// Called for each event on the training's thread; a slow implementation slows down the training.
     fn on_event(&mut self, event: TrainingEvent);
 }
 

@@ -1,6 +1,6 @@
-//! Adam (Kingma & Ba 2015) with its moments in the open, so that a resumed run goes on bit for bit, and gradients as
-//! values of their own, so that parts of a batch can be computed apart and joined.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Adam (Kingma & Ba 2015). Its moments can be exported, so that a resumed training continues bit by bit. [`Gradients`] are
+//! separate values, so that parts of a batch can be computed in parallel and averaged.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 mod gradients;
@@ -21,8 +21,9 @@ const FIRST: &str = "adam.first.";
 const SECOND: &str = "adam.second.";
 const STEP: &str = "adam.step";
 
-/// Why an update was refused. The parameters and the moments are then as they were.
+/// Why an update failed. Parameters and moments are unchanged.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum OptimizerError {
     /// The loss is NaN or infinite.
     #[error("the loss is {value}; it must be a finite number")]
@@ -31,15 +32,15 @@ pub enum OptimizerError {
         value: f64,
     },
     /// A gradient holds NaN or an infinity.
-    #[error("the gradient of tensor \"{name}\" is not finite")]
+    #[error("the gradient of tensor \"{name}\" contains a value that is not a finite number")]
     GradientNotFinite {
         /// The tensor.
         name: String,
     },
-    /// Gradients that are to be joined are not of the same tensors, or there are none.
-    #[error("gradients to be joined must be of the same tensors, and of one part at least")]
+    /// The gradients to average belong to different tensors, or there are none.
+    #[error("the gradients to average must belong to the same tensors, and there must be at least one part")]
     Join,
-    /// An exported state doesn't fit the parameters.
+    /// An exported state does not match the parameters.
     #[error("optimizer state: tensor \"{name}\" {problem}")]
     State {
         /// The exported tensor.
@@ -59,9 +60,9 @@ pub struct AdamConfig {
     pub beta1: f64,
     /// Decay of the second moment.
     pub beta2: f64,
-    /// Added to the root of the second moment.
+    /// Added to the square root of the second moment.
     pub epsilon: f64,
-    /// Gradients of a larger norm are scaled down to this one; infinite for no clipping.
+    /// Gradients with a larger norm are scaled down to this norm; infinite for no clipping.
     pub clip_norm: f64,
 }
 
@@ -93,7 +94,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// An optimizer that has seen no gradient.
+    /// An optimizer before its first update.
     #[must_use]
     pub fn new(config: AdamConfig) -> Self {
         Self {
@@ -103,14 +104,14 @@ impl Adam {
         }
     }
 
-    /// Updates done.
+    /// Number of completed updates.
     #[must_use]
     pub fn steps(&self) -> u64 {
         self.step
     }
 
-    /// Moves the parameters against the gradients; gives the gradients' norm before clipping. Parameters without a
-    /// gradient stay. Errors: `GradientNotFinite`, and then nothing has changed.
+    /// Updates the parameters and returns the gradients' norm before clipping. Parameters without a gradient do not change.
+    /// Errors: `GradientNotFinite`; then nothing has changed.
     pub fn update(
         &mut self,
         parameters: &Parameters,
@@ -135,7 +136,7 @@ impl Adam {
             },
             beta1: beta1 as f32,
             beta2: beta2 as f32,
-            // θ −= lr · (m / b1) / (√(v / b2) + ε), with √b2 taken out of the root.
+            // θ −= lr · (m / b1) / (√(v / b2) + ε), with √b2 moved out of the square root.
             rate: (learning_rate * second_correction.sqrt() / (1.0 - beta1.powi(steps))) as f32,
             epsilon: (epsilon * second_correction.sqrt()) as f32,
         };
@@ -173,7 +174,7 @@ impl Adam {
         Ok(tensors)
     }
 
-    /// The optimizer that [`Adam::export`] wrote down, bit for bit. Tensors of other names are not looked at.
+    /// Restores the optimizer from the tensors of [`Adam::export`], bit by bit. Tensors with other names are ignored.
     /// Errors: `State`.
     pub fn import(
         config: AdamConfig,
@@ -215,7 +216,7 @@ impl Adam {
     }
 }
 
-/// The numbers of one update.
+/// The constants of one update.
 #[derive(Clone, Copy)]
 struct AdamStep {
     scale: f32,
@@ -238,7 +239,7 @@ impl AdamStep {
     }
 }
 
-/// One tensor's update, in one pass and in place: candle's own operations would take a dozen passes.
+/// Updates one tensor in place, in one pass over memory. candle's own operations would need a dozen passes.
 struct AdamUpdate<'a> {
     rule: AdamStep,
     gradient: &'a [f32],
@@ -252,7 +253,7 @@ impl InplaceOp1 for AdamUpdate<'_> {
 
     fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
         let (CpuStorage::F32(values), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
-            candle_core::bail!("adam takes contiguous f32 parameters");
+            candle_core::bail!("adam needs contiguous f32 parameters");
         };
         let mut moments = self.moments.borrow_mut();
         let AdamMoments { first, second, .. } = &mut **moments;

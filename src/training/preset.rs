@@ -1,9 +1,8 @@
 //! The presets, and how a file and single settings change them.
 
-use toml::{Table, Value};
-
 use super::TrainError;
 use super::config::TrainConfig;
+use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// Name and text of each preset.
 const PRESETS: [(&str, &str); 5] = [
@@ -14,6 +13,9 @@ const PRESETS: [(&str, &str); 5] = [
     ("moving-flow", include_str!("presets/moving-flow.toml")),
 ];
 
+/// The command that lists all settings.
+const LISTING: &str = "foreframe train --print-config";
+
 impl TrainConfig {
     /// The names of the presets.
     #[must_use]
@@ -21,73 +23,42 @@ impl TrainConfig {
         PRESETS.iter().map(|(name, _)| *name).collect()
     }
 
-    /// A preset as it is. Errors: `UnknownPreset` with the names there are.
+    /// A preset as it is. Errors: `UnknownPreset` with the known names.
     pub fn preset(name: &str) -> Result<Self, TrainError> {
-        Self::layered(name, None, &[])
+        Self::from_layers(name, [])
     }
 
     /// A preset, changed by a TOML text, then by settings `KEY=VALUE` with dotted keys, and checked.
     /// Errors: `UnknownPreset`, `Config` with the field that is wrong.
-    pub fn layered(preset: &str, file: Option<&str>, settings: &[String]) -> Result<Self, TrainError> {
+    pub fn layered(preset: &str, text: Option<&str>, settings: &[String]) -> Result<Self, TrainError> {
+        let text = text.map(|text| SettingsLayer::toml("settings", text)).into_iter();
+        let settings = settings.iter().map(|setting| SettingsLayer::assignment(setting));
+        let layers: Result<Vec<_>, _> = text.chain(settings).collect();
+        Self::from_layers(preset, layers.map_err(config_error)?)
+    }
+
+    /// A preset under layers of settings, later ones over earlier ones, checked.
+    /// Errors: `UnknownPreset`, `Config` with the field that is wrong.
+    pub fn from_layers(preset: &str, layers: impl IntoIterator<Item = SettingsLayer>) -> Result<Self, TrainError> {
         let (_, text) = PRESETS
             .iter()
             .find(|(name, _)| *name == preset)
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
-        let mut table = parse(text)?;
-        if let Some(file) = file {
-            merge(&mut table, parse(file)?);
-        }
-        for setting in settings {
-            merge(&mut table, parse_setting(setting)?);
-        }
-        let config: Self = table
-            .try_into()
-            .map_err(|error| TrainError::Config(with_field(&error)))?;
+        let defaults = SettingsLayer::toml(format!("preset {preset}"), text).map_err(config_error)?;
+        let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(config_error)?;
+        let config: Self = values.extract(expected).map_err(config_error)?;
         config.validate()?;
         Ok(config)
     }
 }
 
-fn parse(text: &str) -> Result<Table, TrainError> {
-    text.parse().map_err(|error: toml::de::Error| {
-        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
-        let line = before.matches('\n').count() + 1;
-        TrainError::Config(format!(
-            "the configuration is no TOML in line {line}: {}",
-            error.message()
-        ))
-    })
+/// What a setting must be, where its type does not say it well.
+fn expected(key: &str) -> Option<String> {
+    (key == "data.windows").then(|| "a whole number, 1 or more, or \"all\"".to_owned())
 }
 
-/// The error's message, and the field that it tells in a line of its own.
-fn with_field(error: &toml::de::Error) -> String {
-    error.to_string().trim().replace('\n', " ")
-}
-
-/// `fit.steps=3000` as the table it stands for; a value that is no TOML is taken as a string.
-fn parse_setting(setting: &str) -> Result<Table, TrainError> {
-    let (key, value) = setting.split_once('=').ok_or_else(|| {
-        TrainError::Config(format!(
-            "{setting:?} is no setting; write KEY=VALUE, as in fit.steps=3000"
-        ))
-    })?;
-    let (key, value) = (key.trim(), value.trim());
-    format!("{key} = {value}")
-        .parse()
-        .or_else(|_| format!("{key} = {value:?}").parse())
-        .map_err(|_| TrainError::Config(format!("{key:?} is no field; --print-config shows them all")))
-}
-
-/// Lays `over` upon `base`, table by table.
-fn merge(base: &mut Table, over: Table) {
-    for (key, value) in over {
-        match (base.get_mut(&key), value) {
-            (Some(Value::Table(inner)), Value::Table(value)) => merge(inner, value),
-            (_, value) => {
-                base.insert(key, value);
-            }
-        }
-    }
+fn config_error(error: SettingsError) -> TrainError {
+    TrainError::Config(error.to_string())
 }
 
 #[cfg(test)]
@@ -123,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_preset_is_answered_with_the_names_there_are() {
+    fn the_error_for_an_unknown_preset_lists_the_presets() {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
         assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow");
     }
@@ -133,19 +104,32 @@ mod tests {
         let error = TrainConfig::layered("paper", None, &["fit.stepz=3".to_owned()])
             .unwrap_err()
             .to_string();
-        assert!(error.contains("unknown field `stepz`"), "{error}");
+        assert_eq!(
+            error,
+            "unknown field `stepz` in `fit` (--set); `foreframe train --print-config` lists all settings"
+        );
     }
 
     #[test]
-    fn a_value_of_another_kind_is_refused_with_its_field_and_a_damaged_file_with_its_line() {
+    fn a_value_of_another_kind_is_refused_with_its_field_and_origin() {
         let message =
             |file, settings: &[String]| TrainConfig::layered("paper", file, settings).unwrap_err().to_string();
         assert_eq!(
             message(None, &["fit.steps=many".to_owned()]),
-            "invalid type: string \"many\", expected usize in `fit.steps`"
+            "fit.steps is \"many\" (--set); it must be a whole number, 0 or more"
         );
-        assert!(message(Some("seed = 5\n[fit\n"), &[]).starts_with("the configuration is no TOML in line 2: "));
-        assert!(message(None, &["fit steps=3".to_owned()]).starts_with("\"fit steps\" is no field"));
+        assert_eq!(
+            message(Some("[data]\nwindows = \"some\"\n"), &[]),
+            "data.windows is \"some\" (settings); it must be a whole number, 1 or more, or \"all\""
+        );
+        assert_eq!(
+            message(Some("[fit]\ncodec = \"thawed\"\n"), &[]),
+            "fit.codec is \"thawed\" (settings); it must be frozen or fine-tuned"
+        );
+        assert_eq!(
+            message(Some("fit = 3\n"), &[]),
+            "fit is 3 (settings); it must be a table"
+        );
     }
 
     #[test]

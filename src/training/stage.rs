@@ -1,4 +1,5 @@
-//! The loop that both stages share: draw, differentiate, update; validate and keep the best; write checkpoints.
+//! The training loop of both stages: draw a batch, compute gradients, update; validate and keep the best weights; write
+//! checkpoints.
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
@@ -15,25 +16,25 @@ use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::{Adam, Gradients, OptimizerError};
 use crate::nn::Parameters;
 
-/// Pixels lie in 0…1, so a loss above this is no prediction any more.
+/// A larger loss counts as diverged, because pixels are in 0…1.
 const MAX_LOSS: f64 = 1e3;
 
-/// What a stage minimizes.
+/// The objective of a stage.
 pub(super) trait Objective: Sync {
-    /// Which of the two it is.
+    /// The stage.
     fn stage(&self) -> TrainingStage;
-    /// Updates to make.
+    /// Number of updates.
     fn steps(&self) -> usize;
-    /// Adam's learning rate at its highest.
+    /// Adam's highest learning rate.
     fn learning_rate(&self) -> f64;
-    /// The loss of one part of the batch that belongs to a step, a scalar to differentiate.
+    /// The loss of one part of a step's batch, as a scalar with gradients.
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
     /// The mean squared error of the validation split against the target frames.
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
 }
 
-/// One of the equal parts of a batch, which are differentiated side by side. Their number is a setting, not the machine's
-/// count of cores, so that the same bits come out everywhere.
+/// One of the equal parts of a batch, whose gradients are computed in parallel. Their number is a setting and not the number
+/// of cores, so that the result has the same bits on every machine.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BatchPart {
     pub(super) index: usize,
@@ -48,7 +49,7 @@ impl BatchPart {
     }
 }
 
-/// A point of the loss curves.
+/// One point of the loss curves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct HistoryPoint {
     pub(super) stage: TrainingStage,
@@ -57,14 +58,14 @@ pub(super) struct HistoryPoint {
     pub(super) validation_loss: f64,
 }
 
-/// Everything that the next step depends on.
+/// The training state: everything that the next step depends on.
 pub(super) struct TrainState {
     pub(super) stage: TrainingStage,
-    /// Updates made in the stage.
+    /// Number of completed updates of the stage.
     pub(super) step: usize,
     pub(super) parameters: Parameters,
     pub(super) optimizer: Adam,
-    /// The parameters of the lowest validation loss of the stage.
+    /// The parameters with the lowest validation loss of the stage.
     pub(super) best: BTreeMap<String, Tensor>,
     pub(super) best_step: usize,
     pub(super) best_loss: Option<f64>,
@@ -86,8 +87,8 @@ impl TrainState {
         })
     }
 
-    /// Takes the best weights of this stage and starts the next with a fresh optimizer.
-    pub(super) fn enter(&mut self, stage: TrainingStage, run: &RunConfig) -> Result<(), TrainError> {
+    /// Restores the best weights of this stage and starts the next stage with a new optimizer.
+    pub(super) fn start_stage(&mut self, stage: TrainingStage, run: &RunConfig) -> Result<(), TrainError> {
         self.restore_best()?;
         self.stage = stage;
         self.step = 0;
@@ -97,21 +98,21 @@ impl TrainState {
         Ok(())
     }
 
-    /// Sets the parameters to the best of this stage.
+    /// Sets the parameters to the best weights of this stage.
     pub(super) fn restore_best(&mut self) -> Result<(), TrainError> {
         self.parameters.restore(&self.best)?;
         Ok(())
     }
 }
 
-/// Whether a stage came to its end.
+/// How a stage ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum StageEnd {
     Done,
     Interrupted,
 }
 
-/// Runs stages.
+/// Runs the training loop of a stage.
 pub(super) struct StageRunner<'a> {
     pub(super) files: &'a RunFiles,
     pub(super) run: &'a RunConfig,
@@ -119,8 +120,8 @@ pub(super) struct StageRunner<'a> {
 }
 
 impl StageRunner<'_> {
-    /// Updates until the stage's last step, or until cancelled; the state is then on disk. Errors: `Diverged` with the last
-    /// checkpoint kept, and those of the objective.
+    /// Runs until the stage's last step or until cancelled, then writes a checkpoint. Errors: `Diverged`, and those of the
+    /// objective; the last checkpoint stays on disk.
     pub(super) fn run(
         &self,
         objective: &dyn Objective,
@@ -154,17 +155,22 @@ impl StageRunner<'_> {
         Ok(StageEnd::Done)
     }
 
-    /// One update; returns the batch's loss.
-    fn update(&self, objective: &dyn Objective, state: &mut TrainState, kept: usize) -> Result<f64, TrainError> {
+    /// Computes one update and returns the batch's loss.
+    fn update(
+        &self,
+        objective: &dyn Objective,
+        state: &mut TrainState,
+        checkpoint_step: usize,
+    ) -> Result<f64, TrainError> {
         let step = state.step;
         let diverged = |what| TrainError::Diverged {
             stage: objective.stage(),
             step: step + 1,
             what,
-            kept,
+            checkpoint_step,
         };
         let parameters = &state.parameters;
-        let part = |index| -> Result<Result<Gradients, OptimizerError>, TrainError> {
+        let gradients_of_part = |index| -> Result<Result<Gradients, OptimizerError>, TrainError> {
             let loss = objective.loss(
                 parameters,
                 step,
@@ -177,7 +183,7 @@ impl StageRunner<'_> {
         };
         let parts = (0..self.run.batch_parts)
             .into_par_iter()
-            .map(part)
+            .map(gradients_of_part)
             .collect::<Result<Vec<_>, _>>()?;
         let rate = objective.learning_rate() * self.schedule(step, objective.steps());
         let updated = parts
@@ -189,7 +195,7 @@ impl StageRunner<'_> {
                 Ok(gradients.loss())
             });
         match updated {
-            Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, over {MAX_LOSS}"))),
+            Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, more than {MAX_LOSS}"))),
             Ok(loss) => Ok(loss),
             Err(OptimizerError::LossNotFinite { value }) => Err(diverged(format!("the loss is {value}"))),
             Err(error @ OptimizerError::GradientNotFinite { .. }) => Err(diverged(error.to_string())),
@@ -197,7 +203,7 @@ impl StageRunner<'_> {
         }
     }
 
-    /// The learning rate's share of its highest: a linear rise, then half a cosine.
+    /// The learning rate as a share of its highest value: a linear rise, then half a cosine.
     fn schedule(&self, step: usize, steps: usize) -> f64 {
         let (step, steps, warmup) = (step as f64, steps as f64, self.run.warmup_steps as f64);
         if step < warmup {
@@ -237,7 +243,7 @@ impl StageRunner<'_> {
         Ok(())
     }
 
-    /// Writes the state to disk.
+    /// Writes a checkpoint.
     pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
         Checkpoint::save(self.files, state)?;
         observer.on_event(TrainingEvent::Checkpointed {

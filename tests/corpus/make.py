@@ -1,6 +1,6 @@
-"""Makes the corpora that tests/hostile replays: `python make.py` (needs Pillow). What a file's name begins with is what
-becomes of it: `ok` or `refused`, or the HTTP status. They fit the tests' models: 16×12 px, 3 frames of context, 2 to come,
-8 features, an action of two numbers and a state of one."""
+"""Creates the corpus for tests/malformed: `python make.py` (needs Pillow). The first part of a file's name is the expected
+outcome: `ok`, `refused` or the HTTP status. The files match the tests' models: 16×12 px, 3 frames of context, 2 predicted
+frames, 8 features, an action of two numbers and a state of one."""
 
 import base64
 import io
@@ -206,7 +206,7 @@ def bodies():
 
 def states():
     memory = {"next_seq": 5, "features": [[0.25] * 8] * 3, "actions": [[0.5, -0.5]] * 2, "state": [1.0]}
-    # tests/hostile puts the model's own hash in the place of WEIGHTS.
+    # tests/malformed replaces WEIGHTS with the model's hash.
     state = {"model": "moving", "version": 1, "weights_sha256": "WEIGHTS", "on_gap": "error", "memory": memory}
     with_memory = lambda **more: state | {"memory": memory | more}
     for name, content in {

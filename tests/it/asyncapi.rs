@@ -1,4 +1,4 @@
-//! The stream's contract, `openapi/asyncapi.yaml`, held against the codec.
+//! The stream's contract, `openapi/asyncapi.yaml`, checked against the codec.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Debug;
@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// Of each message: the properties of its schema, and its examples.
+/// For each message: the properties of its schema, and its examples.
 type Contract = BTreeMap<String, (BTreeSet<String>, Vec<String>)>;
 
 fn contract() -> Contract {
@@ -33,7 +33,7 @@ fn contract() -> Contract {
     contract
 }
 
-/// The message's types, which the codec names when it knows none of that name.
+/// The message types that the codec lists when it refuses an unknown one.
 fn types<T: DeserializeOwned + Debug>() -> BTreeSet<String> {
     let error = Codec::Json
         .decode::<T>(&Message::Text(r#"{"type":"?"}"#.into()))
@@ -56,24 +56,24 @@ fn replay<T: DeserializeOwned + Serialize + Debug + PartialEq>(contract: &Contra
             let Message::Text(text) = Codec::Json.encode(&typed) else {
                 panic!()
             };
-            let (said, example): (Value, Value) = (
+            let (encoded, example): (Value, Value) = (
                 serde_json::from_str(&text).unwrap(),
                 serde_json::from_str(example).unwrap(),
             );
-            assert_eq!(said, example);
-            assert_eq!(said["type"], name);
+            assert_eq!(encoded, example);
+            assert_eq!(encoded["type"], name);
             assert_eq!(
                 Codec::Msgpack.decode::<T>(&Codec::Msgpack.encode(&typed)).unwrap(),
                 typed
             );
-            fields.extend(said.as_object().unwrap().keys().cloned());
+            fields.extend(encoded.as_object().unwrap().keys().cloned());
         }
         assert_eq!(&fields, properties, "{name}: the examples' fields and the schema's");
     }
 }
 
 #[test]
-fn every_message_has_examples_that_the_codec_reads_and_writes() {
+fn every_message_example_round_trips_through_the_codec() {
     let contract = contract();
     replay::<ClientMessage>(&contract);
     replay::<ServerMessage>(&contract);

@@ -16,7 +16,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::keys::new_key;
-use crate::service::{PATIENCE, Running, post, run};
+use crate::service::{InProcessServer, TIMEOUT, post, run};
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -28,7 +28,7 @@ fn chromium() -> Option<PathBuf> {
     paths.find(|path| path.is_file())
 }
 
-/// A page in a browser.
+/// A page in a headless browser.
 struct Page {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
     session: String,
@@ -36,7 +36,7 @@ struct Page {
     _browser: Browser,
 }
 
-/// A browser that ends with the test.
+/// A browser process. Dropping it kills the process.
 struct Browser(Child);
 
 impl Drop for Browser {
@@ -70,12 +70,12 @@ impl Page {
         let mut lines = BufReader::new(browser.stderr.take().unwrap()).lines();
         let browser = Browser(browser);
         let endpoint = loop {
-            let line = lines.next().expect("Chromium ended at its start").unwrap();
+            let line = lines.next().expect("Chromium starts").unwrap();
             if let Some(endpoint) = line.strip_prefix("DevTools listening on ") {
                 break endpoint.to_owned();
             }
         };
-        // A full pipe would hold the browser up.
+        // A full pipe would block the browser.
         std::thread::spawn(move || lines.for_each(drop));
         let (socket, _) = tokio_tungstenite::connect_async(endpoint).await.unwrap();
         let mut page = Self {
@@ -100,7 +100,7 @@ impl Page {
         }
         self.socket.send(Message::text(message.to_string())).await.unwrap();
         loop {
-            let answer = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+            let answer = tokio::time::timeout(TIMEOUT, self.socket.next()).await;
             let Message::Text(text) = answer.unwrap().unwrap().unwrap() else {
                 continue;
             };
@@ -117,17 +117,17 @@ impl Page {
         self.call("Runtime.evaluate", params).await["result"]["value"].take()
     }
 
-    /// Asks the page until the expression is true.
-    async fn until(&mut self, expression: &str) {
+    /// Evaluates the expression repeatedly until it is true.
+    async fn wait_until(&mut self, expression: &str) {
         let started = Instant::now();
         while self.value(expression).await != json!(true) {
             let page = self.value("document.body.innerText").await;
-            assert!(started.elapsed() < PATIENCE, "never true: {expression}\n{page}");
+            assert!(started.elapsed() < TIMEOUT, "never true: {expression}\n{page}");
             tokio::time::sleep(std::time::Duration::from_millis(50)).await;
         }
     }
 
-    /// The whole page as on a screen of that width, which it must fit.
+    /// Saves a screenshot of the whole page and checks that the page is not wider than the screen.
     async fn screenshot(&mut self, name: &str, width_px: u32, colors: &str) {
         let screen = json!({"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 600});
         self.call("Emulation.setDeviceMetricsOverride", screen).await;
@@ -145,7 +145,7 @@ impl Page {
         );
     }
 
-    /// Types a key into the form and sends it.
+    /// Types an API key into the form and submits it.
     async fn unlock(&mut self, key: &str) {
         let focus = "document.getElementById('key').focus(); document.getElementById('key').select()";
         self.value(focus).await;
@@ -158,25 +158,30 @@ impl Page {
     }
 }
 
-/// Every step has its error, and every picture is there.
+/// True if every step has its error and every image is loaded.
 const IS_COMPLETE: &str =
     "[...document.querySelectorAll('#film #error td')].filter(cell => / %$/.test(cell.textContent)).length === 5
     && [...document.querySelectorAll('#film img')].every(image => image.naturalWidth === 64)";
 
-async fn serve(data_dir: &Path) -> (App, Keys, Running) {
+async fn serve(data_dir: &Path) -> (App, Keys, InProcessServer) {
+    serve_with(data_dir, ServerConfig::default().max_environments).await
+}
+
+async fn serve_with(data_dir: &Path, max_environments: usize) -> (App, Keys, InProcessServer) {
     let app = App::open(ServerConfig {
         data_dir: data_dir.to_owned(),
+        max_environments,
         ..ServerConfig::default()
     })
     .await
     .unwrap();
-    let keys = Keys::of(app.store().clone(), false).await.unwrap();
+    let keys = Keys::open(app.store().clone(), false).await.unwrap();
     let app = app.with_keys(keys.clone());
     (app.clone(), keys, run(app).await)
 }
 
 #[tokio::test]
-async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
+async fn the_page_drives_a_robot_and_shows_predictions() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;
@@ -188,29 +193,37 @@ async fn the_page_drives_a_simulated_robot_and_shows_what_the_model_foresaw() {
     post(&app, "/v1/jobs", &collect("more", 2000)).await;
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
-    page.until(IS_COMPLETE).await;
-    assert_eq!(page.value("document.getElementById('model').value").await, "moving");
+    page.wait_until(IS_COMPLETE).await;
+    assert_eq!(page.value("document.getElementById('model').value").await, "static");
+    let choose =
+        "const list = document.getElementById('model'); list.value = 'moving'; list.dispatchEvent(new Event('change'))";
+    page.value(choose).await;
+    page.wait_until("document.getElementById('status').textContent.includes('automatic driver')")
+        .await;
+    page.wait_until(IS_COMPLETE).await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     let key = |kind: &str| json!({"type": kind, "key": "w", "code": "KeyW", "windowsVirtualKeyCode": 87});
     page.call("Input.dispatchKeyEvent", key("keyDown")).await;
-    page.until("document.getElementById('status').textContent.includes('your keys: 0.35 m/s, 0.00 rad/s')")
+    page.wait_until("document.getElementById('status').textContent.includes('your keys: 0.35 m/s, 0.00 rad/s')")
         .await;
-    page.until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
+    page.wait_until("/collect seen.*succeeded/.test(document.getElementById('jobs').textContent)")
         .await;
-    // The second job goes on meanwhile.
-    page.until("[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)")
-        .await;
+    // The second job is still running.
+    page.wait_until(
+        "[...document.querySelectorAll('#jobs progress')].some(bar => bar.value > 0 && bar.value < bar.max)",
+    )
+    .await;
     for (width_px, colors) in [(1280, "light"), (1280, "dark"), (400, "light"), (400, "dark")] {
         page.screenshot("page", width_px, colors).await;
     }
     page.call("Input.dispatchKeyEvent", key("keyUp")).await;
-    page.until("document.getElementById('status').textContent.includes('its own driver')")
+    page.wait_until("document.getElementById('status').textContent.includes('automatic driver')")
         .await;
     server.stop().await;
 }
 
 #[tokio::test]
-async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addresses() {
+async fn the_page_asks_for_an_api_key_and_hides_it() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
         return;
@@ -221,34 +234,71 @@ async fn where_keys_are_asked_for_the_page_asks_for_one_and_keeps_it_out_of_addr
     let profile = dir.path().join("profile");
     let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
     let says = |text: &str| format!("document.getElementById('refused').textContent.includes('{text}')");
-    page.until("!document.getElementById('unlock').hidden && document.querySelector('main').hidden")
+    page.wait_until("!document.getElementById('unlock').hidden && document.querySelector('main').hidden")
         .await;
     assert_eq!(page.value("document.getElementById('refused').textContent").await, "");
     page.unlock("let me in").await;
-    page.until(&says("This is no key")).await;
+    page.wait_until(&says("This is not a key")).await;
     page.unlock(&format!("{}x", key.text)).await;
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.wait_until(&says("This key is unknown or was revoked")).await;
     for width_px in [1280, 400] {
         page.screenshot("locked", width_px, "light").await;
     }
     page.unlock(&key.text).await;
-    page.until(IS_COMPLETE).await;
+    page.wait_until(IS_COMPLETE).await;
     let addresses = "[location.href, ...performance.getEntriesByType('resource').map(entry => entry.name)].join(' ')";
     let addresses = page.value(addresses).await;
     assert!(
         addresses.as_str().unwrap().contains("/v1/models") && !addresses.as_str().unwrap().contains("ffk_"),
         "{addresses}"
     );
-    // The tab keeps it.
+    // The tab keeps the key.
     page.call("Page.reload", json!({})).await;
-    page.until(&format!("performance.now() < 20000 && {IS_COMPLETE}")).await;
+    page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}"))
+        .await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     app.store().revoke_key(&key.id, 2.0).await.unwrap();
     keys.refresh().await.unwrap();
-    page.until(&says("This key is not known here, or was revoked")).await;
+    page.wait_until(&says("This key is unknown or was revoked")).await;
     page.unlock(&other.text).await;
-    page.until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
+    page.wait_until("document.getElementById('unlock').hidden && !document.querySelector('main').hidden")
         .await;
-    page.until(IS_COMPLETE).await;
+    page.wait_until(IS_COMPLETE).await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn page_deletes_its_environment_when_it_closes() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let (_app, _, server) = serve_with(dir.path(), 2).await;
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
+    for _ in 0..5 {
+        page.wait_until(IS_COMPLETE).await;
+        page.call("Page.reload", json!({})).await;
+        page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}"))
+            .await;
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn page_says_what_to_do_without_models() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let config = crate::service::with_data(dir.path(), ServerConfig::default());
+    let app = crate::service::start(config, Vec::new());
+    let server = run(app).await;
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/", server.address)).await;
+    page.wait_until("document.getElementById('status').textContent.startsWith('No model is loaded')")
+        .await;
     server.stop().await;
 }

@@ -1,4 +1,4 @@
-//! A client of the service over real sockets, in both sub-protocols, as robots would write one.
+//! A client of the stream over real sockets, in both sub-protocols.
 
 use axum::http::HeaderValue;
 use foreframe::server::ImageBytes;
@@ -10,19 +10,19 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
-use crate::service::{PATIENCE, frame, post};
+use crate::service::{TIMEOUT, frame, post};
 use foreframe::server::{App, ImageFormat};
 
 pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
-/// A session as it was opened.
+/// Id and token of an opened session.
 #[derive(Clone)]
-pub(crate) struct Opened {
+pub(crate) struct SessionHandle {
     pub(crate) id: String,
     pub(crate) token: String,
 }
 
-impl Opened {
+impl SessionHandle {
     pub(crate) fn path(&self, rest: &str) -> String {
         format!("/v1/sessions/{}{rest}?token={}", self.id, self.token)
     }
@@ -62,7 +62,7 @@ impl Client {
             next_seq: 0,
         };
         let ServerMessage::Ready { next_seq, .. } = client.receive().await else {
-            panic!("no ready");
+            panic!("the first message is not `ready`");
         };
         client.next_seq = next_seq;
         Ok(client)
@@ -72,7 +72,7 @@ impl Client {
         self.try_send(message).await.unwrap();
     }
 
-    /// Text, whatever the sub-protocol.
+    /// Sends text in either sub-protocol.
     pub(crate) async fn send_text(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
     }
@@ -89,9 +89,9 @@ impl Client {
         self.receive_or_end().await.unwrap()
     }
 
-    /// The next message, or the code of the close that came in its place; none if the socket just ended.
+    /// The next message, or the code of the close frame; no code if the socket ended without one.
     pub(crate) async fn receive_or_end(&mut self) -> Result<ServerMessage, Option<u16>> {
-        let message = tokio::time::timeout(PATIENCE, self.socket.next()).await.unwrap();
+        let message = tokio::time::timeout(TIMEOUT, self.socket.next()).await.unwrap();
         match message {
             Some(Ok(Message::Text(text))) => Ok(serde_json::from_str(&text).unwrap()),
             Some(Ok(Message::Binary(bytes))) => Ok(rmp_serde::from_slice(&bytes).unwrap()),
@@ -105,21 +105,21 @@ impl Client {
         self.receive().await
     }
 
-    /// Reads until the end: why, and the code.
+    /// Reads to the end; returns the reason and the close code.
     pub(crate) async fn end(&mut self) -> (Option<ClosingReason>, Option<u16>) {
-        let mut why = None;
+        let mut last_reason = None;
         loop {
             match self.receive_or_end().await {
-                Ok(ServerMessage::Closing { reason }) => why = Some(reason),
+                Ok(ServerMessage::Closing { reason }) => last_reason = Some(reason),
                 Ok(_) => {}
-                Err(code) => return (why, code),
+                Err(code) => return (last_reason, code),
             }
         }
     }
 }
 
-/// A frame whose image and numbers follow from its number.
-pub(crate) fn step(seq: u64) -> FrameMessage {
+/// A frame whose image, action and state are derived from its `seq`.
+pub(crate) fn numbered_frame(seq: u64) -> FrameMessage {
     let value = (seq % 7) as f32 - 3.0;
     FrameMessage {
         seq,
@@ -132,6 +132,6 @@ pub(crate) fn step(seq: u64) -> FrameMessage {
     }
 }
 
-pub(crate) fn send_frame(seq: u64) -> ClientMessage {
-    ClientMessage::Frame(step(seq))
+pub(crate) fn numbered_message(seq: u64) -> ClientMessage {
+    ClientMessage::Frame(numbered_frame(seq))
 }

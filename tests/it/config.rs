@@ -1,35 +1,36 @@
-//! The configuration: what goes over what, where values come from, and how wrong ones are refused.
+//! The configuration: precedence, sources of values, and refusals.
 
-use foreframe::config::{Config, ConfigError, ConfigLayer, LoadedConfig};
+use foreframe::config::{Config, LoadedConfig, environment_layers};
+use foreframe::settings::{SettingsError, SettingsLayer};
 use foreframe::telemetry::LogFormat;
 
-fn environment(variables: &[(&str, &str)]) -> Vec<ConfigLayer> {
+fn environment(variables: &[(&str, &str)]) -> Vec<SettingsLayer> {
     let owned = variables
         .iter()
         .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()));
-    ConfigLayer::environment(owned).collect()
+    environment_layers(owned).collect()
 }
 
-fn file(text: &str) -> ConfigLayer {
+fn file(text: &str) -> SettingsLayer {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("mine.toml");
     std::fs::write(&path, text).unwrap();
-    ConfigLayer::file(&path).unwrap()
+    SettingsLayer::file(&path).unwrap()
 }
 
-fn refused(layers: Vec<ConfigLayer>) -> String {
+fn refused(layers: Vec<SettingsLayer>) -> String {
     LoadedConfig::from_layers(layers).unwrap_err().to_string()
 }
 
 #[test]
-fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
+fn flags_override_environment_file_and_defaults() {
     let layers = [file("max_streams = 1\nmax_frames = 1\nmax_batch = 1")]
         .into_iter()
         .chain(environment(&[
             ("FOREFRAME_MAX_STREAMS", "2"),
             ("FOREFRAME_MAX_FRAMES", "2"),
         ]))
-        .chain([ConfigLayer::setting("max_streams=3").unwrap()]);
+        .chain([SettingsLayer::assignment("max_streams=3").unwrap()]);
     let loaded = LoadedConfig::from_layers(layers).unwrap();
     let limits = &loaded.config.server;
     assert_eq!((limits.max_streams, limits.max_frames, limits.max_batch), (3, 2, 1));
@@ -46,14 +47,14 @@ fn a_flag_goes_over_the_environment_over_the_file_over_the_defaults() {
 }
 
 #[test]
-fn what_is_printed_can_be_read_as_a_file() {
+fn the_printed_configuration_is_a_valid_file() {
     let settings = [
         "drain_ms=5",
         "cors_origins=[\"http://a\"]",
         "log_format=json",
         "models_dir=m",
     ];
-    let settings = settings.map(|setting| ConfigLayer::setting(setting).unwrap());
+    let settings = settings.map(|setting| SettingsLayer::assignment(setting).unwrap());
     let printed = LoadedConfig::from_layers(settings).unwrap();
     let read = LoadedConfig::from_layers([file(&printed.to_toml())]).unwrap();
     assert_eq!(read.config, printed.config);
@@ -62,10 +63,10 @@ fn what_is_printed_can_be_read_as_a_file() {
 }
 
 #[test]
-fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
+fn every_limit_is_checked_against_its_range() {
     let defaults = Config::default().server;
     for (field, value, range) in defaults.bounds() {
-        let setting = ConfigLayer::setting(&format!("{field}={value}")).unwrap();
+        let setting = SettingsLayer::assignment(&format!("{field}={value}")).unwrap();
         assert_eq!(
             LoadedConfig::from_layers([setting]).unwrap().config.server,
             defaults,
@@ -86,13 +87,12 @@ fn every_limit_can_be_set_and_is_refused_out_of_its_range() {
 }
 
 #[test]
-fn what_is_no_setting_is_refused_with_where_it_was_given() {
-    let set = |setting| vec![ConfigLayer::setting(setting).unwrap()];
+fn invalid_settings_are_refused_with_their_source() {
+    let set = |setting| vec![SettingsLayer::assignment(setting).unwrap()];
     for (layers, expected) in [
         (
             environment(&[("FOREFRAME_MAX_STREAM", "2")]),
-            "max_stream (environment FOREFRAME_MAX_STREAM) is no field of the configuration; foreframe config prints all \
-             of them",
+            "unknown field `max_stream` (environment FOREFRAME_MAX_STREAM); `foreframe config` lists all settings",
         ),
         (
             set("max_streams=many"),
@@ -103,35 +103,49 @@ fn what_is_no_setting_is_refused_with_where_it_was_given() {
             "max_streams is -1 (--set); it must be 1 to 1000000",
         ),
         (
-            set("bind=here"),
-            "bind is \"here\" (--set); it must be ADDRESS:PORT, as in 127.0.0.1:8642",
+            set("bind=localhost:http"),
+            "bind is \"localhost:http\" (--set); it must be HOST:PORT, as in 127.0.0.1:8642 or localhost:8642",
         ),
+        (set("port=70000"), "port is 70000 (--set); it must be 0 to 65535"),
         (
             set("log_format=xml"),
             "log_format is \"xml\" (--set); it must be text or json",
         ),
-        (set("insecure=2"), "insecure is 2 (--set); it must be a boolean"),
+        (set("insecure=2"), "insecure is 2 (--set); it must be true or false"),
     ] {
         assert_eq!(refused(layers), expected);
     }
     assert!(matches!(
-        ConfigLayer::setting("max_streams"),
-        Err(ConfigError::Setting(_))
+        SettingsLayer::assignment("max_streams"),
+        Err(SettingsError::Assignment(_))
     ));
     let dir = tempfile::tempdir().unwrap();
     assert!(matches!(
-        ConfigLayer::file(&dir.path().join("none")),
-        Err(ConfigError::Read { .. })
+        SettingsLayer::file(&dir.path().join("none")),
+        Err(SettingsError::Read { .. })
     ));
     std::fs::write(dir.path().join("bad"), "a = = 1").unwrap();
     assert!(matches!(
-        ConfigLayer::file(&dir.path().join("bad")),
-        Err(ConfigError::Toml { .. })
+        SettingsLayer::file(&dir.path().join("bad")),
+        Err(SettingsError::Toml { .. })
     ));
 }
 
 #[test]
-fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
+fn a_port_replaces_that_of_the_address_and_names_are_resolved() {
+    let bind = |settings: &[&str]| {
+        let layers = settings
+            .iter()
+            .map(|setting| SettingsLayer::assignment(setting).unwrap());
+        LoadedConfig::from_layers(layers).unwrap().config.bind.to_string()
+    };
+    assert_eq!(bind(&["bind=localhost:9000"]), "127.0.0.1:9000");
+    assert_eq!(bind(&["bind=localhost:9000", "port=9001"]), "127.0.0.1:9001");
+    assert_eq!(bind(&["port=9001"]), "127.0.0.1:9001");
+}
+
+#[test]
+fn empty_urls_and_test_variables_are_ignored() {
     let variables = [
         ("FOREFRAME_DATABASE_URL", ""),
         ("FOREFRAME_TEST_POSTGRES", "x"),
@@ -144,7 +158,7 @@ fn an_empty_url_is_none_and_the_tests_own_variables_are_no_settings() {
 #[test]
 fn a_password_is_not_printed() {
     let url = "database_url=postgres://ada:secret@db/foreframe";
-    let text = LoadedConfig::from_layers([ConfigLayer::setting(url).unwrap()])
+    let text = LoadedConfig::from_layers([SettingsLayer::assignment(url).unwrap()])
         .unwrap()
         .to_toml();
     assert!(

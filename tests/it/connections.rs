@@ -1,4 +1,4 @@
-//! What happens to connections that are slow, silent, foreign, or open while the server stops.
+//! Connections that are slow, idle, from other origins, or open during shutdown.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -9,11 +9,11 @@ use foreframe::server::ServerConfig;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::service::{PATIENCE, Running, app, get, run, send};
+use crate::service::{InProcessServer, TIMEOUT, app, get, run, send};
 
 const ASK: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
 
-async fn running(config: ServerConfig) -> (tempfile::TempDir, Running) {
+async fn start(config: ServerConfig) -> (tempfile::TempDir, InProcessServer) {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), config)).await;
     (dir, server)
@@ -23,11 +23,11 @@ async fn connect(address: SocketAddr) -> TcpStream {
     TcpStream::connect(address).await.unwrap()
 }
 
-/// Reads until the server closes.
-async fn rest(client: &mut TcpStream) -> String {
+/// Reads until the server closes the connection.
+async fn read_to_end(client: &mut TcpStream) -> String {
     let mut text = Vec::new();
-    // A reset is an end as well.
-    let _ = tokio::time::timeout(PATIENCE, client.read_to_end(&mut text))
+    // A reset counts as the end as well.
+    let _ = tokio::time::timeout(TIMEOUT, client.read_to_end(&mut text))
         .await
         .unwrap();
     String::from_utf8_lossy(&text).into_owned()
@@ -37,7 +37,7 @@ async fn answer(client: &mut TcpStream) -> String {
     let mut text = String::new();
     while !text.contains("\r\n\r\n{") || !text.ends_with('}') {
         let mut byte = [0; 256];
-        let count = tokio::time::timeout(PATIENCE, client.read(&mut byte))
+        let count = tokio::time::timeout(TIMEOUT, client.read(&mut byte))
             .await
             .unwrap()
             .unwrap();
@@ -48,16 +48,16 @@ async fn answer(client: &mut TcpStream) -> String {
 }
 
 #[tokio::test]
-async fn headers_that_come_too_slowly_are_cut_off() {
-    let (_dir, server) = running(ServerConfig {
+async fn slow_headers_time_out() {
+    let (_dir, server) = start(ServerConfig {
         header_read_ms: 100,
         ..ServerConfig::default()
     })
     .await;
     let mut silent = connect(server.address).await;
     let mut slow = connect(server.address).await;
-    let dribble = async {
-        // A byte now and then does not put the end off.
+    let send_slowly = async {
+        // Single bytes do not extend the time limit.
         for byte in ASK.iter().cycle() {
             if slow.write_all(&[*byte | 0x40]).await.is_err() {
                 return;
@@ -65,14 +65,14 @@ async fn headers_that_come_too_slowly_are_cut_off() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, dribble).await.unwrap();
-    assert!(!rest(&mut silent).await.contains("200"));
+    tokio::time::timeout(TIMEOUT, send_slowly).await.unwrap();
+    assert!(!read_to_end(&mut silent).await.contains("200"));
     server.stop().await;
 }
 
 #[tokio::test]
-async fn an_idle_connection_is_closed_after_its_answers() {
-    let (_dir, server) = running(ServerConfig {
+async fn an_idle_connection_is_closed() {
+    let (_dir, server) = start(ServerConfig {
         header_read_ms: 200,
         ..ServerConfig::default()
     })
@@ -83,14 +83,14 @@ async fn an_idle_connection_is_closed_after_its_answers() {
         assert!(answer(&mut client).await.starts_with("HTTP/1.1 200"));
     }
     let idle = Instant::now();
-    assert_eq!(rest(&mut client).await, "");
+    assert_eq!(read_to_end(&mut client).await, "");
     assert!(idle.elapsed() >= Duration::from_millis(150));
     server.stop().await;
 }
 
 #[tokio::test]
-async fn a_head_over_its_limit_is_refused() {
-    let (_dir, server) = running(ServerConfig {
+async fn headers_over_the_limit_are_answered_431() {
+    let (_dir, server) = start(ServerConfig {
         max_header_bytes: 8192,
         ..ServerConfig::default()
     })
@@ -98,28 +98,28 @@ async fn a_head_over_its_limit_is_refused() {
     let mut client = connect(server.address).await;
     let head = format!("GET /livez HTTP/1.1\r\nhost: a\r\nx: {}\r\n\r\n", "y".repeat(9000));
     client.write_all(head.as_bytes()).await.unwrap();
-    assert!(rest(&mut client).await.starts_with("HTTP/1.1 431"));
+    assert!(read_to_end(&mut client).await.starts_with("HTTP/1.1 431"));
     server.stop().await;
 }
 
 #[tokio::test]
-async fn a_client_that_reads_nothing_loses_its_connection() {
-    let (_dir, server) = running(ServerConfig {
+async fn a_client_that_never_reads_is_disconnected() {
+    let (_dir, server) = start(ServerConfig {
         write_stall_ms: 100,
         ..ServerConfig::default()
     })
     .await;
     let mut client = connect(server.address).await;
-    // Until both sides' buffers are full of answers that nobody reads.
+    // Until unread answers fill the buffers of both sides.
     let contract = b"GET /openapi.json HTTP/1.1\r\nhost: a\r\n\r\n".repeat(500);
     let flood = async { while client.write_all(&contract).await.is_ok() {} };
-    tokio::time::timeout(PATIENCE, flood).await.unwrap();
+    tokio::time::timeout(TIMEOUT, flood).await.unwrap();
     server.stop().await;
 }
 
 #[tokio::test]
-async fn a_stopping_server_is_not_ready_first_and_answers_while_it_drains() {
-    let (_dir, server) = running(ServerConfig {
+async fn a_draining_server_is_not_ready_but_answers() {
+    let (_dir, server) = start(ServerConfig {
         drain_ms: 2_000,
         ..ServerConfig::default()
     })
@@ -146,12 +146,12 @@ async fn a_stopping_server_is_not_ready_first_and_answers_while_it_drains() {
         last.starts_with("HTTP/1.1 200") && last.contains("connection: close"),
         "{last}"
     );
-    tokio::time::timeout(PATIENCE, server.task).await.unwrap().unwrap();
+    tokio::time::timeout(TIMEOUT, server.task).await.unwrap().unwrap();
     assert!(TcpStream::connect(server.address).await.is_err());
 }
 
 #[tokio::test]
-async fn an_encoded_body_is_refused() {
+async fn a_compressed_body_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let bomb = Request::post("/v1/models/plain/predict")
@@ -163,7 +163,7 @@ async fn an_encoded_body_is_refused() {
 }
 
 #[tokio::test]
-async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
+async fn other_origins_are_refused_unless_configured() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         cors_origins: vec!["https://robots.example".to_owned()],
@@ -200,7 +200,7 @@ async fn a_page_of_another_origin_may_not_call_unless_it_is_named() {
 }
 
 #[tokio::test]
-async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
+async fn without_keys_public_host_names_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         cors_origins: vec!["https://robots.example".to_owned()],
@@ -209,7 +209,7 @@ async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
     let app = app(dir.path(), config);
     let asked = |host: &str| {
         let request = Request::get("/v1/models").header(header::HOST, host);
-        // As a page of that host would.
+        // As a page of this host sends it.
         let request = request.header(header::ORIGIN, format!("http://{host}"));
         send(&app, request.body(Body::empty()).unwrap())
     };
@@ -237,7 +237,7 @@ async fn without_keys_it_answers_to_no_name_that_anybody_could_have_given_it() {
 }
 
 #[tokio::test]
-async fn the_contract_can_be_browsed_without_the_internet() {
+async fn the_api_documentation_works_offline() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/docs").await.headers[header::LOCATION], "/docs/");

@@ -1,16 +1,18 @@
-//! What all answers of the service have in common: its contract, one shape of refusals, ids, readiness.
+//! Common to all responses of the service: the API contract, problem details, request ids, readiness.
+
+use std::collections::BTreeMap;
 
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::server::{ServerConfig, openapi};
+use foreframe::server::{App, ServerConfig, openapi_document};
 use serde_json::{Value, json};
 
-use crate::service::{app, get, post, post_text, send, until};
+use crate::service::{app, get, poll_until, post, post_text, send};
 
 const PLAIN: &str = "/v1/models/plain/predict";
 
 #[tokio::test]
-async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
+async fn invalid_requests_are_answered_with_problem_details() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let json = "*/*";
@@ -31,7 +33,7 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
     assert!(get(&app, PLAIN).await.detail(405).contains("openapi.json"));
     assert!(get(&app, "/nothing").await.detail(404).contains("openapi.json"));
     let none = get(&app, "/v1/models/movin").await.detail(404);
-    assert_eq!(none, "no model is named \"movin\"; there are: moving, plain");
+    assert_eq!(none, "there is no model \"movin\"; there are: moving, plain");
     assert!(
         get(&app, "/v1/models/plain/stream")
             .await
@@ -41,7 +43,7 @@ async fn what_is_no_request_of_this_service_is_refused_in_one_shape() {
 }
 
 #[tokio::test]
-async fn every_answer_carries_the_requests_id() {
+async fn every_response_has_a_request_id() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let request = |id: &str| {
@@ -64,11 +66,11 @@ async fn every_answer_carries_the_requests_id() {
 }
 
 #[tokio::test]
-async fn the_server_is_ready_once_its_models_are_warm() {
+async fn the_server_is_ready_after_warming_its_models() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert_eq!(get(&app, "/livez").await.status, 200);
-    until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
+    poll_until(async || (get(&app, "/readyz").await.status == 200).then_some(())).await;
     let models = get(&app, "/v1/models").await.json();
     let names: Vec<&Value> = models["models"]
         .as_array()
@@ -89,22 +91,22 @@ async fn the_server_is_ready_once_its_models_are_warm() {
 }
 
 #[test]
-fn the_committed_contract_is_the_codes() {
+fn the_committed_openapi_document_is_current() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi/openapi.json");
-    let document = openapi::document();
+    let document = openapi_document();
     if std::env::var_os("UPDATE_OPENAPI").is_some() {
         std::fs::write(path, &document).unwrap();
     }
     let committed = std::fs::read_to_string(path).unwrap_or_default();
     assert!(
         committed == document,
-        "openapi/openapi.json differs from the code; write it anew by\n  \
-         UPDATE_OPENAPI=1 cargo test --release --test it the_committed_contract_is_the_codes"
+        "openapi/openapi.json differs from the code; update it with\n  \
+         UPDATE_OPENAPI=1 cargo test --release --test it the_committed_openapi_document_is_current"
     );
 }
 
 #[tokio::test]
-async fn the_contract_of_the_streams_is_served_and_refusals_are_described_as_they_come() {
+async fn the_contracts_are_served_and_describe_refusals() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     assert!(get(&app, "/asyncapi.yaml").await.body.starts_with(b"asyncapi: 3"));
@@ -124,7 +126,7 @@ async fn the_contract_of_the_streams_is_served_and_refusals_are_described_as_the
 }
 
 #[tokio::test]
-async fn lists_come_in_pages() {
+async fn lists_are_paged() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let (mut seen, mut after) = (Vec::new(), String::new());
@@ -153,7 +155,7 @@ async fn lists_come_in_pages() {
 }
 
 #[tokio::test]
-async fn what_is_no_object_or_no_number_is_refused_in_words() {
+async fn wrong_types_are_refused_with_an_explanation() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let list = post(&app, "/v1/sessions", &json!(["plain"])).await.detail(422);
@@ -161,12 +163,12 @@ async fn what_is_no_object_or_no_number_is_refused_in_words() {
     let path = post(&app, "/v1/models/plain/versions/x/activate", &Value::Null).await;
     assert_eq!(
         path.detail(400),
-        "\"x\" in the path is no whole number, or too great a one"
+        "\"x\" in the path is not a whole number, or too large"
     );
 }
 
 #[tokio::test]
-async fn every_path_of_the_contract_is_answered() {
+async fn every_documented_path_exists() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let contract = get(&app, "/openapi.json").await.json();
@@ -188,4 +190,68 @@ async fn every_path_of_the_contract_is_answered() {
             );
         }
     }
+}
+
+#[tokio::test]
+async fn every_example_of_the_contract_succeeds() {
+    let dir = tempfile::tempdir().unwrap();
+    // The shipped models, which the examples name.
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    let contract = get(&app, "/openapi.json").await.json();
+    let mut ids = BTreeMap::new();
+    let mut bodies = 0;
+    // The order of paths lets `/v1/sessions` create what `/v1/sessions/{id}/rollouts` needs.
+    for (path, methods) in contract["paths"].as_object().unwrap() {
+        let operation = &methods["post"];
+        let Some(content) = operation["requestBody"]["content"].as_object() else {
+            continue;
+        };
+        let parameters = operation["parameters"].as_array().into_iter().flatten();
+        let model = parameters
+            .clone()
+            .find(|parameter| parameter["name"] == "model")
+            .map_or("", |parameter| parameter["example"].as_str().unwrap());
+        let resource = path.split('/').nth(2).unwrap();
+        let id = ids.get(resource).map_or("", String::as_str);
+        let address = path.replace("{model}", model).replace("{id}", id);
+        let answer = post(&app, &address, &content["application/json"]["example"]).await;
+        let text = String::from_utf8_lossy(&answer.body).into_owned();
+        // A new session has no frames yet; the contract says so.
+        if path == "/v1/sessions/{id}/rollouts" {
+            assert!(operation["responses"]["409"].is_object());
+            assert_eq!(answer.status, 409, "{path}: {text}");
+        } else {
+            assert!(answer.status.is_success(), "{path}: {text}");
+            if let Some(id) = answer.json()["id"].as_str() {
+                ids.insert(resource.to_owned(), id.to_owned());
+            }
+        }
+        bodies += 1;
+    }
+    assert_eq!(bodies, 8);
+}
+
+#[tokio::test]
+async fn without_a_model_the_server_says_what_to_do() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        models_dir: dir.path().join("none"),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    let detail = get(&app, "/readyz").await.detail(503);
+    let models = get(&app, "/v1/models").await.json();
+    assert_eq!(models["notice"], detail);
+    assert!(
+        detail.starts_with("no model found in ") && detail.contains("POST /v1/jobs"),
+        "{detail}"
+    );
+    let dir = tempfile::tempdir().unwrap();
+    let full = self::app(dir.path(), ServerConfig::default());
+    assert!(get(&full, "/v1/models").await.json().get("notice").is_none());
 }

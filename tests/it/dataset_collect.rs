@@ -1,4 +1,4 @@
-//! Collecting into a directory: what is written, going on after interruptions, and what is refused.
+//! Collecting into a directory: the written files, resuming, and refusals.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ fn run(config: &CollectConfig) -> Result<DatasetInfo, DatasetError> {
     collect(config, &|_| {}, &AtomicBool::new(false))
 }
 
-/// Collects, and cancels once that many trials are simulated.
+/// Collects, and cancels after this many trials.
 fn run_until(config: &CollectConfig, trials: u64) -> Result<DatasetInfo, DatasetError> {
     let cancelled = AtomicBool::new(false);
     let seen = AtomicU64::new(0);
@@ -71,7 +71,7 @@ fn contents(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
 }
 
 #[test]
-fn what_is_read_back_is_what_the_world_showed() {
+fn a_data_set_reads_back_what_was_simulated() {
     let (_directory, out) = finished();
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(dataset.info().episode_count as u64, TRIALS);
@@ -96,7 +96,7 @@ fn what_is_read_back_is_what_the_world_showed() {
 }
 
 #[test]
-fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
+fn the_camera_is_recorded_and_older_data_sets_still_open() {
     let (_directory, out) = finished();
     let recorded = Dataset::open(&out).unwrap();
     let camera = &config(&out).world.camera;
@@ -108,16 +108,27 @@ fn the_camera_is_recorded_and_older_data_sets_open_without_it() {
     stamp.as_object_mut().unwrap().remove("camera");
     fs::write(&path, stamp.to_string()).unwrap();
     let older = Dataset::open(&out).unwrap();
-    assert_eq!(older.info().content_hash, recorded.info().content_hash);
+    assert_eq!(
+        older.info(),
+        recorded.info(),
+        "the collection's arguments describe the camera too"
+    );
+    let arguments = fs::read(out.join("meta/collect.json")).unwrap();
+    fs::remove_file(out.join("meta/collect.json")).unwrap();
+    assert_eq!(Dataset::open(&out).unwrap().info().camera, None);
+    fs::write(out.join("meta/collect.json"), arguments).unwrap();
 
     stamp["camera"] = serde_json::json!({"horizontal_fov_rad": 4.0, "tilt_down_rad": 0.0});
     fs::write(&path, stamp.to_string()).unwrap();
     let refused = Dataset::open(&out).unwrap_err().to_string();
-    assert!(refused.contains("the camera model has a field of view of 4 rad"), "{refused}");
+    assert!(
+        refused.contains("the camera model has a field of view of 4 rad"),
+        "{refused}"
+    );
 }
 
 #[test]
-fn one_thread_writes_the_bytes_of_two() {
+fn the_number_of_threads_does_not_change_the_bytes() {
     let (_directory, two) = finished();
     let directory = tempfile::tempdir().unwrap();
     let one = directory.path().join("one");
@@ -132,7 +143,7 @@ fn one_thread_writes_the_bytes_of_two() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(12))]
     #[test]
-    fn a_collection_stopped_anywhere_ends_with_the_bytes_of_one_that_was_not(
+    fn a_stopped_and_resumed_collection_has_the_same_bytes(
         stops in proptest::collection::vec(0..TRIALS, 1..4),
     ) {
         let (_directory, whole) = finished();
@@ -142,7 +153,8 @@ proptest! {
         for trials in stops {
             if let Err(error) = run_until(&config(&out), trials) {
                 let DatasetError::Cancelled { done, total } = error else { panic!("{error}") };
-                prop_assert!(total == TRIALS && done >= kept_before, "finished shards were lost");
+                prop_assert!(total == TRIALS && done >= kept_before, "finished trials were lost");
+                prop_assert!(done >= trials, "{done} of {trials} finished trials were kept");
                 kept_before = done;
                 prop_assert!(Dataset::open(&out).is_err());
             }
@@ -153,7 +165,7 @@ proptest! {
 }
 
 #[test]
-fn going_on_simulates_only_what_is_missing() {
+fn resuming_simulates_only_missing_trials() {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("set");
     let one_thread = CollectConfig {
@@ -163,22 +175,22 @@ fn going_on_simulates_only_what_is_missing() {
     let error = run_until(&one_thread, 7).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "stopped with 6 of 11 trials kept; run the same command again to go on"
+        "stopped after 7 of 11 trials were saved; run the same command again to resume"
     );
     assert_eq!(
         CollectionStatus::of(&one_thread).unwrap(),
-        CollectionStatus::PendingStep { trials: 6 }
+        CollectionStatus::Unfinished { trials: 7 }
     );
     let first = AtomicU64::new(u64::MAX);
-    let told = |progress: CollectProgress| {
+    let on_progress = |progress: CollectProgress| {
         first.fetch_min(progress.done, Ordering::Relaxed);
     };
-    collect(&one_thread, &told, &AtomicBool::new(false)).unwrap();
-    assert_eq!(first.into_inner(), 6);
+    collect(&one_thread, &on_progress, &AtomicBool::new(false)).unwrap();
+    assert_eq!(first.into_inner(), 7);
 }
 
 #[test]
-fn a_damaged_shard_of_an_unfinished_collection_is_made_anew() {
+fn resuming_replaces_a_damaged_shard() {
     let (_directory, whole) = finished();
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("set");
@@ -195,17 +207,17 @@ fn a_damaged_shard_of_an_unfinished_collection_is_made_anew() {
 }
 
 #[test]
-fn an_unfinished_set_says_so_and_how_to_go_on() {
+fn opening_an_unfinished_data_set_explains_how_to_resume() {
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("set");
     run_until(&config(&out), 4).unwrap_err();
     let message = Dataset::open(&out).unwrap_err().to_string();
-    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to go on"));
+    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to resume it"));
     assert!(message.contains("\"trials\":11"), "{message}");
 }
 
 #[test]
-fn a_finished_set_is_returned_at_once() {
+fn collecting_a_finished_data_set_again_does_nothing() {
     let (_directory, out) = finished();
     let before = contents(&out);
     let info = collect(
@@ -222,7 +234,7 @@ fn a_finished_set_is_returned_at_once() {
 }
 
 #[test]
-fn other_arguments_are_refused_by_name() {
+fn resuming_with_other_arguments_is_refused() {
     let (_directory, out) = finished();
     let other = CollectConfig {
         trials: 12,
@@ -231,14 +243,15 @@ fn other_arguments_are_refused_by_name() {
     let message = run(&other).unwrap_err().to_string();
     assert!(
         message.ends_with(
-            "was begun with other arguments (trials: 11 there, 12 asked); use those to go on, or name another directory"
+            "holds a collection with other arguments (trials: 11 in the directory, 12 requested); use the same arguments to \
+             resume it, or use another directory"
         ),
         "{message}"
     );
 }
 
 #[test]
-fn a_directory_in_other_use_is_refused_untouched() {
+fn a_foreign_directory_is_refused_and_unchanged() {
     let directory = tempfile::tempdir().unwrap();
     fs::write(directory.path().join("thesis.txt"), "years of work").unwrap();
     let error = run(&config(directory.path())).unwrap_err();
@@ -249,13 +262,13 @@ fn a_directory_in_other_use_is_refused_untouched() {
 }
 
 #[test]
-fn an_empty_directory_is_taken() {
+fn an_empty_directory_is_accepted() {
     let directory = tempfile::tempdir().unwrap();
     run(&config(directory.path())).unwrap();
 }
 
 #[test]
-fn no_trials_are_refused() {
+fn zero_trials_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let none = CollectConfig {
         trials: 0,
@@ -269,7 +282,7 @@ fn no_trials_are_refused() {
 }
 
 #[test]
-fn a_changed_file_is_named_with_both_hashes() {
+fn a_changed_file_is_reported_by_name() {
     for file in [
         "data/chunk-000/file-001.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
@@ -287,7 +300,7 @@ fn a_changed_file_is_named_with_both_hashes() {
 }
 
 #[test]
-fn a_truncated_file_is_named() {
+fn a_truncated_file_is_reported_by_name() {
     let (_directory, out) = finished();
     let path = out.join("data/chunk-000/file-002.parquet");
     let bytes = fs::read(&path).unwrap();
@@ -301,7 +314,7 @@ fn a_truncated_file_is_named() {
 }
 
 #[test]
-fn a_missing_file_is_named() {
+fn a_missing_file_is_reported_by_name() {
     let (_directory, out) = finished();
     fs::remove_file(out.join("data/chunk-000/file-002.parquet")).unwrap();
     let error = Dataset::open(&out).unwrap_err();

@@ -20,7 +20,7 @@ fn info() -> DatasetInfo {
     }
 }
 
-/// An episode of that many frames; the clock jumps by 10 s before each frame in `jumps`.
+/// An episode of `frames` frames. The clock jumps by 10 s before each frame in `jumps`.
 fn episode(frames: usize, jumps: &[usize], trial: Option<TrialParameters>) -> EpisodeData {
     let mut time_s = 0.0;
     let timestamps_s = (0..frames)
@@ -60,7 +60,7 @@ fn frames_of(windows: &[Window], shape: WindowShape) -> BTreeSet<usize> {
 
 proptest! {
     #[test]
-    fn no_window_crosses_an_episode_or_a_gap_and_splits_share_no_frame(
+    fn windows_cross_no_gap_and_splits_share_no_frame(
         lengths in proptest::collection::vec(12usize..80, 1..14),
         jump in 1usize..80,
         seed in any::<u64>(),
@@ -73,7 +73,7 @@ proptest! {
         let shape = WindowShape { context, horizon };
         let mut taken = BTreeSet::new();
         for split in Split::ALL {
-            // A split can be too short for the window; what matters is what the others give.
+            // A split can be too short for a window; the others are still checked.
             let Ok(windows) = splits.windows(&dataset, split, shape, stride) else { continue };
             for window in &windows {
                 let frames = dataset.episodes()[window.episode].frames();
@@ -90,7 +90,7 @@ proptest! {
     }
 
     #[test]
-    fn a_larger_collection_keeps_the_split_of_a_smaller_one(seed in any::<u64>(), few in 1u64..60, more in 1u64..60) {
+    fn adding_trials_keeps_the_split_of_earlier_ones(seed in any::<u64>(), few in 1u64..60, more in 1u64..60) {
         let (small, large) = (simulated(few, 1), simulated(few + more, 1));
         let (of_small, of_large) = (Splits::new(&small, Seed(seed)), Splits::new(&large, Seed(seed)));
         for split in Split::ALL {
@@ -100,29 +100,32 @@ proptest! {
     }
 
     #[test]
-    fn every_trial_is_in_one_split_and_the_held_out_ones_in_their_own(seed in any::<u64>()) {
+    fn every_trial_is_in_exactly_one_split(seed in any::<u64>()) {
         let dataset = simulated(100, 1);
         let splits = Splits::new(&dataset, Seed(seed));
         let mut all: Vec<_> = Split::ALL.iter().flat_map(|&split| splits.episodes(split).to_vec()).collect();
         all.sort_unstable();
         prop_assert_eq!(all, (0..100).collect::<Vec<_>>());
         for episode in dataset.episodes() {
-            let held_out = episode.trial.as_ref().unwrap().is_held_out();
-            prop_assert_eq!(splits.episodes(Split::TestUnseen).contains(&episode.index), held_out);
+            let trial = episode.trial.as_ref().unwrap();
+            let (pair, held_out) = (trial.has_held_out_pair(), trial.is_held_out());
+            let is_in = |split| splits.episodes(split).contains(&episode.index);
+            prop_assert_eq!(is_in(Split::UnseenPairs), pair);
+            prop_assert_eq!(is_in(Split::UnseenGains), held_out && !pair);
         }
     }
 }
 
 #[test]
-fn of_a_hundred_whole_recordings_eighty_train() {
+fn recordings_are_split_80_10_10() {
     let dataset = recorded(&[12; 100], &[]);
     let splits = Splits::new(&dataset, Seed(3));
     let counts = Split::ALL.map(|split| splits.episodes(split).len());
-    assert_eq!(counts, [80, 10, 10, 0]);
+    assert_eq!(counts, [80, 10, 10, 0, 0]);
 }
 
 #[test]
-fn a_single_recording_is_split_by_time_with_a_window_between_the_parts() {
+fn a_single_recording_is_split_by_time() {
     let dataset = recorded(&[100], &[]);
     let splits = Splits::new(&dataset, Seed(0));
     let shape = WindowShape { context: 2, horizon: 1 };
@@ -136,7 +139,7 @@ fn a_single_recording_is_split_by_time_with_a_window_between_the_parts() {
 }
 
 #[test]
-fn windows_are_taken_at_every_stride() {
+fn windows_start_at_every_stride() {
     let dataset = recorded(&[20], &[]);
     let windows = Splits::new(&dataset, Seed(0))
         .windows(&dataset, Split::Train, WindowShape { context: 5, horizon: 5 }, 3)
@@ -146,7 +149,7 @@ fn windows_are_taken_at_every_stride() {
 }
 
 #[test]
-fn a_window_longer_than_every_episode_is_refused_with_the_lengths() {
+fn a_window_longer_than_every_episode_is_refused() {
     let dataset = simulated(20, 9);
     let shape = WindowShape { context: 5, horizon: 5 };
     let error = Splits::new(&dataset, Seed(0))
@@ -154,13 +157,13 @@ fn a_window_longer_than_every_episode_is_refused_with_the_lengths() {
         .unwrap_err();
     assert_eq!(
         error.to_string(),
-        "a window of 10 frames (5 seen, 5 to come) is longer than every episode of the train split; the longest runs \
+        "a window of 10 frames (context 5, horizon 5) is longer than every episode of the train split; the longest has \
          9 frames without a gap"
     );
 }
 
 #[test]
-fn a_draw_gives_different_windows_and_the_same_ones_again() {
+fn sampling_is_reproducible_and_without_repetition() {
     let dataset = simulated(20, 30);
     let splits = Splits::new(&dataset, Seed(0));
     let shape = WindowShape { context: 5, horizon: 5 };
@@ -171,19 +174,20 @@ fn a_draw_gives_different_windows_and_the_same_ones_again() {
 }
 
 #[test]
-fn a_draw_of_more_windows_than_there_are_says_how_many_there_are() {
+fn sampling_too_many_windows_is_refused_with_their_number() {
     let dataset = recorded(&[100], &[]);
     let splits = Splits::new(&dataset, Seed(0));
     let shape = WindowShape { context: 5, horizon: 5 };
     let error = splits.sample(&dataset, Split::Train, shape, 1000, Seed(0)).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "data.windows is 1000, but the train split has only 71; ask for fewer (data.windows=all takes what there is) or collect more"
+        "data.windows is 1000, but the train split has only 71 windows; use a smaller number, use data.windows=all, or \
+         collect more trials"
     );
 }
 
 #[test]
-fn an_action_that_is_not_finite_is_refused_with_its_place() {
+fn a_non_finite_action_is_refused_with_episode_and_frame() {
     let mut data = episode(5, &[], None);
     data.actions[3] = f32::NAN;
     let error = Dataset::from_episodes(info(), vec![episode(5, &[], None), data]).unwrap_err();
@@ -194,15 +198,15 @@ fn an_action_that_is_not_finite_is_refused_with_its_place() {
 }
 
 #[test]
-fn parts_of_different_lengths_are_refused() {
+fn columns_of_different_lengths_are_refused() {
     let mut data = episode(5, &[], None);
     data.actions.pop();
     let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
-    assert_eq!(error.to_string(), "episode 0: action has 4 values; 5 frames take 5");
+    assert_eq!(error.to_string(), "episode 0: action has 4 values; 5 frames need 5");
 }
 
 #[test]
-fn time_that_stands_still_is_refused() {
+fn timestamps_that_do_not_increase_are_refused() {
     let mut data = episode(5, &[], None);
     data.timestamps_s[2] = data.timestamps_s[1];
     let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
@@ -210,7 +214,7 @@ fn time_that_stands_still_is_refused() {
 }
 
 #[test]
-fn a_data_set_of_another_shape_is_named_with_both_shapes() {
+fn a_shape_mismatch_names_both_shapes() {
     let dataset = recorded(&[12], &[]);
     assert_eq!(
         dataset.require_frame_size(64, 64).unwrap_err().to_string(),

@@ -26,7 +26,7 @@ fn pixels(observation: &Value) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn an_environment_steps_as_the_simulator_does() {
+async fn an_environment_returns_what_the_simulator_returns() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let created = create(&app, json!({"scenario": "moving-observer", "seed": 7})).await;
@@ -52,7 +52,7 @@ async fn an_environment_steps_as_the_simulator_does() {
 }
 
 #[tokio::test]
-async fn an_episode_ends_once_and_a_reset_begins_the_next() {
+async fn an_ended_episode_needs_a_reset() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let world = json!({"max_duration_s": 0.6, "frame_width_px": 16, "frame_height_px": 16});
@@ -73,7 +73,7 @@ async fn an_episode_ends_once_and_a_reset_begins_the_next() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_simulated_is_refused_with_its_field() {
+async fn invalid_environment_requests_are_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     for (body, part) in [
@@ -95,13 +95,13 @@ async fn what_cannot_be_simulated_is_refused_with_its_field() {
     let id = body["id"].as_str().unwrap();
     let detail = step(&app, id, json!([0.1])).await.detail(422);
     assert!(detail.starts_with("action:"), "{detail}");
-    // Beyond f32.
+    // Too large for f32.
     step(&app, id, json!([0.1, 1e39])).await.detail(400);
     step(&app, "env-99", json!([0, 0])).await.detail(404);
 }
 
 #[tokio::test]
-async fn no_more_environments_run_than_may_and_a_deleted_one_makes_room() {
+async fn environments_are_limited_and_deleting_one_frees_its_place() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_environments: 1,
@@ -120,7 +120,7 @@ async fn no_more_environments_run_than_may_and_a_deleted_one_makes_room() {
 }
 
 #[tokio::test]
-async fn an_environment_that_nobody_steps_is_dropped() {
+async fn an_idle_environment_is_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         environment_idle_ms: 1,
@@ -133,4 +133,26 @@ async fn an_environment_that_nobody_steps_is_dropped() {
         .await
         .detail(404);
     assert!(detail.contains("is dropped"), "{detail}");
+}
+
+#[tokio::test]
+async fn at_the_limit_a_new_environment_replaces_the_idlest() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_environments: 2,
+        environment_evict_ms: 0,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let small = json!({"scenario": "crowded", "world": {"frame_width_px": 16, "frame_height_px": 16}});
+    let mut ids = Vec::new();
+    for _ in 0..20 {
+        let created = create(&app, small.clone()).await;
+        assert_eq!(created.status, 201);
+        ids.push(created.json()["id"].as_str().unwrap().to_owned());
+    }
+    step(&app, &ids[17], json!([0, 0])).await.detail(404);
+    for id in &ids[18..] {
+        assert_eq!(step(&app, id, json!([0, 0])).await.status, 200);
+    }
 }

@@ -1,13 +1,18 @@
-//! Evaluation: a whole run on a small scene, what it leaves on disk, what it refuses.
+//! Evaluation: a whole run on a small scene, its files, and refusals.
 
 use std::collections::BTreeSet;
+use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::Dataset;
+use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
+use foreframe::evaluation::actions::Variant;
+use foreframe::evaluation::baselines::Method;
+use foreframe::evaluation::plans::PlanOutcome;
 use foreframe::evaluation::report::{EvaluationReport, SetOutcome};
-use foreframe::evaluation::{self, EvaluateConfig, EvaluationError};
+use foreframe::evaluation::{self, EvaluateConfig, EvaluationError, Purpose};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe::registry::{DatasetStamp, LoadedModel};
-use foreframe::types::Seed;
+use foreframe::sim::{Scenario, WorldConfig};
+use foreframe::types::{Channel, Seed};
 
 use crate::fixtures::{self, moving_squares};
 
@@ -34,7 +39,7 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
     }
 }
 
-/// A model that was never trained, whose data set is said to have been this one.
+/// An untrained model whose manifest names this data set as its training data.
 fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
     let trained_on = DatasetStamp {
         name: dataset.info().name.clone(),
@@ -69,17 +74,17 @@ fn refusal(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> 
 }
 
 #[test]
-fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
+fn every_method_is_scored_and_skipped_sets_give_reasons() {
     let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     let twin = untrained("twin", spec(Conditioning::None), &dataset);
     let with_twin = EvaluateConfig {
-        twin: Some(&twin),
+        twins: vec![&twin],
         ..config()
     };
     let report = evaluate(&model, &dataset, &with_twin).unwrap();
     let scores = report.scores("test").unwrap();
-    assert_eq!((scores.windows, scores.methods.len()), (15, 7));
+    assert_eq!((scores.windows, scores.methods.len()), (15, 10));
     assert!(scores.trials >= 2 && scores.windows_available > 15);
     assert!(scores.skill.skill.mean < 0.0, "an untrained model has no skill");
     for row in &scores.methods {
@@ -87,14 +92,16 @@ fn a_run_scores_every_method_and_says_why_a_set_was_skipped() {
         assert!(row.mover_mse.is_some() && row.ssim.mean <= 1.0);
     }
     let variants = &scores.actions.as_ref().unwrap().rows;
-    assert_eq!(variants.len(), 4);
+    assert_eq!(variants.len(), 5);
     assert!((variants[0].mse.mean - scores.methods[0].mse.mean).abs() < 1e-9);
     assert!(matches!(&report.sets[1].outcome, SetOutcome::Skipped { reason } if reason.contains("start/goal")));
+    assert!(matches!(&report.sets[2].outcome, SetOutcome::Skipped { reason } if reason.contains("gains")));
+    assert!(matches!(&scores.plans, Some(PlanOutcome::Skipped { reason }) if reason.contains("recording")));
     assert_eq!(report.stamp.split_seed, Seed(7), "the split is that of the training");
 }
 
 #[test]
-fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
+fn scores_do_not_depend_on_the_batch_size() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let first = evaluate(&model, &dataset, &config()).unwrap();
@@ -104,6 +111,102 @@ fn the_same_seed_gives_the_same_scores_whatever_the_batch() {
     assert_eq!(first.samples[0].first_frame, second.samples[0].first_frame);
     assert!((first.skill.skill.mean - second.skill.skill.mean).abs() < 1e-5);
     assert!(first.actions.is_none());
+}
+
+#[test]
+fn validation_scores_are_of_the_validation_split_alone() {
+    let dataset = moving_squares(40, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let validation = EvaluateConfig {
+        purpose: Purpose::Validation,
+        ..config()
+    };
+    let report = evaluate(&model, &dataset, &validation).unwrap();
+    let sets: Vec<&str> = report.sets.iter().map(|set| set.split.as_str()).collect();
+    assert_eq!(sets, ["validation"]);
+    let splits = Splits::new(&dataset, Seed(7));
+    let samples = &report.scores("validation").unwrap().samples;
+    assert!(
+        samples
+            .iter()
+            .all(|sample| splits.episodes(Split::Validation).contains(&sample.episode))
+    );
+    assert!(report.to_markdown().contains("Publish test scores"));
+}
+
+#[test]
+fn each_twin_is_named_by_what_it_lacks() {
+    let dataset = moving_squares(40, SIDE, 0.2);
+    let model = untrained("both", spec(Conditioning::StateAction), &dataset);
+    let twins = [Conditioning::State, Conditioning::Action, Conditioning::None]
+        .map(|conditioning| untrained("twin", spec(conditioning), &dataset));
+    let with_twins = EvaluateConfig {
+        twins: twins.iter().collect(),
+        ..config()
+    };
+    let report = evaluate(&model, &dataset, &with_twins).unwrap();
+    let rows = &report.scores("test").unwrap().actions.as_ref().unwrap().rows;
+    let variants: Vec<Variant> = rows.iter().skip(4).map(|row| row.variant).collect();
+    assert_eq!(
+        variants,
+        [
+            Variant::TwinWithoutAction,
+            Variant::TwinWithoutState,
+            Variant::UnconditionedTwin
+        ]
+    );
+}
+
+#[test]
+fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
+    let dir = tempfile::tempdir().unwrap();
+    let collection = CollectConfig {
+        world: WorldConfig {
+            frame_width_px: SIDE,
+            frame_height_px: SIDE,
+            max_duration_s: 3.0,
+            ..WorldConfig::default()
+        },
+        ..CollectConfig::new(Scenario::MovingObserver, 100, Seed(2), &dir.path().join("set"))
+    };
+    collect(&collection, &|_| {}, &AtomicBool::new(false)).unwrap();
+    let dataset = Dataset::open(&collection.out).unwrap();
+    let scale = |channel: &Channel| ChannelScale {
+        name: channel.name.clone(),
+        unit: channel.unit.clone(),
+        mean: 0.0,
+        std: 1.0,
+    };
+    let spec = ModelSpec {
+        actions: dataset.info().action_channels.iter().map(scale).collect(),
+        states: dataset.info().state_channels.iter().map(scale).collect(),
+        ..spec(Conditioning::StateAction)
+    };
+    let model = untrained("driving", spec, &dataset);
+    let report = evaluate(&model, &dataset, &config()).unwrap();
+    for set in &report.sets {
+        let scores = set.outcome.scores().unwrap();
+        let ego_motion = scores
+            .methods
+            .iter()
+            .find(|row| row.method == Method::EgoMotion)
+            .unwrap();
+        assert!(
+            ego_motion.mse.mean < scores.methods[1].mse.mean,
+            "{}: copying is worse",
+            set.split
+        );
+        let Some(PlanOutcome::Measured(plans)) = &scores.plans else {
+            panic!("plans of {}: {:?}", set.split, scores.plans)
+        };
+        assert_eq!((plans.contexts, plans.plans), (15, 8));
+        // Random weights answer to actions at random.
+        assert!(plans.rate < 0.8, "{}", plans.rate);
+    }
+    let inputs = evaluation::figure_inputs(&model, &dataset, &report).unwrap();
+    let names: Vec<&str> = inputs.samples.iter().map(|sample| sample.name.as_str()).collect();
+    assert_eq!(names.len(), 9);
+    assert_eq!(names[3], "median-unseen-pairs");
 }
 
 #[test]
@@ -146,7 +249,7 @@ fn report_and_figures_are_written_and_read_back() {
 }
 
 #[test]
-fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
+fn a_mismatched_data_set_is_refused() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::StateAction), &dataset);
     assert_eq!(
@@ -169,7 +272,7 @@ fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
     };
     assert!(refusal(&model, &dataset, &other_split).contains("split seed 8 would test it on frames it was trained on"));
     let twin = EvaluateConfig {
-        twin: Some(&model),
+        twins: vec![&model],
         ..config()
     };
     assert!(refusal(&model, &dataset, &twin).contains("needs conditioning \"none\""));
@@ -184,7 +287,7 @@ fn a_data_set_that_does_not_fit_is_refused_in_a_sentence() {
 }
 
 #[test]
-fn the_markdown_reads_as_agreed() {
+fn the_markdown_report_matches_its_snapshot() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::Action), &dataset);
     let mut report = evaluate(&model, &dataset, &config()).unwrap();
@@ -192,13 +295,13 @@ fn the_markdown_reads_as_agreed() {
     "a processor".clone_into(&mut report.stamp.cpu);
     report.stamp.threads = 2;
     report.stamp.program.git_commit = Some("0123abc".to_owned());
-    // Figures differ from one processor to the next in their last digits; their places don't.
+    // The last digits depend on the processor, so numbers are masked.
     let markdown = report.to_markdown();
     let masked: String = markdown.lines().map(|line| mask_numbers(line) + "\n").collect();
     insta::assert_snapshot!(masked);
 }
 
-/// Replaces every number of three digits or more, every fraction and every hash by a mark.
+/// Replaces numbers of three or more characters and hashes by `#`.
 fn mask_numbers(line: &str) -> String {
     let is_measured = |word: &str| {
         let digits = word.trim_matches(|c: char| !c.is_ascii_alphanumeric());

@@ -1,4 +1,4 @@
-//! What tests of several subjects start from: a small data set in memory, and a model with random weights.
+//! Shared fixtures: a small data set in memory, and a model with random weights.
 
 use std::path::Path;
 
@@ -7,10 +7,10 @@ use foreframe::nn::{ModelSpec, Parameters};
 use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
 use foreframe::types::{Channel, Seed};
 
-/// Frames of an episode.
+/// Frames per episode.
 const FRAMES: u32 = 14;
 
-/// Episodes in which a dark square moves over a ramp, by as many pixels a frame as the action says.
+/// Episodes in which a dark square moves over a brightness ramp; the action is its speed in pixels per frame.
 pub(crate) fn moving_squares(episodes: usize, side: u32, period_s: f64) -> Dataset {
     let data = (0..episodes).map(|episode| {
         let speed = (episode % 3) as u32;
@@ -48,7 +48,7 @@ pub(crate) fn moving_squares(episodes: usize, side: u32, period_s: f64) -> Datas
     Dataset::from_episodes(info, data.collect()).unwrap()
 }
 
-/// A model with random weights, published in `model_dir` and loaded as any other.
+/// A model with random weights, published in `model_dir` and loaded from there.
 pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: DatasetStamp) -> LoadedModel {
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let manifest = Manifest {

@@ -1,4 +1,4 @@
-//! Jobs over HTTP: with work that the test holds in its hand, and with the real collection and training.
+//! Jobs over HTTP, most with an executor that the test controls.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -9,22 +9,23 @@ use axum::body::Body;
 use axum::http::Request;
 use foreframe::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
 use foreframe::nn::Conditioning;
-use foreframe::server::{App, ServerConfig};
+use foreframe::server::{App, AppParts, ServerConfig};
 use foreframe::serving::{Predictor, PredictorConfig};
+use foreframe::versions::Versions;
 use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
 
-use crate::service::{app, get, model, post, run, send, spec, store, until, with_data};
+use crate::service::{app, get, model, poll_until, post, run, send, spec, store, with_data};
 
 const JOBS: &str = "/v1/jobs";
 
-/// Work that does what the test says, and looks at its flag.
-struct Puppet {
-    orders: Mutex<Receiver<Result<(), JobFailure>>>,
-    heeds_cancel: bool,
+/// An executor whose jobs end as the test says, or when they are cancelled.
+struct ScriptedExecutor {
+    results: Mutex<Receiver<Result<(), JobFailure>>>,
+    obeys_cancel: bool,
 }
 
-impl JobExecutor for Puppet {
+impl JobExecutor for ScriptedExecutor {
     fn check<'a>(&'a self, _: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
         Box::pin(async { Ok(()) })
     }
@@ -32,23 +33,23 @@ impl JobExecutor for Puppet {
     fn execute(&self, _: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         report.progress(3, 10, "pretending");
         report.line(format!("attempt {}", report.lease().token));
-        let orders = self.orders.lock().unwrap();
+        let results = self.results.lock().unwrap();
         loop {
-            if let Ok(order) = orders.recv_timeout(Duration::from_millis(1)) {
-                return order.map(|()| JobResult::default());
+            if let Ok(finish) = results.recv_timeout(Duration::from_millis(1)) {
+                return finish.map(|()| JobResult::default());
             }
-            if self.heeds_cancel && cancelled.load(Ordering::Acquire) {
+            if self.obeys_cancel && cancelled.load(Ordering::Acquire) {
                 return Err(JobFailure::Cancelled);
             }
         }
     }
 }
 
-fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<(), JobFailure>>) {
-    let (order, orders) = channel();
-    let puppet = Puppet {
-        orders: Mutex::new(orders),
-        heeds_cancel,
+fn scripted_app(dir: &std::path::Path, obeys_cancel: bool) -> (App, Sender<Result<(), JobFailure>>) {
+    let (finish, results) = channel();
+    let executor = ScriptedExecutor {
+        results: Mutex::new(results),
+        obeys_cancel,
     };
     let limits = JobLimits {
         queued: 2,
@@ -56,7 +57,7 @@ fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<
         ..ServerConfig::default().jobs()
     };
     let store = store(dir);
-    let jobs = Jobs::start(store.clone(), limits, Arc::new(puppet), true).unwrap();
+    let jobs = Jobs::start(store.clone(), limits, Arc::new(executor), true).unwrap();
     let predictor = Predictor::start(
         vec![model(dir, "plain", spec(Conditioning::None))],
         PredictorConfig::default(),
@@ -65,16 +66,22 @@ fn puppet_app(dir: &std::path::Path, heeds_cancel: bool) -> (App, Sender<Result<
         shutdown_deadline_ms: 300,
         ..with_data(dir, ServerConfig::default())
     };
-    (App::with_parts(config, predictor.unwrap(), jobs, store), order)
+    let parts = AppParts {
+        predictor: predictor.unwrap(),
+        jobs,
+        versions: Versions::new(store.clone(), &config.models_dir),
+        store,
+    };
+    (App::with_parts(config, parts), finish)
 }
 
 fn collect(name: &str) -> Value {
     json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 12})
 }
 
-async fn state_becomes(app: &App, id: &str, state: &str) -> Value {
+async fn wait_for_state(app: &App, id: &str, state: &str) -> Value {
     let path = format!("{JOBS}/{id}");
-    until(async || {
+    poll_until(async || {
         let job = get(app, &path).await.json();
         let is_over = ["succeeded", "failed", "cancelled"].contains(&job["state"].as_str().unwrap());
         assert!(!is_over || job["state"] == state, "{job}");
@@ -84,30 +91,30 @@ async fn state_becomes(app: &App, id: &str, state: &str) -> Value {
 }
 
 #[tokio::test]
-async fn a_job_goes_its_way_and_can_be_watched() {
+async fn a_job_reports_its_progress_and_outcome() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, order) = puppet_app(dir.path(), true);
+    let (app, finish) = scripted_app(dir.path(), true);
     let taken = post(&app, JOBS, &collect("a")).await;
     assert_eq!(
         (taken.status.as_u16(), &taken.headers["location"]),
         (202, &"/v1/jobs/job-1".parse().unwrap())
     );
-    let job = state_becomes(&app, "job-1", "running").await;
+    let job = wait_for_state(&app, "job-1", "running").await;
     assert_eq!(job["spec"]["scenario"], "static-observer");
-    let progress = until(async || {
+    let progress = poll_until(async || {
         let job = get(&app, "/v1/jobs/job-1").await.json();
         (job["progress"]["total"] == 10).then_some(job["progress"].clone())
     });
     assert_eq!(progress.await["message"], "pretending");
-    order.send(Ok(())).unwrap();
-    state_becomes(&app, "job-1", "succeeded").await;
+    finish.send(Ok(())).unwrap();
+    wait_for_state(&app, "job-1", "succeeded").await;
 
     post(&app, JOBS, &collect("b")).await;
-    order
+    finish
         .send(Err(JobFailure::Failed("the disk is full".to_owned())))
         .unwrap();
     assert_eq!(
-        state_becomes(&app, "job-2", "failed").await["error"],
+        wait_for_state(&app, "job-2", "failed").await["error"],
         "the disk is full"
     );
     let all = get(&app, JOBS).await.json();
@@ -116,18 +123,18 @@ async fn a_job_goes_its_way_and_can_be_watched() {
 }
 
 #[tokio::test]
-async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
+async fn queued_jobs_are_limited_and_cancelled_once() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, _order) = puppet_app(dir.path(), true);
+    let (app, _order) = scripted_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
-    state_becomes(&app, "job-1", "running").await;
+    wait_for_state(&app, "job-1", "running").await;
     for name in ["b", "c"] {
         assert_eq!(post(&app, JOBS, &collect(name)).await.status, 202);
     }
     let refused = post(&app, JOBS, &collect("d")).await;
     assert_eq!(
         refused.detail(503),
-        "2 jobs wait already; cancel one or try again later"
+        "the job queue is full (2 jobs are waiting); cancel one or try again later"
     );
     assert_eq!(refused.headers["retry-after"], "1");
     let same = post(&app, "/v1/jobs/job-3/cancel", &Value::Null).await;
@@ -135,75 +142,75 @@ async fn jobs_can_be_cancelled_once_and_only_so_many_may_wait() {
     let taken = post(&app, JOBS, &collect("a")).await.detail(409);
     assert_eq!(
         taken,
-        "name: data set \"a\" is being made by another job; choose another name"
+        "name: data set \"a\" is the output of another job that has not ended; choose another name"
     );
     assert_eq!(
         post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.json()["cancelling"],
         true
     );
-    state_becomes(&app, "job-1", "cancelled").await;
+    wait_for_state(&app, "job-1", "cancelled").await;
     let again = post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await.detail(409);
     assert_eq!(
         again,
-        "job job-1 has been cancelled; only one that waits or runs can be cancelled"
+        "job job-1 is cancelled; only a queued or running job can be cancelled"
     );
     assert_eq!(
         get(&app, "/v1/jobs/job-77").await.detail(404),
-        "there is no job \"job-77\"; of those that ended only the latest are remembered"
+        "there is no job \"job-77\"; only the latest ended jobs are kept"
     );
 }
 
 #[tokio::test]
-async fn stopping_leaves_jobs_for_the_next_start_and_does_not_wait_for_one_that_will_not_end() {
-    for heeds_cancel in [true, false] {
+async fn a_stopping_server_leaves_jobs_for_the_next_start() {
+    for obeys_cancel in [true, false] {
         let dir = tempfile::tempdir().unwrap();
-        let (app, order) = puppet_app(dir.path(), heeds_cancel);
+        let (app, finish) = scripted_app(dir.path(), obeys_cancel);
         let server = run(app.clone()).await;
         post(&app, JOBS, &collect("a")).await;
         post(&app, JOBS, &collect("b")).await;
-        state_becomes(&app, "job-1", "running").await;
+        wait_for_state(&app, "job-1", "running").await;
         let started = Instant::now();
         server.stop().await;
         assert!(started.elapsed() < Duration::from_secs(10));
-        let expected = if heeds_cancel { "queued" } else { "running" };
+        let expected = if obeys_cancel { "queued" } else { "running" };
         assert_eq!(get(&app, "/v1/jobs/job-1").await.json()["state"], expected);
         assert_eq!(get(&app, "/v1/jobs/job-2").await.json()["state"], "queued");
         assert!(post(&app, JOBS, &collect("c")).await.detail(503).contains("stopping"));
-        order.send(Ok(())).ok();
-        if heeds_cancel {
-            let (next, order) = puppet_app(dir.path(), true);
-            order.send(Ok(())).unwrap();
-            order.send(Ok(())).unwrap();
-            assert_eq!(state_becomes(&next, "job-1", "succeeded").await["attempts"], 2);
-            state_becomes(&next, "job-2", "succeeded").await;
+        finish.send(Ok(())).ok();
+        if obeys_cancel {
+            let (next, finish) = scripted_app(dir.path(), true);
+            finish.send(Ok(())).unwrap();
+            finish.send(Ok(())).unwrap();
+            assert_eq!(wait_for_state(&next, "job-1", "succeeded").await["attempts"], 2);
+            wait_for_state(&next, "job-2", "succeeded").await;
         }
     }
 }
 
 #[tokio::test]
-async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does_not() {
+async fn only_cancelled_or_failed_jobs_can_be_resumed() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, order) = puppet_app(dir.path(), true);
+    let (app, finish) = scripted_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
-    state_becomes(&app, "job-1", "running").await;
+    wait_for_state(&app, "job-1", "running").await;
     let early = post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.detail(409);
     assert_eq!(
         early,
-        "job job-1 has started; only one that failed or was cancelled can be resumed"
+        "job job-1 is running; only a failed or cancelled job can be resumed"
     );
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
-    state_becomes(&app, "job-1", "cancelled").await;
+    wait_for_state(&app, "job-1", "cancelled").await;
     assert_eq!(
         post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"],
         "queued"
     );
-    order.send(Err(JobFailure::Failed("no luck".to_owned()))).unwrap();
+    finish.send(Err(JobFailure::Failed("no luck".to_owned()))).unwrap();
     let path = "/v1/jobs/job-1";
-    let failed = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
+    let failed = poll_until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
     assert_eq!((&failed["error"], &failed["attempts"]), (&json!("no luck"), &json!(2)));
     post(&app, "/v1/jobs/job-1/resume", &Value::Null).await;
-    order.send(Ok(())).unwrap();
-    let done = until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "succeeded")).await;
+    finish.send(Ok(())).unwrap();
+    let done = poll_until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "succeeded")).await;
     assert_eq!((&done["error"], &done["attempts"]), (&Value::Null, &json!(3)));
     assert_eq!(post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.status, 409);
     let lines = get(&app, "/v1/jobs/job-1/logs?after=1&limit=1").await.json();
@@ -215,27 +222,27 @@ async fn a_cancelled_or_failed_job_goes_on_when_resumed_and_a_succeeded_one_does
 }
 
 #[tokio::test]
-async fn a_runner_whose_lease_another_took_stops_and_writes_nothing_more() {
+async fn a_runner_that_lost_its_lease_writes_nothing() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, _order) = puppet_app(dir.path(), true);
+    let (app, _order) = scripted_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
     let log = async || get(&app, "/v1/jobs/job-1/logs").await.json()["lines"].clone();
-    until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
-    // To another process whose clock says that the lease has long run out.
-    let (row, thief) = app.store().claim("another", 1e12, 2e12).await.unwrap().unwrap();
-    assert_eq!((row.number, thief.token), (1, 2));
+    poll_until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
+    // Another process claims the job; by its clock the lease has expired.
+    let (row, other_lease) = app.store().claim_at("another", 1e12, 2e12).await.unwrap().unwrap();
+    assert_eq!((row.number, other_lease.token), (1, 2));
     post(&app, JOBS, &collect("b")).await;
-    // The runner is free for the next job once it has seen that it lost this one.
-    state_becomes(&app, "job-2", "running").await;
+    // The runner starts the next job after it has noticed that it lost the lease.
+    wait_for_state(&app, "job-2", "running").await;
     let job = get(&app, "/v1/jobs/job-1").await.json();
     assert_eq!((&job["state"], &job["attempts"]), (&json!("running"), &json!(2)));
     assert_eq!(log().await.as_array().unwrap().len(), 2);
 }
 
 #[tokio::test]
-async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
+async fn an_idempotency_key_creates_one_job() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, order) = puppet_app(dir.path(), true);
+    let (app, finish) = scripted_app(dir.path(), true);
     let ask = async |body: Value, key: &str| {
         let request = Request::post(JOBS)
             .header("content-type", "application/json")
@@ -245,12 +252,12 @@ async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
         send(&app, request).await
     };
     assert_eq!(ask(collect("a"), "k-1").await.json()["id"], "job-1");
-    order.send(Ok(())).unwrap();
-    state_becomes(&app, "job-1", "succeeded").await;
+    finish.send(Ok(())).unwrap();
+    wait_for_state(&app, "job-1", "succeeded").await;
     assert_eq!(ask(collect("a"), "k-1").await.json()["state"], "succeeded");
     let other = ask(collect("b"), "k-1").await.detail(422);
     assert!(
-        other.starts_with("Idempotency-Key: it was used for another job, job-1"),
+        other.starts_with("Idempotency-Key: it was used for a different job, job-1"),
         "{other}"
     );
     let long = ask(collect("b"), &"k".repeat(129)).await.detail(422);
@@ -259,13 +266,13 @@ async fn an_idempotency_key_makes_one_job_however_often_it_is_asked() {
 }
 
 #[tokio::test]
-async fn jobs_are_listed_by_kind_and_state_page_by_page() {
+async fn jobs_are_listed_by_kind_and_state_in_pages() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, _order) = puppet_app(dir.path(), true);
+    let (app, _order) = scripted_app(dir.path(), true);
     for name in ["a", "b", "c"] {
         post(&app, JOBS, &collect(name)).await;
         if name == "a" {
-            state_becomes(&app, "job-1", "running").await;
+            wait_for_state(&app, "job-1", "running").await;
         }
     }
     let ids = async |query: &str| {
@@ -290,10 +297,10 @@ async fn jobs_are_listed_by_kind_and_state_page_by_page() {
     for (query, part) in [
         (
             "kind=dream",
-            "\"dream\" is no kind; there are: collect, train, evaluate",
+            "there is no kind \"dream\"; there are: collect, train, evaluate",
         ),
         ("state=asleep", "unknown variant `asleep`"),
-        ("before=7", "\"7\" is no job's id"),
+        ("before=7", "\"7\" is not a job id"),
         ("limit=0", "limit: 0 is out of range; it must be 1 to 1000"),
         ("colour=red", "unknown field `colour`"),
     ] {
@@ -303,11 +310,11 @@ async fn jobs_are_listed_by_kind_and_state_page_by_page() {
 }
 
 #[tokio::test]
-async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
+async fn job_events_last_until_the_job_ends() {
     let dir = tempfile::tempdir().unwrap();
-    let (app, order) = puppet_app(dir.path(), true);
+    let (app, finish) = scripted_app(dir.path(), true);
     post(&app, JOBS, &collect("a")).await;
-    order.send(Ok(())).unwrap();
+    finish.send(Ok(())).unwrap();
     let seen = get(&app, "/v1/jobs/job-1/events").await;
     assert_eq!(seen.headers["content-type"], "text/event-stream");
     let text = String::from_utf8(seen.body).unwrap();
@@ -322,18 +329,23 @@ async fn a_watcher_sees_a_job_to_its_end_and_does_not_hold_up_a_stop() {
         "{text}"
     );
     assert_eq!(get(&app, "/v1/jobs/job-9/events").await.status, 404);
+}
 
-    post(&app, JOBS, &collect("b")).await;
+#[tokio::test]
+async fn open_job_events_do_not_delay_shutdown() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, _finish) = scripted_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
     let watched = app.clone();
-    let watcher = tokio::spawn(async move { get(&watched, "/v1/jobs/job-2/events").await });
-    state_becomes(&app, "job-2", "running").await;
+    let watcher = tokio::spawn(async move { get(&watched, "/v1/jobs/job-1/events").await });
+    wait_for_state(&app, "job-1", "running").await;
     run(app.clone()).await.stop().await;
     let text = String::from_utf8(watcher.await.unwrap().body).unwrap();
     assert!(!text.contains("succeeded"), "{text}");
 }
 
 #[tokio::test]
-async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
+async fn an_invalid_job_is_refused_at_submission() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let train = |more: Value| {
@@ -352,7 +364,7 @@ async fn a_job_that_cannot_be_done_is_refused_when_it_is_asked_for() {
             422,
             "trials: 0 is out of range; 1 to 1000000 trials can be collected",
         ),
-        (collect("../up"), 422, "name: \"../up\" is no name"),
+        (collect("../up"), 422, "name: \"../up\" is not a valid name"),
         (
             train(json!({})),
             422,

@@ -1,4 +1,4 @@
-//! Jobs of processes that are killed without warning: the real program, `kill -9`, and the weights in the end.
+//! Jobs of processes that are killed with SIGKILL: the final weights are those of an uninterrupted training.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
@@ -11,15 +11,15 @@ use rand::Rng as _;
 use serde_json::{Value, json};
 
 const KILLS: u32 = 10;
-/// Longer than anything here takes, even where other programs keep the machine busy.
-const PATIENCE: Duration = Duration::from_mins(3);
-/// The program's default.
+/// Time limit of every wait: longer than any step takes, even on a busy machine.
+const TIMEOUT: Duration = Duration::from_mins(3);
+/// The default lease duration.
 const LEASE: Duration = Duration::from_secs(30);
 
-/// A running program that is killed when it is dropped.
-struct Program(Child);
+/// A running program. Dropping it kills the process.
+struct KillOnDrop(Child);
 
-impl Drop for Program {
+impl Drop for KillOnDrop {
     fn drop(&mut self) {
         // On Unix this is SIGKILL.
         let _ = self.0.kill();
@@ -27,16 +27,16 @@ impl Drop for Program {
     }
 }
 
-/// Starts the program with a data directory and no shipped models; returns the first line that it writes too.
-fn start(data_dir: &Path, arguments: &[&str]) -> (Program, String) {
-    let none_shipped = data_dir.join("none-shipped");
-    std::fs::create_dir_all(&none_shipped).unwrap();
+/// Starts the program with a data directory and no shipped models. Returns also its first line of output.
+fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String) {
+    let no_models = data_dir.join("none-shipped");
+    std::fs::create_dir_all(&no_models).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
         .args(arguments)
         .arg("--data-dir")
         .arg(data_dir)
         .arg("--set")
-        .arg(format!("models_dir={}", none_shipped.display()))
+        .arg(format!("models_dir={}", no_models.display()))
         .env("RUST_LOG", "warn")
         .stdout(Stdio::piped())
         .spawn()
@@ -44,16 +44,16 @@ fn start(data_dir: &Path, arguments: &[&str]) -> (Program, String) {
     let mut line = String::new();
     let stdout = child.stdout.take().unwrap();
     BufReader::new(stdout).read_line(&mut line).unwrap();
-    (Program(child), line)
+    (KillOnDrop(child), line)
 }
 
-fn serve(data_dir: &Path, more: &[&str]) -> (Program, String) {
+fn serve(data_dir: &Path, more: &[&str]) -> (KillOnDrop, String) {
     let (program, line) = start(data_dir, &[&["serve", "--bind", "127.0.0.1:0"], more].concat());
     let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
     (program, address.to_owned())
 }
 
-/// Asks and gives the JSON of the answer.
+/// Sends a request and returns the JSON body of the response.
 fn ask(address: &str, request: &str, body: &Value) -> Value {
     let body = if body.is_null() {
         String::new()
@@ -77,11 +77,11 @@ fn wait_for(address: &str, id: &str, state: &str) -> Value {
     wait_until(address, id, |job| job["state"] == state)
 }
 
-fn wait_until(address: &str, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
-    let deadline = Instant::now() + PATIENCE;
+fn wait_until(address: &str, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
+    let deadline = Instant::now() + TIMEOUT;
     loop {
         let job = ask(address, &format!("GET /v1/jobs/{id}"), &Value::Null);
-        if has_come(&job) {
+        if is_reached(&job) {
             return job;
         }
         assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
@@ -108,8 +108,8 @@ fn weights(data_dir: &Path) -> Vec<u8> {
     std::fs::read(data_dir.join("models/m/1/model.safetensors")).unwrap()
 }
 
-/// A data directory in which the collection and the training ran through, and how long the training took.
-fn unbroken() -> (tempfile::TempDir, Duration) {
+/// A data directory after an uninterrupted collection and training, and the duration of the training.
+fn uninterrupted() -> (tempfile::TempDir, Duration) {
     let dir = tempfile::tempdir().unwrap();
     let (_server, address) = serve(dir.path(), &[]);
     ask(&address, "POST /v1/jobs", &collect());
@@ -136,19 +136,20 @@ fn copy_dataset(from: &Path, to: &Path) {
 }
 
 #[test]
-fn a_training_whose_process_is_killed_ends_in_the_weights_of_an_unbroken_one() {
-    let (whole, took) = unbroken();
+fn a_killed_training_ends_with_the_same_weights() {
+    let (whole, took) = uninterrupted();
     killed_at_random_points(whole.path(), took);
-    taken_over_by_another_machine(whole.path());
+    claimed_by_another_machine(whole.path());
 }
 
 fn killed_at_random_points(whole: &Path, took: Duration) {
-    // Where the machine got quicker since `took` was measured, the training ends before its last kill: then they come sooner.
+    // If the machine is faster now than when `took` was measured, the training ends before the last kill. Then try again with
+    // shorter intervals.
     let killed = [0.06, 0.03, 0.015, 0.007]
         .into_iter()
         .find_map(|share| kill_repeatedly(whole, took.mul_f64(share)));
     let dir = killed.expect("the training ended before it was killed often enough");
-    let (_server, address) = serve(dir.path(), &[]);
+    let (_server, address) = serve(dir.path(), &["--set", "job_max_attempts=100"]);
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], KILLS + 1);
     assert!(weights(dir.path()) == weights(whole), "the weights differ");
@@ -158,14 +159,15 @@ fn killed_at_random_points(whole: &Path, took: Duration) {
     assert_eq!(killed.len(), 4 + 12);
 }
 
-/// A data directory whose training was killed again and again, each time at most that long after it was taken up; none if
-/// it came to its end all the same.
+/// A data directory whose training was killed repeatedly, each time at most `at_most` after it was claimed; none if the
+/// training ended before the last kill.
 fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir> {
     let dir = tempfile::tempdir().unwrap();
     copy_dataset(whole, dir.path());
     let mut rng = Seed(3).rng();
     for kill in 0..KILLS {
-        let (_server, address) = serve(dir.path(), &[]);
+        // It is killed faster than it saves.
+        let (_server, address) = serve(dir.path(), &["--set", "job_max_attempts=100"]);
         if kill == 0 {
             ask(&address, "POST /v1/jobs", &train());
         }
@@ -173,7 +175,7 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
         let job = wait_until(&address, "job-1", |job| job["attempts"] == kill + 1);
         assert!(
             started.elapsed() < LEASE,
-            "it was taken up only when the lease had run out: {job}"
+            "the job was claimed only after its lease had expired: {job}"
         );
         std::thread::sleep(at_most.mul_f64(rng.random_range(0.1..1.0)));
         if ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"] != "running" {
@@ -183,7 +185,7 @@ fn kill_repeatedly(whole: &Path, at_most: Duration) -> Option<tempfile::TempDir>
     Some(dir)
 }
 
-/// The points of the loss curves at which the validation windows were predicted.
+/// The points of the loss curves that have a validation loss.
 fn validations(address: &str, id: &str) -> Vec<Value> {
     let curves = ask(address, &format!("GET /v1/jobs/{id}/metrics"), &Value::Null);
     let points = curves["points"].as_array().unwrap().iter();
@@ -193,8 +195,8 @@ fn validations(address: &str, id: &str) -> Vec<Value> {
         .collect()
 }
 
-/// Data directories of their own, one database, one place for objects.
-fn taken_over_by_another_machine(whole: &Path) {
+/// Machines with separate data directories, one database and one object store.
+fn claimed_by_another_machine(whole: &Path) {
     let (of_server, first, second) = (
         tempfile::tempdir().unwrap(),
         tempfile::tempdir().unwrap(),
@@ -207,7 +209,7 @@ fn taken_over_by_another_machine(whole: &Path) {
         None => format!("sqlite:{}", shared.path().join("jobs.db").display()),
     };
     let objects = shared.path().join("objects").display().to_string();
-    let place = [
+    let shared_settings = [
         "--database-url",
         &database,
         "--objects-url",
@@ -216,12 +218,12 @@ fn taken_over_by_another_machine(whole: &Path) {
         "job_lease_ms=1000",
     ];
     copy_dataset(whole, &shared.path().join("objects"));
-    let (_server, address) = serve(of_server.path(), &[&place[..], &["--no-jobs"]].concat());
-    let work = |dir: &Path| start(dir, &[&["worker"], &place[..]].concat()).0;
+    let (_server, address) = serve(of_server.path(), &[&shared_settings[..], &["--no-jobs"]].concat());
+    let start_worker = |dir: &Path| start(dir, &[&["worker"], &shared_settings[..]].concat()).0;
     ask(&address, "POST /v1/jobs", &train());
     assert_eq!(ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"], "queued");
-    let worker = work(first.path());
-    let deadline = Instant::now() + PATIENCE;
+    let worker = start_worker(first.path());
+    let deadline = Instant::now() + TIMEOUT;
     while !shared
         .path()
         .join("objects/runs/job-1/checkpoint.safetensors")
@@ -231,12 +233,12 @@ fn taken_over_by_another_machine(whole: &Path) {
         std::thread::sleep(Duration::from_millis(1));
     }
     drop(worker);
-    let _worker = work(second.path());
+    let _worker = start_worker(second.path());
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["attempts"], 2);
     assert!(weights(second.path()) == weights(whole), "the weights differ");
-    // The server, which never saw the files, loads the new model by itself.
-    let deadline = Instant::now() + PATIENCE;
+    // The server has no copy of the files, but loads the new model.
+    let deadline = Instant::now() + TIMEOUT;
     while ask(&address, "GET /v1/models", &Value::Null)["models"][0]["name"] != "m" {
         assert!(Instant::now() < deadline);
         std::thread::sleep(Duration::from_millis(20));
@@ -247,7 +249,7 @@ fn taken_over_by_another_machine(whole: &Path) {
         .unwrap()
         .iter()
         .filter_map(|line| line["line"].as_str());
-    // What the first worker said in its last half second died with it.
-    let begun = lines.rfind(|line| line.contains(" from step ")).unwrap();
-    assert!(!begun.starts_with("pretrain from step 0,"), "{begun}");
+    // Log lines of the first worker's last half second are lost.
+    let resumed = lines.rfind(|line| line.contains(" from step ")).unwrap();
+    assert!(!resumed.starts_with("pretrain from step 0,"), "{resumed}");
 }

@@ -1,14 +1,14 @@
-//! The priorities of the real program's threads while it serves and works on a job; Linux has them for each thread.
+//! Thread priorities of the real program while a job runs. Only Linux has a priority per thread.
 #![cfg(target_os = "linux")]
 
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use crate::process::{Program, Served};
-use crate::service::PATIENCE;
+use crate::process::{Program, RunningServer};
+use crate::service::TIMEOUT;
 
-/// Name and niceness of a process's threads.
+/// Name and nice value of each thread of a process.
 fn threads(process: u32) -> Vec<(String, i64)> {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
     let stats = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("stat")).ok());
@@ -16,17 +16,17 @@ fn threads(process: u32) -> Vec<(String, i64)> {
         .map(|stat| {
             let (head, rest) = stat.rsplit_once(") ").unwrap();
             let (_, name) = head.split_once('(').unwrap();
-            // The 19th field of all; the third is the first after the name.
+            // Field 19 of the file; the first field after the name is field 3.
             let niceness = rest.split(' ').nth(16).unwrap().parse().unwrap();
             (name.to_owned(), niceness)
         })
         .collect()
 }
 
-/// Whether all of a job's threads are there, below the others; and the others where the process began.
-fn stands_back(process: u32) -> bool {
+/// Whether all job threads exist and have a lower priority, and all others have the priority of the process.
+fn has_lower_priority(process: u32) -> bool {
     let threads = threads(process);
-    // Threads that candle shares would have predictions wait for the training.
+    // With threads shared by candle, predictions would wait for the training.
     assert!(
         !threads.iter().any(|(name, _)| name.starts_with("candle")),
         "{threads:?}"
@@ -38,13 +38,13 @@ fn stands_back(process: u32) -> bool {
         "{threads:?}"
     );
     let low = (of_process + 10).min(19);
-    // One that waits for the work, and two of the pool.
+    // One thread that waits for the work, and two of the pool.
     jobs.len() >= 3 && jobs.iter().all(|(_, niceness)| *niceness == low)
 }
 
-fn wait_until_it_stands_back(process: u32) {
-    let deadline = Instant::now() + PATIENCE;
-    while !stands_back(process) {
+fn wait_for_lower_priority(process: u32) {
+    let deadline = Instant::now() + TIMEOUT;
+    while !has_lower_priority(process) {
         assert!(Instant::now() < deadline, "{:?}", threads(process));
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -55,29 +55,29 @@ fn collect(name: &str, trials: u64) -> Value {
 }
 
 #[test]
-fn the_threads_of_jobs_stand_back_behind_those_that_serve() {
+fn job_threads_of_a_server_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
-    let served = Served::start(dir.path(), &["--set", "job_threads=2"]);
-    served.ask("POST", "/v1/jobs", &collect("seen", 40));
-    served.job_until("job-1", |job| job["state"] == "succeeded");
+    let server = RunningServer::start(dir.path(), &["--set", "job_threads=2"]);
+    server.ask("POST", "/v1/jobs", &collect("seen", 40));
+    server.wait_for_job("job-1", |job| job["state"] == "succeeded");
     let settings = json!({"data": {"windows": 64, "validation_windows": 8}});
     let train = json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings});
     for job in [&train, &collect("more", 100_000)] {
-        let id = served.ask("POST", "/v1/jobs", job)["id"].as_str().unwrap().to_owned();
-        served.job_until(&id, |job| job["progress"]["done"].as_u64() > Some(0));
-        wait_until_it_stands_back(served.program.id());
-        served.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
+        let id = server.ask("POST", "/v1/jobs", job)["id"].as_str().unwrap().to_owned();
+        server.wait_for_job(&id, |job| job["progress"]["done"].as_u64() > Some(0));
+        wait_for_lower_priority(server.program.id());
+        server.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
     }
-    let names: Vec<String> = threads(served.program.id()).into_iter().map(|(name, _)| name).collect();
+    let names: Vec<String> = threads(server.program.id()).into_iter().map(|(name, _)| name).collect();
     assert!(names.iter().any(|name| name == "inference"), "{names:?}");
 }
 
 #[test]
-fn so_do_those_of_a_worker() {
+fn job_threads_of_a_worker_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
-    let served = Served::start(dir.path(), &["--no-jobs"]);
+    let server = RunningServer::start(dir.path(), &["--no-jobs"]);
     let worker = Program::start(dir.path(), &["worker", "--set", "job_threads=2"]);
-    served.ask("POST", "/v1/jobs", &collect("seen", 100_000));
-    served.job_until("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
-    wait_until_it_stands_back(worker.id());
+    server.ask("POST", "/v1/jobs", &collect("seen", 100_000));
+    server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
+    wait_for_lower_priority(worker.id());
 }

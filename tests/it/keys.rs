@@ -1,4 +1,4 @@
-//! API keys: who is asked for one, and what a revoked one is worth.
+//! API keys: when a key is required, and what happens after it is revoked.
 
 use axum::body::Body;
 use axum::http::{Request, header};
@@ -10,14 +10,14 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 
 use crate::service::{Answer, app, get, run, send};
 
-async fn guarded(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
+async fn app_with_keys(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig {
         data_dir: dir.path().to_owned(),
         ..StoreConfig::default()
     };
     let store = Store::open(&config).await.unwrap();
-    let keys = Keys::of(store.clone(), is_required).await.unwrap();
+    let keys = Keys::open(store.clone(), is_required).await.unwrap();
     let app = app(dir.path(), ServerConfig::default()).with_keys(keys.clone());
     (dir, store, keys, app)
 }
@@ -38,22 +38,22 @@ async fn models_with(app: &App, authorization: &str) -> Answer {
 }
 
 #[tokio::test]
-async fn everybody_may_until_the_first_key_is_made_unless_one_is_required() {
-    let (_dir, store, keys, app) = guarded(false).await;
+async fn authentication_starts_with_the_first_key() {
+    let (_dir, store, keys, app) = app_with_keys(false).await;
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
     keys.refresh().await.unwrap();
-    // That a key was taken away opens the server to nobody.
+    // Revoking the last key does not switch authentication off.
     assert_eq!(get(&app, "/v1/models").await.status, 401);
-    let (_dir, _store, _keys, app) = guarded(true).await;
+    let (_dir, _store, _keys, app) = app_with_keys(true).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
 }
 
 #[tokio::test]
-async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
-    let (_dir, store, keys, app) = guarded(true).await;
+async fn the_api_requires_a_valid_key() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
     let (key, other) = (new_key(&store, &keys).await, NewKey::generate().unwrap());
     let refused = get(&app, "/v1/models").await;
     assert!(refused.detail(401).contains("Authorization: Bearer KEY"));
@@ -75,8 +75,8 @@ async fn only_a_valid_key_opens_the_api_and_the_rest_is_open() {
 }
 
 #[tokio::test]
-async fn a_browser_shows_its_key_as_a_subprotocol() {
-    let (_dir, store, keys, app) = guarded(true).await;
+async fn a_websocket_can_send_its_key_as_a_subprotocol() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
     let key = new_key(&store, &keys).await;
     let server = run(app).await;
     let connect = async |protocols: String| {

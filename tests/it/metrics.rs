@@ -1,4 +1,4 @@
-//! What the real program measures, after each thing that it measures has been done.
+//! Every metric of the real program, checked after the events that it counts.
 
 use std::io::Read as _;
 use std::net::TcpStream;
@@ -11,16 +11,16 @@ use foreframe::server::{ImageBytes, ImageFormat};
 use foreframe::telemetry::names;
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened, send_frame, step};
-use crate::process::Served;
-use crate::service::{PATIENCE, context, model, slow_spec, spec};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
+use crate::process::RunningServer;
+use crate::service::{TIMEOUT, context, model, slow_spec, spec};
 
 const SIDE: u32 = 256;
 const CONNECTIONS: usize = 24;
 
-/// The value of a series, as it is scraped.
-fn measured(served: &Served, series: &str) -> Option<f64> {
-    let text = served.get("/metrics");
+/// The scraped value of a series.
+fn metric(server: &RunningServer, series: &str) -> Option<f64> {
+    let text = server.get("/metrics");
     let line = text
         .lines()
         .find_map(|line| line.strip_prefix(series)?.strip_prefix(' '));
@@ -28,24 +28,24 @@ fn measured(served: &Served, series: &str) -> Option<f64> {
 }
 
 #[track_caller]
-fn becomes(served: &Served, series: &str, value: f64) {
-    let deadline = Instant::now() + PATIENCE;
-    while measured(served, series) != Some(value) {
-        let found = measured(served, series);
+fn wait_for_metric(server: &RunningServer, series: &str, value: f64) {
+    let deadline = Instant::now() + TIMEOUT;
+    while metric(server, series) != Some(value) {
+        let found = metric(server, series);
         assert!(Instant::now() < deadline, "{series} is {found:?}, not {value}");
         std::thread::sleep(std::time::Duration::from_millis(10));
     }
 }
 
 #[track_caller]
-fn is(served: &Served, series: &str, value: f64) {
-    assert_eq!(measured(served, series), Some(value), "{series}");
+fn assert_metric(server: &RunningServer, series: &str, value: f64) {
+    assert_eq!(metric(server, series), Some(value), "{series}");
 }
 
 fn models(dir: &Path) {
     model(dir, "plain", spec(Conditioning::None));
     model(dir, "slow", slow_spec());
-    // One whose answers soon fill a socket.
+    // A model whose answers soon fill a socket.
     let large = ModelSpec {
         frame_width_px: SIDE,
         frame_height_px: SIDE,
@@ -59,68 +59,68 @@ fn models(dir: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_program_does_is_counted() {
+async fn every_metric_is_measured() {
     let dir = tempfile::tempdir().unwrap();
     models(&dir.path().join("models"));
-    let bounds = [
+    let limits = [
         "session_grace_ms=1000".to_owned(),
         "max_stream_buffer_bytes=1048576".to_owned(),
         "max_queued_predictions=1".to_owned(),
         format!("max_connections={CONNECTIONS}"),
     ];
-    let settings: Vec<&str> = bounds.iter().flat_map(|bound| ["--set", bound]).collect();
-    let served = Served::start(dir.path(), &settings);
-    is(&served, "foreframe_models_loaded", 3.0);
-    is(&served, "foreframe_model_loads_total{outcome=\"ok\"}", 3.0);
-    is(&served, "foreframe_model_loads_total{outcome=\"refused\"}", 1.0);
-    for seldom in [
+    let settings: Vec<&str> = limits.iter().flat_map(|limit| ["--set", limit]).collect();
+    let server = RunningServer::start(dir.path(), &settings);
+    assert_metric(&server, "foreframe_models_loaded", 3.0);
+    assert_metric(&server, "foreframe_model_loads_total{outcome=\"ok\"}", 3.0);
+    assert_metric(&server, "foreframe_model_loads_total{outcome=\"refused\"}", 1.0);
+    for name in [
         names::SESSIONS_EVICTED,
         names::STREAM_DROPPED,
         names::AUTH_REFUSED,
         names::HTTP_CONNECTIONS_REFUSED,
     ] {
-        is(&served, seldom, 0.0);
+        assert_metric(&server, name, 0.0);
     }
-    sessions(&served).await;
-    late_frames(&served).await;
-    a_slow_reader(&served).await;
-    a_full_queue(&served);
-    jobs(&served);
-    connections(&served);
-    let text = served.get("/metrics");
+    sessions(&server).await;
+    late_frames(&server).await;
+    a_slow_reader(&server).await;
+    a_full_queue(&server);
+    jobs(&server);
+    connections(&server);
+    let text = server.get("/metrics");
     for name in names::ALL {
         assert!(text.contains(&format!("# HELP {name} ")), "{name} is not in\n{text}");
     }
-    served.terminate();
-    served.ended();
+    server.terminate();
+    server.wait_for_exit();
 }
 
-async fn sessions(served: &Served) {
+async fn sessions(server: &RunningServer) {
     let mut clients = Vec::new();
     for _ in 0..2 {
-        let opened = Opened::of(&served.ask("POST", "/v1/sessions", &json!({"model": "plain"})));
+        let opened = SessionHandle::of(&server.ask("POST", "/v1/sessions", &json!({"model": "plain"})));
         let path = opened.path("/stream");
-        clients.push(Client::connect(served.address, &path, Codec::Msgpack).await.unwrap());
+        clients.push(Client::connect(server.address, &path, Codec::Msgpack).await.unwrap());
     }
     for seq in 0..3 {
-        clients[0].ask(&send_frame(seq)).await;
+        clients[0].ask(&numbered_message(seq)).await;
     }
-    // One that is refused has come all the same.
-    let refused = clients[1].ask(&send_frame(9)).await;
+    // A refused frame counts as well.
+    let refused = clients[1].ask(&numbered_message(9)).await;
     assert!(matches!(refused, ServerMessage::Error { .. }), "{refused:?}");
-    is(served, "foreframe_sessions_active", 2.0);
-    is(served, "foreframe_streams_active", 2.0);
-    is(served, "foreframe_stream_frames_total{model=\"plain\"}", 4.0);
-    is(served, "foreframe_sessions_evicted_total", 0.0);
+    assert_metric(server, "foreframe_sessions_active", 2.0);
+    assert_metric(server, "foreframe_streams_active", 2.0);
+    assert_metric(server, "foreframe_stream_frames_total{model=\"plain\"}", 4.0);
+    assert_metric(server, "foreframe_sessions_evicted_total", 0.0);
     drop(clients);
-    becomes(served, "foreframe_sessions_evicted_total", 2.0);
-    becomes(served, "foreframe_sessions_active", 0.0);
-    becomes(served, "foreframe_streams_active", 0.0);
+    wait_for_metric(server, "foreframe_sessions_evicted_total", 2.0);
+    wait_for_metric(server, "foreframe_sessions_active", 0.0);
+    wait_for_metric(server, "foreframe_streams_active", 0.0);
 }
 
-async fn late_frames(served: &Served) {
+async fn late_frames(server: &RunningServer) {
     let path = "/v1/models/plain/stream";
-    let mut client = Client::connect(served.address, path, Codec::Msgpack).await.unwrap();
+    let mut client = Client::connect(server.address, path, Codec::Msgpack).await.unwrap();
     let configure = ConfigureMessage {
         on_late: Some(OnLate::Skip),
         ..ConfigureMessage::default()
@@ -128,7 +128,7 @@ async fn late_frames(served: &Served) {
     client.ask(&ClientMessage::Configure(configure)).await;
     let sent = 100;
     for seq in 0..sent {
-        client.send(&send_frame(seq)).await;
+        client.send(&numbered_message(seq)).await;
     }
     let mut overtaken = 0;
     for _ in 0..sent {
@@ -136,58 +136,62 @@ async fn late_frames(served: &Served) {
     }
     assert!(overtaken > 0);
     let name = "foreframe_stream_frames_overtaken_total{model=\"plain\"}";
-    is(served, name, f64::from(overtaken));
+    assert_metric(server, name, f64::from(overtaken));
 }
 
-async fn a_slow_reader(served: &Served) {
+async fn a_slow_reader(server: &RunningServer) {
     let path = "/v1/models/large/stream";
-    let mut client = Client::connect(served.address, path, Codec::Msgpack).await.unwrap();
+    let mut client = Client::connect(server.address, path, Codec::Msgpack).await.unwrap();
     let frame = ClientMessage::Frame(foreframe::server::protocol::FrameMessage {
         image: ImageBytes(vec![7; (SIDE * SIDE) as usize]),
         format: ImageFormat::Raw,
         action: None,
         state: None,
-        ..step(0)
+        ..numbered_frame(0)
     });
     client.ask(&frame).await;
     let sent = 100;
     for _ in 0..sent {
-        // The kept answer is sent again for each.
+        // The server sends the cached answer for each.
         client.send(&frame).await;
     }
-    let (mut missed, mut read) = (0, 0);
-    while missed + read < sent {
+    let (mut dropped_total, mut read) = (0, 0);
+    while dropped_total + read < sent {
         if let ServerMessage::Prediction { dropped, .. } = client.receive().await {
-            missed += dropped;
+            dropped_total += dropped;
             read += 1;
         }
     }
-    assert!(missed > 0);
-    is(served, "foreframe_stream_predictions_dropped_total", missed as f64);
-    is(
-        served,
+    assert!(dropped_total > 0);
+    assert_metric(
+        server,
+        "foreframe_stream_predictions_dropped_total",
+        dropped_total as f64,
+    );
+    assert_metric(
+        server,
         "foreframe_stream_frames_total{model=\"large\"}",
         1.0 + sent as f64,
     );
 }
 
-/// Asks for predictions at once until one finds the queue full.
-fn a_full_queue(served: &Served) {
+/// Sends concurrent requests until one finds the queue full.
+fn a_full_queue(server: &RunningServer) {
     let body = json!({"frames": context()});
     let (mut computed, mut refused) = (0, 0);
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while refused == 0 {
         assert!(Instant::now() < deadline);
         std::thread::scope(|scope| {
-            let ask = || served.ask("POST", "/v1/models/slow/predict", &body)["status"] == 503;
+            let ask = || server.ask("POST", "/v1/models/slow/predict", &body)["status"] == 503;
             let asked: Vec<_> = (0..8).map(|_| scope.spawn(ask)).collect();
             for is_refused in asked.into_iter().map(|asked| asked.join().unwrap()) {
                 *(if is_refused { &mut refused } else { &mut computed }) += 1;
             }
         });
     }
-    is(
-        served,
+    assert_metric(
+        server,
         "foreframe_predictions_refused_total{reason=\"full\"}",
         f64::from(refused),
     );
@@ -195,23 +199,23 @@ fn a_full_queue(served: &Served) {
         "foreframe_prediction_batch_size_sum",
         "foreframe_prediction_queue_wait_seconds_count",
     ] {
-        is(served, &format!("{name}{{model=\"slow\"}}"), f64::from(computed));
+        assert_metric(server, &format!("{name}{{model=\"slow\"}}"), f64::from(computed));
     }
-    let seconds = measured(served, "foreframe_prediction_compute_seconds_sum{model=\"slow\"}");
+    let seconds = metric(server, "foreframe_prediction_compute_seconds_sum{model=\"slow\"}");
     assert!(seconds.is_some_and(|seconds| seconds > 0.0), "{seconds:?}");
-    is(served, "foreframe_predictions_waiting", 0.0);
+    assert_metric(server, "foreframe_predictions_waiting", 0.0);
     let route = "method=\"POST\",route=\"/v1/models/{model}/predict\"";
     for (status, count) in [(200, computed), (503, refused)] {
         let series = format!("foreframe_http_requests_total{{{route},status=\"{status}\"}}");
-        is(served, &series, f64::from(count));
+        assert_metric(server, &series, f64::from(count));
     }
 }
 
-fn jobs(served: &Served) {
+fn jobs(server: &RunningServer) {
     let collect = |name: &str, trials: u64| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials});
-    let post = |body: &Value| served.ask("POST", "/v1/jobs", body);
+    let post = |body: &Value| server.ask("POST", "/v1/jobs", body);
     post(&collect("seen", 40));
-    served.job_until("job-1", |job| job["state"] == "succeeded");
+    server.wait_for_job("job-1", |job| job["state"] == "succeeded");
     let settings = json!({
         "model": {"features": 8, "hidden": 8},
         "data": {"windows": 8, "validation_windows": 4},
@@ -220,56 +224,56 @@ fn jobs(served: &Served) {
         "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
     });
     post(&json!({"kind": "train", "name": "new", "preset": "paper", "dataset": "seen", "settings": settings}));
-    let trained = served.job_until("job-2", |job| job["state"] == "succeeded");
+    let trained = server.wait_for_job("job-2", |job| job["state"] == "succeeded");
     for split in ["train", "validation"] {
         let series = format!("foreframe_training_loss{{split=\"{split}\"}}");
-        is(served, &series, trained["losses"][split].as_f64().unwrap());
+        assert_metric(server, &series, trained["losses"][split].as_f64().unwrap());
     }
     post(&collect("long", 100_000));
-    served.job_until("job-3", |job| job["state"] == "running");
-    is(served, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 1.0);
-    post_cancel(served, "job-3");
+    server.wait_for_job("job-3", |job| job["state"] == "running");
+    assert_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 1.0);
+    post_cancel(server, "job-3");
     for (kind, state, count) in [
         ("collect", "succeeded", 1.0),
         ("train", "succeeded", 1.0),
         ("collect", "cancelled", 1.0),
     ] {
-        is(
-            served,
+        assert_metric(
+            server,
             &format!("foreframe_jobs{{kind=\"{kind}\",state=\"{state}\"}}"),
             count,
         );
-        becomes(
-            served,
+        wait_for_metric(
+            server,
             &format!("foreframe_jobs_ended_total{{kind=\"{kind}\",outcome=\"{state}\"}}"),
             count,
         );
     }
-    is(served, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
-    becomes(served, "foreframe_models_loaded", 4.0);
-    is(served, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
+    assert_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
+    wait_for_metric(server, "foreframe_models_loaded", 4.0);
+    assert_metric(server, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
 }
 
-fn post_cancel(served: &Served, id: &str) {
-    served.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
-    served.job_until(id, |job| job["state"] == "cancelled");
+fn post_cancel(server: &RunningServer, id: &str) {
+    server.ask("POST", &format!("/v1/jobs/{id}/cancel"), &Value::Null);
+    server.wait_for_job(id, |job| job["state"] == "cancelled");
 }
 
-fn connections(served: &Served) {
-    // The one that asks.
-    becomes(served, "foreframe_http_connections_open", 1.0);
+fn connections(server: &RunningServer) {
+    // The connection that asks for the metrics.
+    wait_for_metric(server, "foreframe_http_connections_open", 1.0);
     let mut held: Vec<TcpStream> = (0..CONNECTIONS + 4)
-        .map(|_| TcpStream::connect(served.address).unwrap())
+        .map(|_| TcpStream::connect(server.address).unwrap())
         .collect();
     for over in held.iter_mut().skip(CONNECTIONS) {
-        let mut told = String::new();
-        over.read_to_string(&mut told).unwrap();
-        assert!(told.starts_with("HTTP/1.1 503"), "{told}");
+        let mut answer = String::new();
+        over.read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 503"), "{answer}");
     }
     drop(held);
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     let refused = loop {
-        if let Some(refused) = measured(served, "foreframe_http_connections_refused_total") {
+        if let Some(refused) = metric(server, "foreframe_http_connections_refused_total") {
             break refused;
         }
         assert!(Instant::now() < deadline);

@@ -6,7 +6,7 @@ use candle_core::{Device, Tensor};
 use foreframe::nn::lstm::unroll;
 use foreframe::nn::lstm_cell::{LstmState, PeepholeCell};
 
-use crate::nn_common::largest_difference;
+use crate::nn_fixtures::largest_difference;
 
 type Tensors = HashMap<String, Tensor>;
 
@@ -50,7 +50,7 @@ fn the_fused_sequence_agrees_with_onnxruntime() {
 
 /// The paper's prose lets the output gate see c(t − 1); its equation (4), and Graves, c(t).
 #[test]
-fn an_output_gate_that_sees_the_memory_before_is_told_apart() {
+fn an_output_gate_that_sees_the_previous_memory_differs() {
     let t = fixture();
     let hidden = t["c0"].dim(1).unwrap();
     let sigmoid = |sum: &Tensor| candle_nn::ops::sigmoid(sum).unwrap();

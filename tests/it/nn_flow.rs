@@ -7,7 +7,7 @@ use foreframe::nn::{
 };
 use foreframe::types::Seed;
 
-use crate::nn_common::{condition, largest_difference, values};
+use crate::nn_fixtures::{condition, largest_difference, values};
 
 const CAMERA: CameraModel = CameraModel {
     horizontal_fov_rad: 1.0,
@@ -62,7 +62,9 @@ fn kinds() -> Vec<ModelSpec> {
 }
 
 fn frames(spec: &ModelSpec, batch: usize) -> Tensor {
-    values(&[batch, spec.context, spec.pixels()], 0.3).affine(0.5, 0.5).unwrap()
+    values(&[batch, spec.context, spec.pixels()], 0.3)
+        .affine(0.5, 0.5)
+        .unwrap()
 }
 
 #[test]
@@ -75,14 +77,22 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
             var.set(&(var.as_detached_tensor() + noise).unwrap()).unwrap();
         }
         let model = Model::new(spec.clone(), &parameters).unwrap();
-        let predicted = model.predict_flow(&frames(&spec, 2), &condition(&spec, 2)).unwrap().unwrap();
+        let predicted = model
+            .predict_flow(&frames(&spec, 2), &condition(&spec, 2))
+            .unwrap()
+            .unwrap();
         let shape = [2, spec.horizon, spec.pixels()];
-        assert_eq!((predicted.frames.dims(), predicted.scene.dims()), (&shape[..], &shape[..]));
+        assert_eq!(
+            (predicted.frames.dims(), predicted.scene.dims()),
+            (&shape[..], &shape[..])
+        );
         let squares = predicted.frames.sqr().unwrap().sum_all().unwrap();
         let loss = (squares + predicted.motion.sqr().unwrap().sum_all().unwrap()).unwrap();
         let gradients = loss.backward().unwrap();
         for (name, var) in parameters.iter() {
-            let gradient = gradients.get(var.as_tensor()).unwrap_or_else(|| panic!("{name} has no gradient"));
+            let gradient = gradients
+                .get(var.as_tensor())
+                .unwrap_or_else(|| panic!("{name} has no gradient"));
             let most = gradient.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
             assert!(most.is_finite() && most > 0.0, "{name}: {most}");
         }
@@ -117,7 +127,13 @@ fn an_untrained_network_turns_the_last_frame_with_the_camera() {
     told.actions = Some(Tensor::new(&[[[0.0f32, 0.5], [0.0, 0.5]]], &Device::Cpu).unwrap());
     told.state = Some(Tensor::new(&[[0.1f32, 0.1, 1.0, 0.0, 0.5]], &Device::Cpu).unwrap());
     let motion = model.predict_flow(&frames(&spec, 1), &told).unwrap().unwrap().motion;
-    let yaw: Vec<f32> = motion.narrow(2, 0, 1).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+    let yaw: Vec<f32> = motion
+        .narrow(2, 0, 1)
+        .unwrap()
+        .flatten_all()
+        .unwrap()
+        .to_vec1()
+        .unwrap();
     assert!((yaw[0] - 0.1).abs() < 1e-6 && (yaw[1] - 0.2).abs() < 1e-6, "{yaw:?}");
 }
 
@@ -130,7 +146,10 @@ fn the_cost_is_that_of_its_layers() {
     let once = 24 * 9 * 18 * 6 + 6 * 9 * 6 * 8 + 4 * 6 * 9 * 8 * 8;
     let each = 6 * (8 + 32) * 8 + 2 * 6 * 9 * 8 * 8 + 6 * 8 * 12 + 24 * 9 * (3 + 5 + 12) * 5 + 24 * 9 * 5 * 32;
     let modulation = 2 * 64 + 64 * 32;
-    assert_eq!(spec.multiply_adds_per_frame(), (once as u64).div_ceil(2) + each + modulation);
+    assert_eq!(
+        spec.multiply_adds_per_frame(),
+        (once as u64).div_ceil(2) + each + modulation
+    );
 }
 
 #[test]
@@ -162,7 +181,10 @@ fn what_does_not_suit_the_network_is_refused_in_one_sentence() {
 #[test]
 fn a_dense_specification_is_written_as_before() {
     let text = serde_json::to_string(&ModelSpec::default()).unwrap();
-    assert!(!text.contains("architecture") && !text.contains("flow") && !text.contains("camera"), "{text}");
+    assert!(
+        !text.contains("architecture") && !text.contains("flow") && !text.contains("camera"),
+        "{text}"
+    );
     let spec = small(Conditioning::StateAction, Some(CAMERA));
     let back: ModelSpec = serde_json::from_str(&serde_json::to_string(&spec).unwrap()).unwrap();
     assert_eq!(back, spec);

@@ -1,12 +1,12 @@
-//! The whole model: gradients, determinism, conditioning, and what it refuses.
+//! The whole model: gradients, determinism, conditioning, and errors.
 
 use candle_core::{DType, Device, Tensor};
 use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
-use crate::nn_common::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
+use crate::nn_fixtures::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
 
-/// A loss that every tensor of the model has a part in.
+/// A loss that depends on every tensor of the model.
 fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
     let spec = model.spec();
     let batch = frames.dim(0).unwrap();
@@ -70,7 +70,7 @@ fn gradients_agree_with_finite_differences() {
 }
 
 #[test]
-fn fused_f32_agrees_with_composed_f64_in_values_and_gradients() {
+fn fused_f32_training_agrees_with_composed_f64() {
     for (spec, with_truth) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(5)).unwrap();
         let doubles = parameters.to_dtype(DType::F64).unwrap();
@@ -98,7 +98,7 @@ fn fused_f32_agrees_with_composed_f64_in_values_and_gradients() {
 }
 
 #[test]
-fn predictions_of_fused_f32_and_composed_f64_agree() {
+fn fused_f32_prediction_agrees_with_composed_f64() {
     for (spec, _) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(6)).unwrap();
         let frames = values(&[2, spec.context, spec.pixels()], 0.2);
@@ -115,7 +115,7 @@ fn predictions_of_fused_f32_and_composed_f64_agree() {
 }
 
 #[test]
-fn one_seed_gives_one_set_of_bits_whatever_other_threads_do() {
+fn results_do_not_depend_on_other_threads() {
     let spec = ModelSpec {
         frame_width_px: 16,
         frame_height_px: 16,
@@ -142,7 +142,7 @@ fn one_seed_gives_one_set_of_bits_whatever_other_threads_do() {
 }
 
 #[test]
-fn a_window_is_predicted_alike_alone_and_in_company() {
+fn a_batched_window_is_predicted_as_a_single_one() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let (frames, condition) = (values(&[5, spec.context, spec.pixels()], 0.0), condition(&spec, 5));
@@ -159,7 +159,7 @@ fn a_window_is_predicted_alike_alone_and_in_company() {
 }
 
 #[test]
-fn without_conditioning_given_actions_change_nothing() {
+fn an_unconditioned_model_ignores_actions() {
     let spec = tiny(Conditioning::None, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
@@ -169,7 +169,7 @@ fn without_conditioning_given_actions_change_nothing() {
 }
 
 #[test]
-fn with_conditioning_each_action_changes_only_what_follows_it() {
+fn an_action_changes_only_later_frames() {
     let spec = tiny(Conditioning::Action, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[1, spec.context, spec.pixels()], 0.0);
@@ -195,7 +195,7 @@ fn with_conditioning_each_action_changes_only_what_follows_it() {
 }
 
 #[test]
-fn a_missing_or_misshapen_input_is_named_with_what_would_be_right() {
+fn a_missing_or_misshaped_input_names_the_expected_shape() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
     let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);

@@ -1,4 +1,4 @@
-//! Adam: the closed form, resumption, clipping, and what it refuses.
+//! Adam: the closed form, resuming, clipping, and errors.
 
 use candle_core::{Device, Tensor};
 use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
@@ -70,7 +70,7 @@ fn train(parameters: &Parameters, adam: &mut Adam, steps: std::ops::Range<usize>
 }
 
 #[test]
-fn the_first_two_steps_follow_the_closed_form() {
+fn adam_follows_its_closed_form_for_two_steps() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let mut adam = Adam::new(unclipped());
     let slopes = [0.5f32, -2.0, 1e-3, 30.0, 0.0, 1.0, -1.0, 0.1, 0.2, 0.3, 0.4, 0.6];
@@ -97,7 +97,7 @@ fn the_first_two_steps_follow_the_closed_form() {
 }
 
 #[test]
-fn a_resumed_run_goes_on_bit_for_bit() {
+fn a_resumed_run_is_bit_identical() {
     let whole = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     train(&whole, &mut Adam::new(AdamConfig::default()), 0..7);
     let stopped = Parameters::initialize(&tiny(), Seed(1)).unwrap();
@@ -134,7 +134,7 @@ fn a_large_gradient_is_scaled_to_the_clipping_norm() {
 }
 
 #[test]
-fn a_gradient_or_loss_that_is_not_finite_changes_nothing() {
+fn a_non_finite_gradient_or_loss_changes_nothing() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let before = all_bits(&parameters);
     let mut adam = Adam::new(AdamConfig::default());
@@ -143,7 +143,7 @@ fn a_gradient_or_loss_that_is_not_finite_changes_nothing() {
         Gradients::of(&infinite, &parameters, &[]),
         Err(OptimizerError::LossNotFinite { .. })
     ));
-    // √0 is finite, its slope isn't.
+    // √0 is finite, but its derivative is not.
     let edge = slope(&parameters, &[0.0; 12]).sqrt().unwrap();
     let gradients = Gradients::of(&edge, &parameters, &[]).unwrap();
     let error = adam.update(&parameters, &gradients, RATE).unwrap_err();
@@ -155,7 +155,7 @@ fn a_gradient_or_loss_that_is_not_finite_changes_nothing() {
 }
 
 #[test]
-fn frozen_tensors_stay() {
+fn frozen_tensors_do_not_change() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let before = bias(&parameters);
     let gradients = Gradients::of(&slope(&parameters, &[1.0; 12]), &parameters, &["frame_"]).unwrap();
@@ -166,7 +166,7 @@ fn frozen_tensors_stay() {
 }
 
 #[test]
-fn gradients_of_halves_join_to_the_gradient_of_the_whole() {
+fn half_batch_gradients_average_to_the_batch_gradient() {
     let spec = tiny();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let model = Model::new(spec.clone(), &parameters).unwrap();
@@ -189,7 +189,7 @@ fn gradients_of_halves_join_to_the_gradient_of_the_whole() {
 }
 
 #[test]
-fn a_checkpoint_that_does_not_fit_is_refused() {
+fn a_mismatched_optimizer_state_is_refused() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let mut adam = Adam::new(AdamConfig::default());
     train(&parameters, &mut adam, 0..1);

@@ -6,10 +6,10 @@ use candle_core::{DType, Tensor};
 use foreframe::nn::{Conditioning, Loss, ModelSpec, NnError, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
-use crate::nn_common::{all_kinds, bits, channel, tiny, values};
+use crate::nn_fixtures::{all_kinds, bits, channel, tiny, values};
 
 #[test]
-fn every_bound_of_the_specification_refuses() {
+fn specifications_out_of_bounds_are_refused() {
     type Change = fn(&mut ModelSpec);
     let changes: [(&str, Change); 12] = [
         ("frame_width_px", |spec| spec.frame_width_px = 0),
@@ -47,16 +47,16 @@ fn every_bound_of_the_specification_refuses() {
 }
 
 #[test]
-fn parameters_are_counted_as_they_are() {
+fn the_parameter_count_matches_the_tensors() {
     for (spec, _) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(0)).unwrap();
         assert_eq!(spec.parameter_count(), parameters.count());
     }
 }
 
-/// Each weight (no bias) counts once for each frame it works on.
+/// Each weight (biases excluded) counts once for each frame that it is applied to.
 #[test]
-fn multiply_adds_are_the_weights_times_their_uses() {
+fn multiply_adds_count_every_use_of_a_weight() {
     for (spec, _) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(0)).unwrap();
         let uses = |name: &str| match name.split('.').next().unwrap() {
@@ -72,7 +72,7 @@ fn multiply_adds_are_the_weights_times_their_uses() {
 }
 
 #[test]
-fn stored_weights_are_checked_by_name_and_shape_and_widened() {
+fn stored_weights_are_checked_and_converted_to_f32() {
     let spec = tiny(Conditioning::None, Reconstruction::Sequence);
     let parameters = Parameters::initialize(&spec, Seed(4)).unwrap();
     let stored: BTreeMap<String, Tensor> = parameters.snapshot().unwrap();
@@ -98,7 +98,7 @@ fn stored_weights_are_checked_by_name_and_shape_and_widened() {
 }
 
 #[test]
-fn a_snapshot_keeps_its_values_and_restores_them() {
+fn a_snapshot_restores_its_values() {
     let spec = tiny(Conditioning::None, Reconstruction::Stepwise);
     let parameters = Parameters::initialize(&spec, Seed(4)).unwrap();
     let snapshot = parameters.snapshot().unwrap();
@@ -111,7 +111,7 @@ fn a_snapshot_keeps_its_values_and_restores_them() {
 }
 
 #[test]
-fn a_specification_keeps_its_names_on_disk() {
+fn specification_names_on_disk_are_stable() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Stepwise);
     let text = serde_json::to_string(&spec).unwrap();
     assert!(text.contains("\"conditioning\":\"state-action\"") && text.contains("\"reconstruction\":\"stepwise\""));

@@ -1,11 +1,11 @@
-//! Traces of the real program at a collector.
+//! Traces that the real program sends to a collector.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpListener;
 
-use crate::process::Served;
+use crate::process::RunningServer;
 
-/// Takes requests until one brings a trace, and gives its path and body.
+/// Accepts one request and returns its first line and body.
 fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
     let (stream, _) = collector.accept().unwrap();
     let mut stream = BufReader::new(stream);
@@ -30,14 +30,14 @@ fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
 }
 
 #[test]
-fn requests_are_traced_to_a_collector() {
+fn request_traces_reach_the_collector() {
     let (dir, collector) = (tempfile::tempdir().unwrap(), TcpListener::bind("127.0.0.1:0").unwrap());
     let endpoint = format!("otlp_endpoint=http://{}", collector.local_addr().unwrap());
-    let server = Served::start(dir.path(), &["--set", &endpoint]);
+    let server = RunningServer::start(dir.path(), &["--set", &endpoint]);
     server.get("/v1/models");
     server.program.terminate();
     let (path, body) = first_trace(&collector);
-    server.program.ended();
+    server.program.wait_for_exit();
     assert_eq!(path, "POST /v1/traces HTTP/1.1");
     let holds = |text: &str| body.windows(text.len()).any(|part| part == text.as_bytes());
     // The service's name, and the request with its path.

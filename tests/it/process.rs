@@ -1,4 +1,4 @@
-//! The real program in a process of its own, asked over sockets and told to stop.
+//! The real program as a child process: started, called over sockets, and stopped.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::service::PATIENCE;
+use crate::service::TIMEOUT;
 
-/// The program in a directory, with no setting from the environment, as users start it.
+/// A command of the program in a directory, without settings from the environment.
 pub(crate) fn foreframe(dir: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
     command.current_dir(dir).env_remove("CANDLE_NUM_THREADS");
@@ -29,7 +29,7 @@ pub(crate) fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
 }
 
-/// A running program that has said its first line; killed when a test ends before it.
+/// A running program that has printed its first line. Dropping it kills the process.
 pub(crate) struct Program {
     child: Child,
     line: String,
@@ -53,6 +53,11 @@ impl Program {
         Self { child, line, log }
     }
 
+    /// The first line that it printed.
+    pub(crate) fn first_line(&self) -> &str {
+        &self.line
+    }
+
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
@@ -62,9 +67,9 @@ impl Program {
         assert!(kill.unwrap().success());
     }
 
-    /// Waits for the end; gives its log.
-    pub(crate) fn ended(mut self) -> String {
-        let deadline = Instant::now() + PATIENCE;
+    /// Waits for a successful exit and returns the log.
+    pub(crate) fn wait_for_exit(mut self) -> String {
+        let deadline = Instant::now() + TIMEOUT;
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
@@ -80,41 +85,48 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // It has ended already in a test that passes.
+        // In a passing test it has ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// A server that is ready.
-pub(crate) struct Served {
+/// A server process that is ready.
+pub(crate) struct RunningServer {
     pub(crate) program: Program,
     pub(crate) address: SocketAddr,
 }
 
-impl Served {
+impl RunningServer {
     pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
-        let program = Program::start(dir, &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat());
+        Self::of(Program::start(
+            dir,
+            &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat(),
+        ))
+    }
+
+    /// Waits until a program that serves is ready.
+    pub(crate) fn of(program: Program) -> Self {
         let line = &program.line;
         let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
-        let served = Self {
+        let server = Self {
             address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
             program,
         };
-        let deadline = Instant::now() + PATIENCE;
-        while !served.get("/readyz").starts_with("HTTP/1.1 200") {
-            assert!(Instant::now() < deadline, "the server did not get ready");
+        let deadline = Instant::now() + TIMEOUT;
+        while !server.get("/readyz").starts_with("HTTP/1.1 200") {
+            assert!(Instant::now() < deadline, "the server did not become ready");
             std::thread::sleep(Duration::from_millis(10));
         }
-        served
+        server
     }
 
-    /// The whole answer.
+    /// The whole response, with its headers.
     pub(crate) fn get(&self, path: &str) -> String {
         self.send("GET", path, "")
     }
 
-    /// The JSON of the answer.
+    /// The JSON body of the response.
     pub(crate) fn ask(&self, method: &str, path: &str, body: &Value) -> Value {
         let answer = self.send(method, path, &body.to_string());
         let body = answer.split_once("\r\n\r\n").map(|(_, body)| body).unwrap();
@@ -135,12 +147,12 @@ impl Served {
         answer
     }
 
-    /// Asks for a job until that has come.
-    pub(crate) fn job_until(&self, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
-        let deadline = Instant::now() + PATIENCE;
+    /// Polls a job until the condition holds. Panics if the job fails.
+    pub(crate) fn wait_for_job(&self, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let job = self.ask("GET", &format!("/v1/jobs/{id}"), &Value::Null);
-            if has_come(&job) {
+            if is_reached(&job) {
                 return job;
             }
             assert!(job["state"] != "failed" && Instant::now() < deadline, "{job}");
@@ -152,8 +164,8 @@ impl Served {
         self.program.terminate();
     }
 
-    /// Waits for the end; gives its log.
-    pub(crate) fn ended(self) -> String {
-        self.program.ended()
+    /// Waits for a successful exit and returns the log.
+    pub(crate) fn wait_for_exit(self) -> String {
+        self.program.wait_for_exit()
     }
 }

@@ -1,4 +1,4 @@
-//! The real program: what it says on the command line, and how it ends.
+//! The real program: shutdown, metrics, health checks, keys and configuration.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
-use crate::process::{Served, foreframe, output, text};
-use crate::service::{PATIENCE, context, model, slow_spec, spec};
+use crate::process::{Program, RunningServer, foreframe, output, text};
+use crate::service::{TIMEOUT, context, model, slow_spec, spec};
 
-/// Asks over one connection until it ends or is refused. A request counts as accepted once the server asks for its body.
-fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
+/// Sends requests until connections are refused. A request counts as accepted once the server asks for its body.
+fn send_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, answered: &AtomicUsize) {
     let head = format!(
         "POST /v1/models/slow/predict HTTP/1.1\r\nhost: a\r\ncontent-type: application/json\r\nexpect: 100-continue\r\n\
          content-length: {}\r\n\r\n",
@@ -20,14 +20,14 @@ fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, an
     );
     while let Ok(mut stream) = TcpStream::connect(address) {
         loop {
-            let mut go_on = [0; 25];
-            if stream.write_all(head.as_bytes()).is_err() || stream.read_exact(&mut go_on).is_err() {
+            let mut interim = [0; 25];
+            if stream.write_all(head.as_bytes()).is_err() || stream.read_exact(&mut interim).is_err() {
                 break;
             }
-            assert_eq!(&go_on, b"HTTP/1.1 100 Continue\r\n\r\n");
+            assert_eq!(&interim, b"HTTP/1.1 100 Continue\r\n\r\n");
             accepted.fetch_add(1, Ordering::Relaxed);
             stream.write_all(body.as_bytes()).unwrap();
-            if !is_whole_answer(&mut stream) {
+            if !read_whole_answer(&mut stream) {
                 break;
             }
             answered.fetch_add(1, Ordering::Relaxed);
@@ -35,7 +35,7 @@ fn ask_until_refused(address: SocketAddr, body: &str, accepted: &AtomicUsize, an
     }
 }
 
-fn is_whole_answer(stream: &mut TcpStream) -> bool {
+fn read_whole_answer(stream: &mut TcpStream) -> bool {
     let mut reader = BufReader::new(stream);
     let (mut line, mut length, mut is_status) = (String::new(), 0, true);
     while line != "\r\n" {
@@ -53,28 +53,28 @@ fn is_whole_answer(stream: &mut TcpStream) -> bool {
 }
 
 #[test]
-fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
+fn sigterm_under_load_answers_every_accepted_request() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "slow", slow_spec());
-    let served = Served::start(
+    let server = RunningServer::start(
         dir.path(),
         &["--set", "drain_ms=300", "--set", "shutdown_deadline_ms=20000"],
     );
     let body = json!({"frames": context()}).to_string();
     let (accepted, answered) = (AtomicUsize::new(0), AtomicUsize::new(0));
-    let address = served.address;
-    let told = std::thread::scope(|scope| {
+    let address = server.address;
+    let stopped_at = std::thread::scope(|scope| {
         for _ in 0..8 {
-            scope.spawn(|| ask_until_refused(address, &body, &accepted, &answered));
+            scope.spawn(|| send_until_refused(address, &body, &accepted, &answered));
         }
         while answered.load(Ordering::Relaxed) < 40 {
             std::thread::sleep(Duration::from_millis(1));
         }
-        served.terminate();
+        server.terminate();
         Instant::now()
     });
-    let log = served.ended();
-    assert!(told.elapsed() < Duration::from_secs(20), "{log}");
+    let log = server.wait_for_exit();
+    assert!(stopped_at.elapsed() < Duration::from_secs(20), "{log}");
     assert_eq!(
         accepted.load(Ordering::Relaxed),
         answered.load(Ordering::Relaxed),
@@ -84,16 +84,16 @@ fn sigterm_under_load_answers_every_accepted_request_and_ends_in_time() {
 }
 
 #[test]
-fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
+fn requests_are_counted_by_route_and_logged_with_ids() {
     let dir = tempfile::tempdir().unwrap();
     model(&dir.path().join("models"), "plain", spec(Conditioning::None));
-    let served = Served::start(dir.path(), &["--log-format", "json"]);
+    let server = RunningServer::start(dir.path(), &["--log-format", "json"]);
     for name in ["plain", "a", "b"] {
-        served.get(&format!("/v1/models/{name}"));
+        server.get(&format!("/v1/models/{name}"));
     }
-    served.get("/nothing HTTP/1.1\r\nx-request-id: robot-7\r\nx:");
+    server.get("/nothing HTTP/1.1\r\nx-request-id: robot-7\r\nx:");
     let body = json!({"frames": context()}).to_string();
-    let mut stream = TcpStream::connect(served.address).unwrap();
+    let mut stream = TcpStream::connect(server.address).unwrap();
     write!(
         stream,
         "POST /v1/models/plain/predict HTTP/1.1\r\nhost: a\r\nconnection: close\r\ncontent-type: application/json\r\n\
@@ -102,7 +102,7 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
     )
     .unwrap();
     stream.read_to_end(&mut Vec::new()).unwrap();
-    let metrics = served.get("/metrics");
+    let metrics = server.get("/metrics");
     for line in [
         "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"200\"} 1",
         "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"404\"} 2",
@@ -125,8 +125,8 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
         !metrics.contains("/v1/models/a") && !metrics.contains("/nothing"),
         "{metrics}"
     );
-    served.terminate();
-    let log = served.ended();
+    server.terminate();
+    let log = server.wait_for_exit();
     let entries = log
         .lines()
         .map(|line| serde_json::from_str::<Value>(line).unwrap_or_else(|_| panic!("{line}")));
@@ -144,10 +144,10 @@ fn the_metrics_count_by_route_and_the_log_has_every_requests_id() {
 }
 
 #[test]
-fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
+fn the_healthcheck_exit_code_reports_readiness() {
     let dir = tempfile::tempdir().unwrap();
-    let served = Served::start(dir.path(), &[]);
-    let bind = served.address.to_string();
+    let server = RunningServer::start(dir.path(), &[]);
+    let bind = server.address.to_string();
     let ready = output(dir.path(), &["healthcheck", "--bind", &bind]);
     assert!(ready.status.success(), "{}", text(&ready.stderr));
     let elsewhere = format!("http://{bind}/nothing");
@@ -156,8 +156,8 @@ fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
         (lost.status.code(), text(&lost.stderr).contains("404")),
         (Some(1), true)
     );
-    served.terminate();
-    served.ended();
+    server.terminate();
+    server.wait_for_exit();
     assert_eq!(
         output(dir.path(), &["healthcheck", "--bind", &bind]).status.code(),
         Some(1)
@@ -165,7 +165,7 @@ fn a_health_check_tells_by_its_exit_code_whether_a_server_is_ready() {
 }
 
 #[test]
-fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it() {
+fn a_public_server_requires_an_api_key() {
     let dir = tempfile::tempdir().unwrap();
     let refused = output(dir.path(), &["serve", "--bind", "0.0.0.0:0"]);
     assert_eq!(refused.status.code(), Some(2));
@@ -181,11 +181,11 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
         listed.contains("valid") && listed.contains("robot 7") && !listed.contains(keys[0].trim()),
         "{listed}"
     );
-    let served = Served::start(dir.path(), &["--set", "key_refresh_ms=100"]);
-    assert!(served.get("/v1/models").starts_with("HTTP/1.1 401"));
-    assert!(served.get("/metrics").contains("\nforeframe_auth_refused_total 1\n"));
+    let server = RunningServer::start(dir.path(), &["--set", "key_refresh_ms=100"]);
+    assert!(server.get("/v1/models").starts_with("HTTP/1.1 401"));
+    assert!(server.get("/metrics").contains("\nforeframe_auth_refused_total 1\n"));
     let ask = |key: &str| {
-        served.get(&format!(
+        server.get(&format!(
             "/v1/models HTTP/1.1\r\nauthorization: Bearer {}\r\nx:",
             key.trim()
         ))
@@ -194,24 +194,24 @@ fn a_reachable_server_without_keys_does_not_start_and_one_with_a_key_asks_for_it
     let id = keys[0].split('_').nth(1).unwrap();
     assert!(output(dir.path(), &["keys", "revoke", id]).status.success());
     assert_eq!(output(dir.path(), &["keys", "revoke", id]).status.code(), Some(2));
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     while !ask(&keys[0]).starts_with("HTTP/1.1 401") {
-        assert!(Instant::now() < deadline, "the revoked key is still taken");
+        assert!(Instant::now() < deadline, "the revoked key is still accepted");
     }
     assert!(ask(&keys[1]).starts_with("HTTP/1.1 200"));
-    served.terminate();
-    served.ended();
+    server.terminate();
+    server.wait_for_exit();
 }
 
 #[test]
-fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
+fn invalid_directories_are_refused_at_startup() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("file"), "").unwrap();
-    let none = "; name a directory that holds models, or none to serve those in ./models";
+    let none = "; name a directory that holds models, or leave the setting out to serve those in ./models";
     for (arguments, complaint) in [
         (
-            ["serve", "--models", "modles"],
-            format!("models_dir is \"modles\" (--models), which is not there{none}"),
+            ["serve", "--models-dir", "modles"],
+            format!("models_dir is \"modles\" (--models-dir), which does not exist{none}"),
         ),
         (
             ["worker", "--set", "models_dir=file"],
@@ -219,7 +219,7 @@ fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
         ),
         (
             ["serve", "--data-dir", "file"],
-            "data_dir is \"file\" (--data-dir), which is a file; name a directory, which is made if it is not there"
+            "data_dir is \"file\" (--data-dir), which is a file; name a directory; it is created if it does not exist"
                 .to_owned(),
         ),
     ] {
@@ -229,15 +229,15 @@ fn a_directory_that_cannot_be_right_is_refused_at_the_start() {
             (Some(2), format!("error: {complaint}").as_str())
         );
     }
-    // Without any, it says what to do.
-    let served = Served::start(dir.path(), &[]);
-    assert!(served.get("/v1/models").ends_with("{\"models\":[]}"));
-    served.terminate();
-    assert!(served.ended().contains("no models there; train one by"));
+    // Without models the server starts, and the log says what to do.
+    let server = RunningServer::start(dir.path(), &[]);
+    assert!(server.get("/v1/models").contains("{\"models\":[]"));
+    server.terminate();
+    assert!(server.wait_for_exit().contains("publish a trained model with `foreframe publish DIR`"));
 }
 
 #[test]
-fn the_configuration_is_printed_with_where_it_comes_from() {
+fn the_configuration_is_printed_with_its_sources() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();
     let printed = foreframe(dir.path())
@@ -260,19 +260,97 @@ fn the_configuration_is_printed_with_where_it_comes_from() {
     std::fs::write(dir.path().join("foreframe.toml"), "max_stream = 7\n").unwrap();
     let refused = output(dir.path(), &["serve"]);
     assert_eq!(refused.status.code(), Some(2));
-    assert!(text(&refused.stderr).contains("max_stream (foreframe.toml) is no field"));
+    assert!(text(&refused.stderr).contains("unknown field `max_stream` (foreframe.toml); `foreframe config` lists"));
 }
 
 #[test]
-fn one_thread_for_requests_is_enough_to_check_a_job() {
+fn a_server_listens_on_the_port_and_name_that_it_is_given() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = RunningServer::start(dir.path(), &["--port", "0"]);
+    assert!(server.get("/livez").starts_with("HTTP/1.1 200"));
+    server.terminate();
+    server.wait_for_exit();
+    let named = Program::start(dir.path(), &["serve", "--bind", "localhost:0"]);
+    assert!(
+        named.first_line().contains("http://127.0.0.1:"),
+        "{}",
+        named.first_line()
+    );
+    named.terminate();
+    named.wait_for_exit();
+}
+
+#[test]
+fn the_directory_of_a_model_gives_it_its_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let models = dir.path().join("models");
+    model(&models, "plain", spec(Conditioning::None));
+    std::fs::rename(models.join("plain"), models.join("other")).unwrap();
+    model(&models, "my_model", spec(Conditioning::None));
+    let server = RunningServer::start(dir.path(), &[]);
+    assert!(server.get("/v1/models/other").contains("\"name\":\"other\""));
+    server.terminate();
+    let log = server.wait_for_exit();
+    assert!(log.contains("my_model") && log.contains("is not a valid model name"), "{log}");
+}
+
+#[test]
+fn a_running_server_serves_what_is_published() {
+    let dir = tempfile::tempdir().unwrap();
+    model(&dir.path().join("models"), "plain", spec(Conditioning::None));
+    let server = RunningServer::start(dir.path(), &[]);
+    let run = |arguments: &[&str]| {
+        let done = output(dir.path(), arguments);
+        assert!(done.status.success(), "{arguments:?}: {}", text(&done.stderr));
+        text(&done.stdout)
+    };
+    let wait_for = |model: &str, version: &str| {
+        let deadline = Instant::now() + TIMEOUT;
+        while !server.get(&format!("/v1/models/{model}")).contains(version) {
+            assert!(Instant::now() < deadline, "{model} is not server as {version}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    assert_eq!(
+        run(&["publish", "models/plain", "--name", "mine"]),
+        "published mine@1; it is the active version\n"
+    );
+    wait_for("mine", "\"active_version\":1");
+    assert_eq!(
+        run(&["publish", "models/plain"]),
+        "published plain@2; it is the active version\n"
+    );
+    wait_for("plain", "\"active_version\":2");
+    let listed = run(&["models", "list"]);
+    assert!(
+        listed.contains("mine@1                   active data/models/mine/1\n")
+            && listed.contains("plain@1                         models/plain\n")
+            && listed.contains("plain@2                  active data/models/plain/2\n"),
+        "{listed}"
+    );
+    let refused = output(dir.path(), &["models", "remove", "plain@2"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("is active"));
+    run(&["models", "activate", "plain@1"]);
+    wait_for("plain", "\"active_version\":1");
+    assert_eq!(run(&["models", "remove", "plain@2"]), "removed plain@2\n");
+    assert!(!dir.path().join("data/models/plain/2").exists());
+    assert!(run(&["models", "remove", "mine"]).contains("no version of mine is left"));
+    let refused = output(dir.path(), &["models", "remove", "plain"]);
+    assert!(refused.status.code() == Some(2) && text(&refused.stderr).contains("delete its directory there"));
+    server.terminate();
+    server.wait_for_exit();
+}
+
+#[test]
+fn one_request_thread_is_enough_to_check_a_job() {
     let dir = tempfile::tempdir().unwrap();
     let arguments = ["--objects-url", "objects", "--set", "request_threads=1"];
-    let served = Served::start(dir.path(), &arguments);
+    let server = RunningServer::start(dir.path(), &arguments);
     let job = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "none"});
     for _ in 0..2 {
-        let refused = served.ask("POST", "/v1/jobs", &job);
+        let refused = server.ask("POST", "/v1/jobs", &job);
         assert_eq!(refused["status"], 422, "{refused}");
     }
-    served.terminate();
-    served.ended();
+    server.terminate();
+    server.wait_for_exit();
 }

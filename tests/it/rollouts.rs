@@ -1,4 +1,4 @@
-//! Many futures of one context, and images as files.
+//! Rollouts: many plans from one context. Also predictions from image files in a form.
 
 use std::pin::pin;
 
@@ -12,12 +12,13 @@ use foreframe::server::protocol::Codec;
 use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened, send_frame, step};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
 use crate::service::{
     Answer, CONTEXT, HEIGHT, WIDTH, app, context, frame, model, post, post_text, run, send, slow_spec, start, with_data,
 };
 
 const ROLLOUTS: &str = "/v1/models/moving/rollouts";
+const PLAIN_PREDICT: &str = "/v1/models/plain/predict";
 
 fn candidates(count: usize) -> Vec<Value> {
     (0..count)
@@ -32,8 +33,8 @@ fn pixels(image: &Value) -> Vec<u8> {
     STANDARD.decode(image.as_str().unwrap()).unwrap()
 }
 
-/// The greatest difference of any two pixels.
-fn difference(a: &Value, b: &Value) -> u8 {
+/// The largest absolute difference between two lists of raw images.
+fn largest_pixel_difference(a: &Value, b: &Value) -> u8 {
     let (a, b) = (a.as_array().unwrap(), b.as_array().unwrap());
     assert_eq!(a.len(), b.len());
     let pairs = a.iter().zip(b).flat_map(|(a, b)| pixels(a).into_iter().zip(pixels(b)));
@@ -41,7 +42,7 @@ fn difference(a: &Value, b: &Value) -> u8 {
 }
 
 #[tokio::test]
-async fn hundreds_of_candidates_come_to_what_each_would_alone() {
+async fn batched_rollouts_equal_single_predictions() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let raw: Vec<String> = (0..CONTEXT as u8)
@@ -55,13 +56,13 @@ async fn hundreds_of_candidates_come_to_what_each_would_alone() {
     for index in [0, 1, 150, 299] {
         let body = json!({"frames": raw, "format": "raw", "state": [0.5], "future_actions": candidates[index]});
         let alone = post(&app, "/v1/models/moving/predict", &body).await.json();
-        assert!(difference(&futures[index], &alone["frames"]) <= 1);
+        assert!(largest_pixel_difference(&futures[index], &alone["frames"]) <= 1);
     }
-    assert!(difference(&futures[0], &futures[299]) > 0);
+    assert!(largest_pixel_difference(&futures[0], &futures[299]) > 0);
 }
 
 #[tokio::test]
-async fn others_are_answered_while_hundreds_of_candidates_are_computed() {
+async fn other_requests_are_answered_during_a_large_rollout() {
     let dir = tempfile::tempdir().unwrap();
     let spec = ModelSpec {
         conditioning: Conditioning::StateAction,
@@ -79,21 +80,21 @@ async fn others_are_answered_while_hundreds_of_candidates_are_computed() {
             answer = post(&app, "/v1/models/slow/predict", &single) => answered += usize::from(answer.status == 200),
         }
     }
-    // Were they computed in one go, one prediction would fit before and one would wait for the end.
+    // If the rollout ran as one batch, only one or two single predictions could be answered.
     assert!(answered > 4, "{answered} answered");
 }
 
 #[tokio::test]
-async fn rollouts_can_be_looked_at() {
+async fn rollouts_are_answered_as_png_or_gif() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let body = |count| json!({"frames": context(), "state": [0.5], "candidates": candidates(count)}).to_string();
     let sheet = post_text(&app, ROLLOUTS, body(4), "image/png").await;
     let sheet = codec::decode(&sheet.body).unwrap();
     assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 5 * HEIGHT);
-    let film = post_text(&app, ROLLOUTS, body(4), "image/gif").await;
-    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, ROLLOUTS, body(4), "image/gif").await;
+    assert_eq!(gif.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(gif.body.starts_with(b"GIF89a"));
     let many = post_text(&app, ROLLOUTS, body(400), "image/png").await;
     assert_eq!(
         many.detail(406),
@@ -102,7 +103,7 @@ async fn rollouts_can_be_looked_at() {
 }
 
 #[tokio::test]
-async fn candidates_that_do_not_fit_are_refused_by_field() {
+async fn invalid_candidates_are_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_candidates: 8,
@@ -115,7 +116,7 @@ async fn candidates_that_do_not_fit_are_refused_by_field() {
         (
             with(json!([])),
             422,
-            "candidates is empty; give at least one sequence of future actions",
+            "candidates is empty; give at least one plan",
         ),
         (
             with(json!([[[0, 0]]])),
@@ -135,23 +136,26 @@ async fn candidates_that_do_not_fit_are_refused_by_field() {
         (
             with(json!(candidates(5))),
             413,
-            "the futures would be 1920 bytes of images; this server predicts at most 1536 for a request",
+            "the rollouts would be 1920 bytes of images; this server predicts at most 1536 in a request",
         ),
     ] {
         assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
     }
-    let untold = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
+    let unconditioned = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
         .await
         .detail(422);
-    assert!(untold.starts_with("model \"plain\" takes no actions"), "{untold}");
+    assert!(
+        unconditioned.starts_with("model \"plain\" takes no actions"),
+        "{unconditioned}"
+    );
 }
 
 #[tokio::test]
-async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
+async fn session_rollouts_equal_stateless_rollouts() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &json!({"model": "moving"})).await;
+    let session = SessionHandle::open(&app, &json!({"model": "moving"})).await;
     let path = session.path("/rollouts");
     let body = json!({"candidates": candidates(20), "format": "raw"});
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
@@ -161,15 +165,15 @@ async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
         let early = post(&app, &path, &body).await.detail(409);
         assert_eq!(
             early,
-            format!("the session has {seq} frames of the 3 that a prediction takes; send it more")
+            format!("the session has {seq} of the 3 frames that a prediction takes; send more frames")
         );
-        client.ask(&send_frame(seq)).await;
+        client.ask(&numbered_message(seq)).await;
     }
     let futures = post(&app, &path, &body).await.json();
     let raw: Vec<String> = (0..CONTEXT as u64)
-        .map(|seq| STANDARD.encode(&step(seq).image.0))
+        .map(|seq| STANDARD.encode(&numbered_frame(seq).image.0))
         .collect();
-    let state = step(CONTEXT as u64 - 1).state;
+    let state = numbered_frame(CONTEXT as u64 - 1).state;
     let stateless = json!({"frames": raw, "format": "raw", "state": state, "candidates": candidates(20)});
     let stateless = post(&app, ROLLOUTS, &stateless).await.json();
     for (found, expected) in futures["futures"]
@@ -178,10 +182,10 @@ async fn a_session_is_asked_for_futures_and_stays_where_it_is() {
         .iter()
         .zip(stateless["futures"].as_array().unwrap())
     {
-        assert!(difference(found, expected) <= 1);
+        assert!(largest_pixel_difference(found, expected) <= 1);
     }
-    let film = post_text(&app, &path, body.to_string(), "image/gif").await;
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, &path, body.to_string(), "image/gif").await;
+    assert!(gif.body.starts_with(b"GIF89a"));
     drop(client);
     server.stop().await;
 }
@@ -200,30 +204,35 @@ async fn post_form(app: &App, path: &str, parts: &[(&str, &[u8])]) -> Answer {
 }
 
 #[tokio::test]
-async fn image_files_in_a_form_are_predicted_as_the_same_in_json() {
+async fn multipart_and_json_give_the_same_prediction() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let files: Vec<Vec<u8>> = (0..CONTEXT as u8)
+        .map(|i| codec::encode_png(&frame(i * 10)).unwrap())
+        .collect();
+    let mut parts: Vec<(&str, &[u8])> = files.iter().map(|file| ("frames", file.as_slice())).collect();
+    let plain = PLAIN_PREDICT;
+    let by_json = post(&app, plain, &json!({"frames": context()})).await.json();
+    assert_eq!(post_form(&app, plain, &parts).await.json()["frames"], by_json["frames"]);
+
+    let inputs = json!({"state": [0.5], "actions": [[1.0, 2.0]]});
+    let mut body = inputs.clone();
+    body["frames"] = json!(context());
+    let by_json = post(&app, "/v1/models/moving/predict", &body).await.json();
+    let inputs = inputs.to_string();
+    parts.push(("request", inputs.as_bytes()));
+    let by_form = post_form(&app, "/v1/models/moving/predict", &parts).await.json();
+    assert_eq!(by_form["frames"], by_json["frames"]);
+}
+
+#[tokio::test]
+async fn invalid_multipart_forms_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_frames: 4,
         ..ServerConfig::default()
     };
-    let app = app(dir.path(), config);
-    let files: Vec<Vec<u8>> = (0..CONTEXT as u8)
-        .map(|i| codec::encode_png(&frame(i * 10)).unwrap())
-        .collect();
-    let mut parts: Vec<(&str, &[u8])> = files.iter().map(|file| ("frames", file.as_slice())).collect();
-    let plain = "/v1/models/plain/predict";
-    let by_json = post(&app, plain, &json!({"frames": context()})).await.json();
-    assert_eq!(post_form(&app, plain, &parts).await.json()["frames"], by_json["frames"]);
-
-    let told = json!({"state": [0.5], "actions": [[1.0, 2.0]]});
-    let mut body = told.clone();
-    body["frames"] = json!(context());
-    let by_json = post(&app, "/v1/models/moving/predict", &body).await.json();
-    let told = told.to_string();
-    parts.push(("request", told.as_bytes()));
-    let by_form = post_form(&app, "/v1/models/moving/predict", &parts).await.json();
-    assert_eq!(by_form["frames"], by_json["frames"]);
-
+    let (app, plain) = (app(dir.path(), config), PLAIN_PREDICT);
     let odd = post_form(&app, plain, &[("image", &b"x"[..])]).await.detail(422);
     assert_eq!(odd, "the form has a part \"image\"; there are frames and request");
     let many = post_form(&app, plain, &[("frames", &b"x"[..]); 5]).await.detail(413);

@@ -1,4 +1,4 @@
-//! Predictions over HTTP: answers, refusals by field, limits, and the end of the server.
+//! Predictions over HTTP: responses, refusals, limits and shutdown.
 
 use axum::http::header;
 use base64::Engine as _;
@@ -20,7 +20,7 @@ const PLAIN: &str = "/v1/models/plain/predict";
 const MOVING: &str = "/v1/models/moving/predict";
 
 #[tokio::test]
-async fn a_prediction_over_http_is_the_librarys() {
+async fn http_predictions_equal_library_predictions() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let loaded = model(dir.path(), "plain", spec(Conditioning::None));
@@ -43,7 +43,7 @@ async fn a_prediction_over_http_is_the_librarys() {
 }
 
 #[tokio::test]
-async fn raw_images_are_answered_by_raw_images() {
+async fn raw_frames_are_answered_with_raw_frames() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let raw: Vec<String> = (0..CONTEXT as u8)
@@ -60,7 +60,7 @@ async fn raw_images_are_answered_by_raw_images() {
 }
 
 #[tokio::test]
-async fn the_last_action_is_held_where_no_future_actions_are_given() {
+async fn without_future_actions_the_last_action_repeats() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let ask = async |actions: Value, future: Value, state: Value| {
@@ -84,7 +84,7 @@ async fn the_last_action_is_held_where_no_future_actions_are_given() {
 }
 
 #[tokio::test]
-async fn pictures_are_given_where_asked_for() {
+async fn the_accept_header_selects_png_or_gif() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let body = json!({"frames": context()}).to_string();
@@ -92,9 +92,9 @@ async fn pictures_are_given_where_asked_for() {
     assert_eq!(sheet.headers[header::CONTENT_TYPE], "image/png");
     let sheet = codec::decode(&sheet.body).unwrap();
     assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 2 * HEIGHT);
-    let film = post_text(&app, PLAIN, body.clone(), "image/gif").await;
-    assert_eq!(film.headers[header::CONTENT_TYPE], "image/gif");
-    assert!(film.body.starts_with(b"GIF89a"));
+    let gif = post_text(&app, PLAIN, body.clone(), "image/gif").await;
+    assert_eq!(gif.headers[header::CONTENT_TYPE], "image/gif");
+    assert!(gif.body.starts_with(b"GIF89a"));
     let refused = post_text(&app, PLAIN, body, "text/csv").await.detail(406);
     assert!(
         refused.contains("application/json, image/png and image/gif"),
@@ -103,7 +103,7 @@ async fn pictures_are_given_where_asked_for() {
 }
 
 #[tokio::test]
-async fn what_does_not_fit_the_model_is_refused_by_field() {
+async fn mismatched_inputs_are_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let large = png(&Frame::new(80, 60, vec![0; 4800]).unwrap());
@@ -117,7 +117,7 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
         (
             PLAIN,
             json!({"frames": with_large}),
-            "frames[2] is 80×60 px; model \"plain\" takes 16×12",
+            "frames[2] is 80×60 px; model \"plain\" takes 16×12; set fit to crop, letterbox or stretch to resize it",
         ),
         (
             PLAIN,
@@ -180,7 +180,7 @@ async fn what_does_not_fit_the_model_is_refused_by_field() {
 }
 
 #[tokio::test]
-async fn a_body_or_a_list_over_its_limit_is_refused() {
+async fn bodies_and_lists_over_their_limit_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_body_bytes: 4096,
@@ -197,7 +197,7 @@ async fn a_body_or_a_list_over_its_limit_is_refused() {
 }
 
 #[tokio::test]
-async fn a_full_queue_is_answered_with_when_to_try_again() {
+async fn a_full_queue_is_answered_503_with_retry_after() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_queued_predictions: 1,
@@ -211,13 +211,16 @@ async fn a_full_queue_is_answered_with_when_to_try_again() {
     let refused: Vec<_> = answers.iter().filter(|answer| answer.status != 200).collect();
     assert!(!refused.is_empty() && refused.len() < answers.len());
     for answer in refused {
-        assert_eq!(answer.detail(503), "1 predictions wait already; try again in 1 s");
+        assert_eq!(
+            answer.detail(503),
+            "1 predictions are waiting already; try again in 1 s"
+        );
         assert_eq!(answer.headers[header::RETRY_AFTER], "1");
     }
 }
 
 #[tokio::test]
-async fn a_prediction_past_its_deadline_is_refused() {
+async fn a_prediction_past_its_deadline_is_answered_503() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         prediction_deadline_ms: 1,
@@ -233,7 +236,7 @@ async fn a_prediction_past_its_deadline_is_refused() {
 }
 
 #[tokio::test]
-async fn a_connection_over_the_limit_is_told_so_and_closed() {
+async fn a_connection_over_the_limit_is_answered_503() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_connections: 1,
@@ -261,7 +264,7 @@ async fn a_connection_over_the_limit_is_told_so_and_closed() {
 }
 
 #[tokio::test]
-async fn half_a_body_is_not_waited_for_for_ever() {
+async fn reading_an_incomplete_body_times_out() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         request_deadline_ms: 50,
@@ -280,7 +283,7 @@ async fn half_a_body_is_not_waited_for_for_ever() {
 }
 
 #[tokio::test]
-async fn an_accepted_request_is_answered_while_the_server_stops() {
+async fn an_accepted_request_is_answered_during_shutdown() {
     let dir = tempfile::tempdir().unwrap();
     let config = with_data(dir.path(), ServerConfig::default());
     let app = start(config, vec![model(dir.path(), "slow", slow_spec())]);
@@ -293,16 +296,16 @@ async fn an_accepted_request_is_answered_while_the_server_stops() {
     );
     let mut client = TcpStream::connect(server.address).await.unwrap();
     client.write_all(head.as_bytes()).await.unwrap();
-    let mut go_on = [0; 25];
-    client.read_exact(&mut go_on).await.unwrap();
-    assert_eq!(&go_on, b"HTTP/1.1 100 Continue\r\n\r\n");
-    // The request has been taken; only its body is missing.
+    let mut interim = [0; 25];
+    client.read_exact(&mut interim).await.unwrap();
+    assert_eq!(&interim, b"HTTP/1.1 100 Continue\r\n\r\n");
+    // The server has accepted the request; only its body is missing.
     server.shutdown.send(()).unwrap();
     client.write_all(body.as_bytes()).await.unwrap();
     let mut answer = String::new();
     client.read_to_string(&mut answer).await.unwrap();
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    tokio::time::timeout(crate::service::PATIENCE, server.task)
+    tokio::time::timeout(crate::service::TIMEOUT, server.task)
         .await
         .unwrap()
         .unwrap();
@@ -310,13 +313,13 @@ async fn an_accepted_request_is_answered_while_the_server_stops() {
 }
 
 #[tokio::test]
-async fn the_context_of_a_simulated_trial_and_its_prediction_can_be_looked_at() {
+async fn a_model_has_a_preview_picture() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let preview = get(&app, "/v1/models/plain/preview.png").await;
     assert_eq!(preview.status, 200, "{}", String::from_utf8_lossy(&preview.body));
     assert!(codec::decode(&preview.body).unwrap().height() > 3 * HEIGHT);
-    let misfit = get(&app, "/v1/models/moving/preview.png").await.detail(422);
-    assert_eq!(misfit, "state holds 6 numbers; model \"moving\" takes 1: x m");
+    let mismatch = get(&app, "/v1/models/moving/preview.png").await.detail(422);
+    assert_eq!(mismatch, "state holds 6 numbers; model \"moving\" takes 1: x m");
     assert_eq!(HORIZON, 2);
 }

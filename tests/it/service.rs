@@ -1,4 +1,4 @@
-//! What the tests of the service share: small models with random weights, requests, and a running server.
+//! Shared by the tests of the service: small models with random weights, requests, and a running server.
 
 use std::path::Path;
 use std::sync::LazyLock;
@@ -26,8 +26,8 @@ pub(crate) const WIDTH: u32 = 16;
 pub(crate) const HEIGHT: u32 = 12;
 pub(crate) const CONTEXT: usize = 3;
 pub(crate) const HORIZON: usize = 2;
-/// Longer than anything here takes.
-pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
+/// Time limit of every wait: longer than any step of a test takes.
+pub(crate) const TIMEOUT: Duration = Duration::from_mins(1);
 
 pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
@@ -50,7 +50,7 @@ pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     }
 }
 
-/// A model that takes long enough to compute that others queue behind it.
+/// A model so slow that requests queue behind one prediction.
 pub(crate) fn slow_spec() -> ModelSpec {
     ModelSpec {
         features: 64,
@@ -80,13 +80,13 @@ pub(crate) fn app(dir: &Path, config: ServerConfig) -> App {
     start(with_data(dir, config), models)
 }
 
-/// With a store in the data directory.
+/// Starts the service with a store in the data directory.
 pub(crate) fn start(config: ServerConfig, models: Vec<LoadedModel>) -> App {
     let store = store(&config.data_dir);
     App::start(config, models, store).unwrap()
 }
 
-/// The store of a data directory, opened on a runtime of its own, since this is no async function.
+/// The store of a data directory. It is opened on a separate runtime, because this function is not async.
 pub(crate) fn store(dir: &Path) -> Store {
     static RUNTIME: LazyLock<Runtime> = LazyLock::new(|| Runtime::new().unwrap());
     let config = StoreConfig {
@@ -129,7 +129,7 @@ impl Answer {
         serde_json::from_slice(&self.body).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&self.body)))
     }
 
-    /// The detail of a problem, whose shape is checked.
+    /// Checks the shape of a problem response and returns its detail.
     pub(crate) fn detail(&self, status: u16) -> String {
         assert_eq!(self.status, status, "{}", String::from_utf8_lossy(&self.body));
         assert_eq!(self.headers[header::CONTENT_TYPE], "application/problem+json");
@@ -172,42 +172,42 @@ pub(crate) async fn post_text(app: &App, path: &str, body: String, accept: &str)
     send(app, request).await
 }
 
-/// A server on a port of its own.
-pub(crate) struct Running {
+/// A server in this process, on a free port.
+pub(crate) struct InProcessServer {
     pub(crate) address: std::net::SocketAddr,
     pub(crate) shutdown: oneshot::Sender<()>,
     pub(crate) task: JoinHandle<()>,
 }
 
-pub(crate) async fn run(app: App) -> Running {
+pub(crate) async fn run(app: App) -> InProcessServer {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let (shutdown, asked) = oneshot::channel();
+    let (shutdown, requested) = oneshot::channel();
     let task = tokio::spawn(server::serve(listener, app, async move {
-        let _ = asked.await;
+        let _ = requested.await;
     }));
-    Running {
+    InProcessServer {
         address,
         shutdown,
         task,
     }
 }
 
-impl Running {
+impl InProcessServer {
     pub(crate) async fn stop(self) {
         let _ = self.shutdown.send(());
-        tokio::time::timeout(PATIENCE, self.task).await.unwrap().unwrap();
+        tokio::time::timeout(TIMEOUT, self.task).await.unwrap().unwrap();
     }
 }
 
-/// Asks again and again until the answer is `Some`.
-pub(crate) async fn until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + PATIENCE;
+/// Calls `ask` repeatedly until it returns `Some`.
+pub(crate) async fn poll_until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + TIMEOUT;
     loop {
         if let Some(answer) = ask().await {
             return answer;
         }
-        assert!(Instant::now() < deadline, "nothing within {PATIENCE:?}");
+        assert!(Instant::now() < deadline, "no result within {TIMEOUT:?}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }

@@ -1,50 +1,56 @@
-//! The frames of a session: their order, gaps, those sent twice, ahead, or overtaken by newer ones, and sockets that go in between.
+//! The frames of a session: order, gaps, repeated, pipelined and overtaken frames, and lost connections.
 
 use foreframe::server::protocol::{
     ClientMessage, CloseMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, OnGap, OnLate, ServerMessage,
+    SessionSettings,
 };
 use foreframe::server::{ImageFormat, ServerConfig};
 use proptest::prelude::*;
 use serde_json::json;
 
-use crate::client::{Client, Opened, send_frame, step};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
 use crate::service::{app, get, post, run};
 use crate::sessions::{code, frames, moving};
 
 #[tokio::test]
-async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() {
+async fn on_gap_skip_accepts_a_gap_and_reports_it() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
-    assert_eq!(code(&client.ask(&send_frame(2)).await), (ErrorCode::Gap, 0));
+    assert_eq!(code(&client.ask(&numbered_message(2)).await), (ErrorCode::Gap, 0));
     let configure = ClientMessage::Configure(ConfigureMessage {
         on_gap: Some(OnGap::Skip),
         on_late: None,
         format: Some(ImageFormat::Png),
+        fit: None,
     });
-    let configured = ServerMessage::Configured {
+    let configured = ServerMessage::Configured(SessionSettings {
         on_gap: OnGap::Skip,
         on_late: OnLate::Predict,
         format: Some(ImageFormat::Png),
-    };
+        fit: None,
+    });
     assert_eq!(client.ask(&configure).await, configured);
     for (seq, expected) in [(2, 2), (3, 0), (5, 1)] {
-        let answer = client.ask(&send_frame(seq)).await;
+        let answer = client.ask(&numbered_message(seq)).await;
         let (ServerMessage::Buffering { skipped, .. } | ServerMessage::Prediction { skipped, .. }) = answer else {
             panic!("{answer:?}")
         };
         assert_eq!(skipped, expected);
     }
-    let ServerMessage::Prediction { format, frames, .. } = client.ask(&send_frame(6)).await else {
+    let ServerMessage::Prediction { format, frames, .. } = client.ask(&numbered_message(6)).await else {
         panic!()
     };
     assert_eq!(format, ImageFormat::Png);
     assert!(frames[0].0.starts_with(b"\x89PNG"));
-    assert_eq!(code(&client.ask(&send_frame(u64::MAX)).await), (ErrorCode::Invalid, 7));
+    assert_eq!(
+        code(&client.ask(&numbered_message(u64::MAX)).await),
+        (ErrorCode::Invalid, 7)
+    );
     let settings = get(&app, &session.path("/state")).await.json();
     assert_eq!(
         (&settings["on_gap"], &settings["format"]),
@@ -54,12 +60,15 @@ async fn a_gap_is_skipped_where_the_client_asks_for_it_and_the_answer_says_so() 
 }
 
 #[tokio::test]
-async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from() {
+async fn on_late_skip_predicts_only_from_the_newest_frame() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let (skipping, predicting) = (Opened::open(&app, &moving()).await, Opened::open(&app, &moving()).await);
-    let connect = async |session: &Opened| {
+    let (skipping, predicting) = (
+        SessionHandle::open(&app, &moving()).await,
+        SessionHandle::open(&app, &moving()).await,
+    );
+    let connect = async |session: &SessionHandle| {
         let client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack).await;
         client.unwrap()
     };
@@ -68,32 +77,31 @@ async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from
         on_late: Some(OnLate::Skip),
         ..ConfigureMessage::default()
     });
-    let configured = ServerMessage::Configured {
-        on_gap: OnGap::Error,
+    let configured = ServerMessage::Configured(SessionSettings {
         on_late: OnLate::Skip,
-        format: None,
-    };
+        ..SessionSettings::default()
+    });
     assert_eq!(skipped.ask(&configure).await, configured);
     let count = 200;
     for seq in 0..count {
-        skipped.send(&send_frame(seq)).await;
+        skipped.send(&numbered_message(seq)).await;
     }
-    // What is sent again overtakes nothing.
-    skipped.send(&send_frame(count - 1)).await;
+    // A repeated frame overtakes nothing.
+    skipped.send(&numbered_message(count - 1)).await;
     let (mut overtaken, mut in_a_row) = (0, 0);
     for expected in 0..count {
-        let from_all = predicted.ask(&send_frame(expected)).await;
+        let from_all = predicted.ask(&numbered_message(expected)).await;
         let answer = skipped.receive().await;
         match &answer {
             ServerMessage::Overtaken { seq, timestamp_us, .. } => {
-                assert_eq!((*seq, *timestamp_us), (expected, step(expected).timestamp_us));
+                assert_eq!((*seq, *timestamp_us), (expected, numbered_frame(expected).timestamp_us));
                 overtaken += 1;
                 in_a_row += 1;
                 assert!(in_a_row <= ServerConfig::default().max_pipelined_frames);
             }
             ServerMessage::Buffering { seq, .. } => assert_eq!(*seq, expected),
             _ => {
-                // From the same context, whatever was predicted on the way.
+                // Overtaken frames are part of the context too.
                 assert_eq!(frames(&answer), frames(&from_all));
                 in_a_row = 0;
             }
@@ -109,16 +117,16 @@ async fn what_newer_frames_overtake_is_taken_in_and_the_newest_is_predicted_from
 }
 
 #[tokio::test]
-async fn frames_sent_ahead_of_their_answers_are_answered_in_order() {
+async fn pipelined_frames_are_answered_in_order() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
     for seq in 0..100 {
-        client.send(&send_frame(seq)).await;
+        client.send(&numbered_message(seq)).await;
     }
     client.send(&ClientMessage::Close(CloseMessage {})).await;
     for expected in 0..100 {
@@ -133,64 +141,67 @@ async fn frames_sent_ahead_of_their_answers_are_answered_in_order() {
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Mishap {
-    /// The next frame as it should be.
+enum NetworkFault {
+    /// No fault: the next frame.
     Next,
-    /// One of the last frames once more.
+    /// One of the last frames is repeated.
     Twice(u64),
-    /// A frame that leaves others out.
+    /// Frames are skipped.
     Ahead(u64),
-    /// Two frames the wrong way round.
+    /// Two frames in the wrong order.
     Swapped,
-    /// The socket goes without a word.
+    /// The connection is lost.
     Lost,
-    /// The socket goes after a frame was sent and before its answer came.
+    /// The connection is lost after a frame was sent and before its answer arrives.
     LostAfter,
 }
 
-fn mishap() -> impl Strategy<Value = Mishap> {
+fn fault() -> impl Strategy<Value = NetworkFault> {
     prop_oneof![
-        4 => Just(Mishap::Next),
-        2 => (0u64..4).prop_map(Mishap::Twice),
-        1 => (1u64..4).prop_map(Mishap::Ahead),
-        1 => Just(Mishap::Swapped),
-        1 => Just(Mishap::Lost),
-        1 => Just(Mishap::LostAfter),
+        4 => Just(NetworkFault::Next),
+        2 => (0u64..4).prop_map(NetworkFault::Twice),
+        1 => (1u64..4).prop_map(NetworkFault::Ahead),
+        1 => Just(NetworkFault::Swapped),
+        1 => Just(NetworkFault::Lost),
+        1 => Just(NetworkFault::LostAfter),
     ]
 }
 
-async fn suffer(mishaps: &[Mishap]) -> Result<(), TestCaseError> {
+async fn run_with_faults(faults: &[NetworkFault]) -> Result<(), TestCaseError> {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let path = session.path("/stream");
     let connect = async || Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
     let mut client = connect().await;
     let mut next = 0;
-    for mishap in mishaps {
-        match *mishap {
-            Mishap::Next => {
-                client.ask(&send_frame(next)).await;
+    for fault in faults {
+        match *fault {
+            NetworkFault::Next => {
+                client.ask(&numbered_message(next)).await;
                 next += 1;
             }
-            Mishap::Twice(back) if next > 0 => {
-                client.ask(&send_frame((next - 1).saturating_sub(back))).await;
+            NetworkFault::Twice(back) if next > 0 => {
+                client.ask(&numbered_message((next - 1).saturating_sub(back))).await;
             }
-            Mishap::Twice(_) => {}
-            Mishap::Ahead(by) => {
-                prop_assert_eq!(code(&client.ask(&send_frame(next + by)).await), (ErrorCode::Gap, next));
+            NetworkFault::Twice(_) => {}
+            NetworkFault::Ahead(by) => {
+                prop_assert_eq!(
+                    code(&client.ask(&numbered_message(next + by)).await),
+                    (ErrorCode::Gap, next)
+                );
             }
-            Mishap::Swapped => {
-                client.ask(&send_frame(next + 1)).await;
-                client.ask(&send_frame(next)).await;
+            NetworkFault::Swapped => {
+                client.ask(&numbered_message(next + 1)).await;
+                client.ask(&numbered_message(next)).await;
                 next += 1;
             }
-            Mishap::Lost => client = connect().await,
-            Mishap::LostAfter => {
-                client.send(&send_frame(next)).await;
+            NetworkFault::Lost => client = connect().await,
+            NetworkFault::LostAfter => {
+                client.send(&numbered_message(next)).await;
                 client = connect().await;
-                // It was taken or it was not; the server says which.
+                // The server says whether it accepted the frame.
                 prop_assert!(client.next_seq == next || client.next_seq == next + 1);
                 next = client.next_seq;
             }
@@ -198,12 +209,12 @@ async fn suffer(mishaps: &[Mishap]) -> Result<(), TestCaseError> {
         let described = get(&app, &format!("/v1/sessions/{}", session.id)).await.json();
         prop_assert_eq!(&described["next_seq"], next);
     }
-    let reference = Opened::open(&app, &moving()).await;
+    let reference = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &reference.path("/stream"), Codec::Json)
         .await
         .unwrap();
     for seq in 0..next {
-        client.ask(&send_frame(seq)).await;
+        client.ask(&numbered_message(seq)).await;
     }
     let (found, expected) = (
         get(&app, &session.path("/state")).await,
@@ -219,14 +230,14 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn duplicates_reorders_drops_and_reconnects_end_in_the_state_of_the_reference(
-        mishaps in proptest::collection::vec(mishap(), 1..24),
+    fn network_faults_do_not_change_the_session_state(
+        faults in proptest::collection::vec(fault(), 1..24),
     ) {
-        tokio::runtime::Runtime::new().unwrap().block_on(suffer(&mishaps))?;
+        tokio::runtime::Runtime::new().unwrap().block_on(run_with_faults(&faults))?;
     }
 
     #[test]
-    fn no_body_opens_a_session_by_accident_or_breaks_the_server(
+    fn random_session_bodies_never_cause_a_server_error(
         pointer in prop_oneof![
             Just(""), Just("/state"), Just("/state/memory"), Just("/state/memory/features"), Just("/state/memory/features/0"),
             Just("/state/memory/next_seq"), Just("/state/memory/actions"), Just("/state/version"), Just("/model"),
@@ -239,7 +250,7 @@ proptest! {
         tokio::runtime::Runtime::new().unwrap().block_on(async {
             let dir = tempfile::tempdir().unwrap();
             let app = app(dir.path(), ServerConfig::default());
-            let session = Opened::open(&app, &moving()).await;
+            let session = SessionHandle::open(&app, &moving()).await;
             let mut body = json!({"model": "moving", "state": get(&app, &session.path("/state")).await.json()});
             body["state"]["memory"]["features"] = json!([vec![0.0; 8]]);
             if let Some(place) = body.pointer_mut(pointer) {
@@ -253,17 +264,17 @@ proptest! {
 }
 
 #[tokio::test]
-async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
+async fn a_truncated_frame_is_ignored() {
     use tokio::io::AsyncWriteExt as _;
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
-    client.ask(&send_frame(0)).await;
-    // The head of a masked binary message of 200 bytes, and three of them.
+    client.ask(&numbered_message(0)).await;
+    // The header of a masked binary message of 200 bytes, and its first three bytes.
     client
         .socket
         .get_mut()
@@ -276,27 +287,27 @@ async fn a_frame_cut_off_in_the_middle_is_as_if_it_had_not_been_sent() {
         .unwrap();
     assert_eq!(client.next_seq, 1);
     assert!(matches!(
-        client.ask(&send_frame(1)).await,
+        client.ask(&numbered_message(1)).await,
         ServerMessage::Buffering { have: 2, .. }
     ));
     server.stop().await;
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was() {
+async fn an_invalid_frame_does_not_change_the_session() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
     let before = get(&app, &session.path("/state")).await.json();
-    // A PNG that states 60,000 × 60,000 pixels in its first bytes.
-    let mut liar = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\0\0\0\0".to_vec();
-    liar.extend([0; 64]);
+    // A PNG whose header states 60,000 × 60,000 pixels.
+    let mut oversized_png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\0\0\0\0".to_vec();
+    oversized_png.extend([0; 64]);
     let changed = |change: &dyn Fn(&mut foreframe::server::protocol::FrameMessage)| {
-        let mut message = step(0);
+        let mut message = numbered_frame(0);
         change(&mut message);
         ClientMessage::Frame(message)
     };
@@ -321,7 +332,7 @@ async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was()
         (changed(&|m| m.image.0.truncate(5)), "image holds 5 raw bytes"),
         (
             changed(&|m| {
-                m.image.0.clone_from(&liar);
+                m.image.0.clone_from(&oversized_png);
                 m.format = ImageFormat::Png;
             }),
             "image is",
@@ -343,7 +354,7 @@ async fn what_is_wrong_with_a_frame_is_said_and_the_session_stays_where_it_was()
     assert_eq!(code(&client.receive().await), (ErrorCode::Malformed, 0));
     assert_eq!(get(&app, &session.path("/state")).await.json(), before);
     assert!(matches!(
-        client.ask(&send_frame(0)).await,
+        client.ask(&numbered_message(0)).await,
         ServerMessage::Buffering { have: 1, .. }
     ));
     server.stop().await;

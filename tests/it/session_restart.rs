@@ -1,4 +1,4 @@
-//! The program itself, killed in the middle of a stream.
+//! A server process that is killed during a stream.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -10,17 +10,17 @@ use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMess
 use foreframe::server::{ImageBytes, ImageFormat};
 use serde_json::{Value, json};
 
-use crate::client::{Client, Opened};
+use crate::client::{Client, SessionHandle};
 
-struct Server {
+struct KillableServer {
     child: Child,
     address: SocketAddr,
 }
 
-impl Server {
+impl KillableServer {
     fn start(data_dir: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
-            .args(["serve", "--bind", "127.0.0.1:0", "--models", "models", "--data-dir"])
+            .args(["serve", "--bind", "127.0.0.1:0", "--models-dir", "models", "--data-dir"])
             .arg(data_dir)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
             .stdout(Stdio::piped())
@@ -57,14 +57,14 @@ impl Server {
         serde_json::from_str(body).unwrap()
     }
 
-    /// As `kill -9` does.
+    /// Kills the process with SIGKILL.
     fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
 }
 
-impl Drop for Server {
+impl Drop for KillableServer {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -74,8 +74,8 @@ impl Drop for Server {
 fn frame(seq: u64) -> ClientMessage {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/frames");
     let image = std::fs::read(dir.join(format!("frame-{seq:03}.png"))).unwrap();
-    let told: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
-    let numbers = |field: &str| serde_json::from_value(told[field][seq as usize].clone()).unwrap();
+    let recorded: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
+    let numbers = |field: &str| serde_json::from_value(recorded[field][seq as usize].clone()).unwrap();
     ClientMessage::Frame(FrameMessage {
         seq,
         timestamp_us: 0,
@@ -95,11 +95,11 @@ fn images(answer: ServerMessage) -> Vec<ImageBytes> {
 }
 
 #[tokio::test]
-async fn a_killed_servers_last_exported_state_predicts_in_another_as_if_nothing_had_been() {
+async fn an_exported_state_outlives_a_killed_server() {
     let dir = tempfile::tempdir().unwrap();
-    let mut first = Server::start(&dir.path().join("first"));
-    let open = |server: &Server, body: &Value| Opened::of(&server.ask("POST", "/v1/sessions", body));
-    let connect = async |server: &Server, session: &Opened| {
+    let mut first = KillableServer::start(&dir.path().join("first"));
+    let open = |server: &KillableServer, body: &Value| SessionHandle::of(&server.ask("POST", "/v1/sessions", body));
+    let connect = async |server: &KillableServer, session: &SessionHandle| {
         Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
             .await
             .unwrap()
@@ -110,12 +110,12 @@ async fn a_killed_servers_last_exported_state_predicts_in_another_as_if_nothing_
         client.ask(&frame(seq)).await;
     }
     let state = first.ask("GET", &session.path("/state"), &Value::Null);
-    let unbroken = images(client.ask(&frame(8)).await);
+    let expected = images(client.ask(&frame(8)).await);
     first.kill();
 
-    let second = Server::start(&dir.path().join("second"));
+    let second = KillableServer::start(&dir.path().join("second"));
     let session = open(&second, &json!({"state": state}));
     let mut client = connect(&second, &session).await;
     assert_eq!(client.next_seq, 8);
-    assert_eq!(images(client.ask(&frame(8)).await), unbroken);
+    assert_eq!(images(client.ask(&frame(8)).await), expected);
 }

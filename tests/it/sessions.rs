@@ -1,4 +1,4 @@
-//! Sessions: what outlives a socket, what a number sent twice means, and who may ask.
+//! Sessions: reconnection, expiry, access tokens, and export and import of their state.
 
 use std::time::Duration;
 
@@ -9,8 +9,8 @@ use foreframe::server::protocol::{ClosingReason, Codec, ErrorCode, ServerMessage
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Error;
 
-use crate::client::{Client, Opened, send_frame};
-use crate::service::{CONTEXT, app, get, post, run, send, until};
+use crate::client::{Client, SessionHandle, numbered_message};
+use crate::service::{CONTEXT, app, get, poll_until, post, run, send};
 
 const MOVING: &str = r#"{"model": "moving"}"#;
 
@@ -33,24 +33,27 @@ pub(crate) fn code(message: &ServerMessage) -> (ErrorCode, u64) {
 }
 
 #[tokio::test]
-async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
+async fn a_session_continues_after_reconnecting() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let (broken, whole) = (Opened::open(&app, &moving()).await, Opened::open(&app, &moving()).await);
+    let (broken, whole) = (
+        SessionHandle::open(&app, &moving()).await,
+        SessionHandle::open(&app, &moving()).await,
+    );
     let mut reference = Client::connect(server.address, &whole.path("/stream"), Codec::Json)
         .await
         .unwrap();
     for seq in 0..6 {
-        // Every frame over a socket of its own, in either sub-protocol.
+        // Each frame over a new socket, in alternating sub-protocols.
         let codec = [Codec::Json, Codec::Msgpack][seq as usize % 2];
         let mut client = Client::connect(server.address, &broken.path("/stream"), codec)
             .await
             .unwrap();
         assert_eq!(client.next_seq, seq);
         let (answer, expected) = (
-            client.ask(&send_frame(seq)).await,
-            reference.ask(&send_frame(seq)).await,
+            client.ask(&numbered_message(seq)).await,
+            reference.ask(&numbered_message(seq)).await,
         );
         if seq + 1 < CONTEXT as u64 {
             assert_eq!(answer, expected);
@@ -58,7 +61,7 @@ async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
             assert_eq!(frames(&answer), frames(&expected));
         }
     }
-    let state = |session: &Opened| {
+    let state = |session: &SessionHandle| {
         let path = session.path("/state");
         let app = app.clone();
         async move { get(&app, &path).await.json() }
@@ -75,19 +78,19 @@ async fn a_session_goes_on_where_it_was_after_its_socket_has_gone() {
 }
 
 #[tokio::test]
-async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
+async fn a_new_connection_replaces_the_old_one() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let path = session.path("/stream");
     let mut older = Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
-    older.ask(&send_frame(0)).await;
+    older.ask(&numbered_message(0)).await;
     let mut newer = Client::connect(server.address, &path, Codec::Msgpack).await.unwrap();
     assert_eq!(newer.next_seq, 1);
     assert_eq!(older.end().await, (Some(ClosingReason::Replaced), Some(1008)));
     assert!(matches!(
-        newer.ask(&send_frame(1)).await,
+        newer.ask(&numbered_message(1)).await,
         ServerMessage::Buffering { have: 2, .. }
     ));
     let gone = Request::delete(session.path("")).body(Body::empty()).unwrap();
@@ -98,11 +101,11 @@ async fn the_newer_connection_holds_the_session_and_the_older_one_is_told() {
 }
 
 #[tokio::test]
-async fn nothing_is_said_of_a_session_without_its_token() {
+async fn session_state_requires_the_token() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     assert!(session.token.len() >= 32 && session.id.len() >= 32);
     for (path, status) in [
         (format!("/v1/sessions/{}/state", session.id), 403),
@@ -123,7 +126,7 @@ async fn nothing_is_said_of_a_session_without_its_token() {
 }
 
 #[tokio::test]
-async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_never_was() {
+async fn an_unused_session_expires_and_is_answered_410() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         session_grace_ms: 50,
@@ -132,14 +135,14 @@ async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_neve
     };
     let app = app(dir.path(), config);
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Json)
         .await
         .unwrap();
     tokio::time::sleep(Duration::from_millis(80)).await;
-    // While its stream is open it does not expire, and holds its place.
+    // While its stream is open, the session does not expire and counts towards the limit.
     assert!(matches!(
-        client.ask(&send_frame(0)).await,
+        client.ask(&numbered_message(0)).await,
         ServerMessage::Buffering { .. }
     ));
     let full = post(&app, "/v1/sessions", &moving()).await;
@@ -147,9 +150,9 @@ async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_neve
     assert_eq!(full.headers["retry-after"], "1");
     drop(client);
     let path = session.path("/state");
-    // Asking with the token would count as use.
+    // A request with the token would count as use.
     let peek = format!("/v1/sessions/{}", session.id);
-    until(async || (get(&app, &peek).await.status == 410).then_some(())).await;
+    poll_until(async || (get(&app, &peek).await.status == 410).then_some(())).await;
     assert!(
         get(&app, &path)
             .await
@@ -157,16 +160,16 @@ async fn a_session_that_nobody_uses_expires_and_says_so_apart_from_one_that_neve
             .contains("was not used for 50 ms and has expired")
     );
     get(&app, "/v1/sessions/another").await.detail(404);
-    Opened::open(&app, &moving()).await;
+    SessionHandle::open(&app, &moving()).await;
     server.stop().await;
 }
 
 #[tokio::test]
-async fn sessions_are_listed_page_by_page() {
+async fn sessions_are_listed_in_pages() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     for _ in 0..5 {
-        Opened::open(&app, &moving()).await;
+        SessionHandle::open(&app, &moving()).await;
     }
     let (mut after, mut seen) = (String::new(), Vec::new());
     loop {
@@ -193,51 +196,51 @@ async fn sessions_are_listed_page_by_page() {
 }
 
 #[tokio::test]
-async fn an_exported_state_goes_on_in_another_server_as_if_nothing_had_been() {
+async fn an_exported_state_continues_on_another_server() {
     let (here, there) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let (first, second) = (
         app(here.path(), ServerConfig::default()),
         app(there.path(), ServerConfig::default()),
     );
     let (old, new) = (run(first.clone()).await, run(second.clone()).await);
-    let session = Opened::open(&first, &moving()).await;
+    let session = SessionHandle::open(&first, &moving()).await;
     let mut client = Client::connect(old.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
     for seq in 0..5 {
-        client.ask(&send_frame(seq)).await;
+        client.ask(&numbered_message(seq)).await;
     }
     let state = get(&first, &session.path("/state")).await.json();
-    let last = client.ask(&send_frame(4)).await;
-    let next = client.ask(&send_frame(5)).await;
+    let last = client.ask(&numbered_message(4)).await;
+    let next = client.ask(&numbered_message(5)).await;
 
-    let moved = Opened::open(&second, &json!({"state": state})).await;
+    let moved = SessionHandle::open(&second, &json!({"state": state})).await;
     assert_eq!(get(&second, &moved.path("/state")).await.json(), state);
     let mut client = Client::connect(new.address, &moved.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
     assert_eq!(client.next_seq, 5);
-    // The last answer did not travel; it is computed again, and nothing is stepped.
-    assert_eq!(frames(&client.ask(&send_frame(4)).await), frames(&last));
-    assert_eq!(frames(&client.ask(&send_frame(5)).await), frames(&next));
+    // The exported state has no cached answer: the server computes it again, and `next_seq` does not change.
+    assert_eq!(frames(&client.ask(&numbered_message(4)).await), frames(&last));
+    assert_eq!(frames(&client.ask(&numbered_message(5)).await), frames(&next));
     old.stop().await;
     new.stop().await;
 }
 
 #[tokio::test]
-async fn a_state_that_does_not_fit_is_refused_by_field() {
+async fn an_invalid_state_is_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
-    let session = Opened::open(&app, &moving()).await;
+    let session = SessionHandle::open(&app, &moving()).await;
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Json)
         .await
         .unwrap();
-    client.ask(&send_frame(0)).await;
+    client.ask(&numbered_message(0)).await;
     let state = get(&app, &session.path("/state")).await.json();
     for (pointer, value, status, detail) in [
         ("/weights_sha256", json!("00"), 409, "here version 1"),
-        ("/model", json!("none"), 404, "no model is named"),
+        ("/model", json!("none"), 404, "there is no model"),
         ("/memory/next_seq", json!(0), 422, "state.memory.next_seq is 0"),
         (
             "/memory/features",

@@ -1,4 +1,4 @@
-//! Data sets of several machines that keep their objects in one place, each with a data directory and a database of its own.
+//! Data sets of several machines that share an object store; each has its own data directory and database.
 
 use std::path::Path;
 
@@ -8,12 +8,12 @@ use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::service::{Answer, get, post, send, until};
+use crate::service::{Answer, get, poll_until, post, send};
 
 const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";
 
-/// A server with a data directory of its own and no shipped models.
+/// A server with its own data directory and no shipped models.
 async fn machine(objects: &Path) -> (TempDir, App) {
     let dir = tempfile::tempdir().unwrap();
     let models_dir = dir.path().join("none-shipped");
@@ -32,12 +32,12 @@ fn collect(trials: u32) -> Value {
     json!({"kind": "collect", "name": "d", "scenario": "static-observer", "trials": trials})
 }
 
-/// Asks for a collection and waits until it has succeeded.
+/// Creates a collection job and waits until it has succeeded.
 async fn collected(app: &App, trials: u32) {
     let taken = post(app, JOBS, &collect(trials)).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
-    until(async || {
+    poll_until(async || {
         let job = get(app, &path).await.json();
         assert!(job["state"] != "failed", "{job}");
         (job["state"] == "succeeded").then_some(())
@@ -50,7 +50,7 @@ async fn delete(app: &App) -> Answer {
 }
 
 #[tokio::test]
-async fn a_data_set_is_described_without_being_fetched_and_shown_after_it_is() {
+async fn describing_a_shared_data_set_does_not_download_it() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (there, other) = machine(objects.path()).await;
@@ -68,7 +68,7 @@ async fn a_data_set_is_described_without_being_fetched_and_shown_after_it_is() {
 }
 
 #[tokio::test]
-async fn a_name_that_another_machine_has_collected_is_taken() {
+async fn data_set_names_are_unique_across_machines() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (_there, other) = machine(objects.path()).await;
@@ -80,7 +80,7 @@ async fn a_name_that_another_machine_has_collected_is_taken() {
 }
 
 #[tokio::test]
-async fn a_data_set_that_was_deleted_and_collected_anew_elsewhere_is_fetched_anew() {
+async fn a_replaced_shared_data_set_is_downloaded_again() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (there, other) = machine(objects.path()).await;
@@ -102,7 +102,7 @@ async fn a_data_set_that_was_deleted_and_collected_anew_elsewhere_is_fetched_ane
 }
 
 #[tokio::test]
-async fn what_is_left_here_of_a_set_that_was_deleted_elsewhere_is_in_no_ones_way() {
+async fn a_stale_copy_does_not_block_a_new_collection() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, one) = machine(objects.path()).await;
     let (_there, other) = machine(objects.path()).await;
@@ -112,13 +112,13 @@ async fn what_is_left_here_of_a_set_that_was_deleted_elsewhere_is_in_no_ones_way
     collected(&one, 5).await;
     assert_eq!(get(&other, SET).await.json()["episodes"], 5);
     assert_eq!(delete(&other).await.status, 204);
-    // With the same arguments it is the same set.
+    // The same arguments give the same data set again.
     collected(&one, 5).await;
     assert_eq!(get(&other, SET).await.json()["episodes"], 5);
 }
 
 #[tokio::test]
-async fn a_data_set_that_is_not_whole_where_objects_are_kept_is_not_told_of_but_can_be_deleted() {
+async fn an_incomplete_shared_data_set_is_hidden_but_deletable() {
     let objects = tempfile::tempdir().unwrap();
     let (_here, app) = machine(objects.path()).await;
     let half = objects.path().join("datasets/d/data");

@@ -1,4 +1,4 @@
-//! The simulated world against closed forms, and its promises: seeds, bounds, collisions, refusals.
+//! The simulated world: closed forms, seeds, bounds, collisions, camera.
 
 use foreframe::sim::camera::Camera;
 use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
@@ -20,7 +20,7 @@ pub(crate) fn small() -> WorldConfig {
     }
 }
 
-/// A moving-observer trial in which Tb1 begins at that pose.
+/// A moving-observer trial in which Tb1 starts at this pose.
 fn world_from(x_m: f32, y_m: f32, heading_rad: f32, config: &WorldConfig) -> World {
     let mut parameters = TrialParameters::draw(Scenario::MovingObserver, Seed(3), 0);
     parameters.observer = PlanarPose { x_m, y_m, heading_rad };
@@ -40,7 +40,7 @@ fn whole_trial(scenario: Scenario, seed: Seed, trial: u64, config: &WorldConfig)
 }
 
 #[test]
-fn constant_wheel_speeds_follow_the_exact_arc() {
+fn constant_wheel_speeds_drive_an_exact_arc() {
     let mut world = world_from(1.2, -0.9, 0.3, &small());
     let (linear, angular) = (0.4f64, 0.7f64);
     // Half a second is enough to reach the speeds; the arc is measured from there.
@@ -52,7 +52,7 @@ fn constant_wheel_speeds_follow_the_exact_arc() {
         world.step(&action(linear as f32, angular as f32)).unwrap();
     }
     let to = world.observer_pose();
-    // A unicycle at constant speeds, by hand: circle of radius v/ω.
+    // Closed form of a unicycle at constant speeds: a circle of radius v/ω.
     let turned = angular * 2.0;
     let heading = f64::from(from.heading_rad);
     let radius = linear / angular;
@@ -64,7 +64,7 @@ fn constant_wheel_speeds_follow_the_exact_arc() {
 }
 
 #[test]
-fn wheels_reach_their_speed_at_their_acceleration_limit() {
+fn wheels_accelerate_at_their_limit() {
     let mut world = world_from(1.0, 0.0, 0.0, &small());
     world.step(&action(0.6, 0.0)).unwrap();
     let speed = world.observe().state.as_slice()[4];
@@ -72,7 +72,7 @@ fn wheels_reach_their_speed_at_their_acceleration_limit() {
 }
 
 #[test]
-fn odometry_agrees_with_the_truth_until_wheels_slip() {
+fn odometry_equals_the_true_pose_without_slip() {
     let mut world = world_from(1.0, 0.0, 0.2, &small());
     for _ in 0..10 {
         world.step(&action(0.3, -0.4)).unwrap();
@@ -87,7 +87,7 @@ fn odometry_agrees_with_the_truth_until_wheels_slip() {
 }
 
 #[test]
-fn a_wall_stops_the_robot_while_its_wheels_go_on() {
+fn a_wall_stops_the_robot_while_its_wheels_turn() {
     let mut world = world_from(4.3, 1.2, 0.0, &small());
     let mut least = 1.0f32;
     for _ in 0..15 {
@@ -97,7 +97,7 @@ fn a_wall_stops_the_robot_while_its_wheels_go_on() {
     let reach = arena::LENGTH_M - 0.177;
     assert!((truth.x_m - reach).abs() < 0.02, "{} {reach}", truth.x_m);
     assert!(world.observe().state.as_slice()[0] > truth.x_m + 0.3);
-    assert!(least < 0.0, "bumping costs: {least}");
+    assert!(least < 0.0, "a collision must have a negative reward: {least}");
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn a_pillar_stops_the_robot() {
 }
 
 #[test]
-fn robots_never_drive_through_each_other() {
+fn robots_never_overlap() {
     for trial in 0..10 {
         let config = WorldConfig {
             max_duration_s: 20.0,
@@ -121,7 +121,7 @@ fn robots_never_drive_through_each_other() {
         };
         let mut world = World::new(Scenario::Crowded, &config, Seed(5), trial).unwrap();
         while !world.step(&world.policy_action()).unwrap().truncated {
-            let mut places: Vec<[f32; 2]> = world.mover_poses().into_iter().map(arena::position).collect();
+            let mut places: Vec<[f32; 2]> = world.other_robot_poses().into_iter().map(arena::position).collect();
             places.push(arena::position(world.observer_pose()));
             for (index, &one) in places.iter().enumerate() {
                 for &other in &places[..index] {
@@ -133,7 +133,7 @@ fn robots_never_drive_through_each_other() {
 }
 
 #[test]
-fn commands_beyond_the_limits_are_clamped_to_them() {
+fn commands_are_clamped_to_the_speed_limits() {
     let mut world = world_from(1.0, 0.0, 0.0, &small());
     for _ in 0..5 {
         world.step(&action(9.0, 50.0)).unwrap();
@@ -144,7 +144,7 @@ fn commands_beyond_the_limits_are_clamped_to_them() {
 }
 
 #[test]
-fn one_seed_gives_the_same_bytes_and_another_gives_others() {
+fn the_seed_determines_the_trial() {
     for scenario in Scenario::ALL {
         let config = WorldConfig::default();
         let (first, _) = whole_trial(scenario, Seed(11), 4, &config);
@@ -156,17 +156,17 @@ fn one_seed_gives_the_same_bytes_and_another_gives_others() {
 }
 
 #[test]
-fn a_world_from_its_written_parameters_is_the_same() {
+fn a_world_rebuilt_from_its_parameters_is_the_same() {
     let config = WorldConfig::default();
     let world = World::new(Scenario::Crowded, &config, Seed(2), 7).unwrap();
     let written = serde_json::to_string(world.parameters()).unwrap();
     let again = World::from_parameters(serde_json::from_str(&written).unwrap(), &config).unwrap();
     assert_eq!(world.observe(), again.observe());
-    assert_eq!(world.photograph().unwrap().0, world.observe().frame);
+    assert_eq!(world.render().unwrap().0, world.observe().frame);
 }
 
 #[test]
-fn every_static_trial_has_twelve_frames_and_shows_tb2_whole_in_all() {
+fn static_trials_show_the_whole_robot_for_twelve_frames() {
     let config = small();
     let mut lengths = Vec::new();
     for trial in 0..400 {
@@ -174,7 +174,7 @@ fn every_static_trial_has_twelve_frames_and_shows_tb2_whole_in_all() {
         let mut frames = 1;
         loop {
             assert!(
-                is_whole(&world.camera(), world.mover_poses()[0]),
+                is_whole(&world.camera(), world.other_robot_poses()[0]),
                 "trial {trial}, frame {frames}"
             );
             let step = world.step(&world.policy_action()).unwrap();
@@ -194,7 +194,7 @@ fn every_static_trial_has_twelve_frames_and_shows_tb2_whole_in_all() {
     assert!(lengths[399] <= 40);
 }
 
-/// Whether the middle axis of a TurtleBot and its sides are in the picture of 16×16.
+/// Whether the whole width and height of a TurtleBot is inside the frame of 16×16 px.
 fn is_whole(camera: &Camera, pose: PlanarPose) -> bool {
     [(0.0, -0.17), (0.0, 0.17), (0.42, -0.17), (0.42, 0.17)]
         .into_iter()
@@ -205,14 +205,14 @@ fn is_whole(camera: &Camera, pose: PlanarPose) -> bool {
 }
 
 #[test]
-fn a_moving_observer_trial_has_all_its_frames() {
+fn a_moving_observer_trial_has_40_frames() {
     let (seen, _) = whole_trial(Scenario::MovingObserver, Seed(1), 0, &small());
     assert_eq!(seen.len(), 40);
     assert!((seen[39].time_s - 7.8).abs() < 1e-9);
 }
 
 #[test]
-fn tb1s_own_driver_sees_tb2_often_and_seldom_bumps() {
+fn the_policy_of_tb1_follows_tb2_and_rarely_collides() {
     let (mut frames, mut shown, mut bumps) = (0, 0, 0);
     for trial in 0..40 {
         let mut world = World::new(Scenario::MovingObserver, &small(), Seed(9), trial).unwrap();
@@ -234,7 +234,7 @@ fn tb1s_own_driver_sees_tb2_often_and_seldom_bumps() {
 }
 
 #[test]
-fn held_out_trials_are_those_pairs_and_a_tenth_of_the_gains() {
+fn held_out_trials_are_the_held_out_pairs_and_gains() {
     let trials: Vec<TrialParameters> = (0..4000)
         .map(|trial| TrialParameters::draw(Scenario::StaticObserver, Seed(1), trial))
         .collect();
@@ -253,7 +253,7 @@ fn held_out_trials_are_those_pairs_and_a_tenth_of_the_gains() {
 }
 
 #[test]
-fn known_points_appear_where_a_pinhole_puts_them() {
+fn the_camera_projects_points_as_a_pinhole() {
     let mut config = WorldConfig::default();
     config.camera.tilt_down_rad = 0.0;
     let pose = PlanarPose {
@@ -274,7 +274,7 @@ fn known_points_appear_where_a_pinhole_puts_them() {
 }
 
 #[test]
-fn tb2s_pixels_are_where_its_body_projects_to() {
+fn the_mask_of_tb2_is_where_its_body_projects() {
     let config = WorldConfig {
         frame_width_px: 128,
         frame_height_px: 128,
@@ -285,7 +285,7 @@ fn tb2s_pixels_are_where_its_body_projects_to() {
         for _ in 0..5 {
             world.step(&action(0.0, 0.0)).unwrap();
         }
-        let (mask, pose) = (world.observe().mask, world.mover_poses()[0]);
+        let (mask, pose) = (world.observe().mask, world.other_robot_poses()[0]);
         assert!(mask.iter().all(|&owner| owner <= 1));
         let pixels: Vec<usize> = (0..mask.len()).filter(|&index| mask[index] == 1).collect();
         let mean = pixels.iter().map(|index| (index % 128) as f32 + 0.5).sum::<f32>() / pixels.len() as f32;
@@ -301,7 +301,7 @@ fn tb2s_pixels_are_where_its_body_projects_to() {
 }
 
 #[test]
-fn crowded_masks_name_each_mover() {
+fn crowded_masks_contain_every_robot() {
     let mut seen = [false; 5];
     for trial in 0..30 {
         let world = World::new(Scenario::Crowded, &WorldConfig::default(), Seed(4), trial).unwrap();
@@ -313,18 +313,18 @@ fn crowded_masks_name_each_mover() {
 }
 
 #[test]
-fn only_the_movers_pixels_and_shadow_change_before_a_still_camera() {
+fn a_still_camera_sees_a_still_background() {
     let mut config = WorldConfig::default();
     config.camera.noise_std = 0.0;
     let (seen, _) = whole_trial(Scenario::StaticObserver, Seed(1), 0, &config);
     let (first, last) = (&seen[0], &seen[seen.len() - 1]);
-    // The topmost rows show wall only.
+    // The top rows show only wall.
     assert_eq!(first.frame.pixels()[..64 * 4], last.frame.pixels()[..64 * 4]);
     assert!(first.frame != last.frame);
 }
 
 #[test]
-fn channels_name_what_actions_and_states_hold() {
+fn channel_lists_match_actions_and_states() {
     let world = World::new(Scenario::StaticObserver, &small(), Seed(1), 0).unwrap();
     assert_eq!(world.policy_action().as_slice(), [0.0, 0.0]);
     assert_eq!(action_channels().len(), 2);

@@ -1,21 +1,21 @@
-//! The store, on SQLite always and on PostgreSQL where `FOREFRAME_TEST_POSTGRES` holds the URL of one to make databases in.
+//! The store on SQLite, and on PostgreSQL if `FOREFRAME_TEST_POSTGRES` is the URL of a server to create databases on.
 
 use std::collections::BTreeSet;
 
 use foreframe::store::{
-    EnqueueResult, JobOutcome, JobPage, JobRow, JobUpdate, Lease, LossRow, NewJob, Store, StoreConfig,
+    EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, Lease, LossRow, NewJob, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
 
-/// Where to open a store of each kind, empty. `name` is the test's.
-async fn places(name: &str) -> Vec<(TempDir, StoreConfig)> {
-    let mut places = vec![place(None)];
-    places.extend(postgres(name).await.map(|url| place(Some(url))));
-    places
+/// Configurations of an empty store of each kind. `name` is that of the test.
+async fn configs(name: &str) -> Vec<(TempDir, StoreConfig)> {
+    let mut configs = vec![config(None)];
+    configs.extend(postgres(name).await.map(|url| config(Some(url))));
+    configs
 }
 
-fn place(database: Option<String>) -> (TempDir, StoreConfig) {
+fn config(database: Option<String>) -> (TempDir, StoreConfig) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig {
         data_dir: dir.path().to_owned(),
@@ -45,7 +45,7 @@ pub(crate) async fn postgres(name: &str) -> Option<String> {
 
 async fn stores(name: &str) -> Vec<(TempDir, Store)> {
     let mut stores = Vec::new();
-    for (dir, config) in places(name).await {
+    for (dir, config) in configs(name).await {
         stores.push((dir, Store::open(&config).await.unwrap()));
     }
     stores
@@ -54,7 +54,7 @@ async fn stores(name: &str) -> Vec<(TempDir, Store)> {
 fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
     NewJob {
         kind: "collect".to_owned(),
-        makes: makes.map(str::to_owned),
+        exclusive_output: makes.map(str::to_owned),
         spec: "{}".to_owned(),
         progress: "{}".to_owned(),
         idempotency_key: key.map(str::to_owned),
@@ -68,18 +68,20 @@ async fn enqueued(store: &Store) -> JobRow {
     }
 }
 
-fn ending(state: &'static str) -> JobOutcome {
+fn outcome(state: &'static str) -> JobOutcome {
     JobOutcome {
         state,
         error: None,
         outcome: Some("{}".to_owned()),
         ended_s: Some(9.0),
         published: None,
+        measured: None,
+        crashed: false,
     }
 }
 
-fn account(line: &str) -> JobUpdate {
-    JobUpdate {
+fn report(line: &str) -> JobReport {
+    JobReport {
         progress: "{\"done\":1}".to_owned(),
         lines: vec![(2.0, line.to_owned())],
         losses: vec![LossRow {
@@ -89,29 +91,30 @@ fn account(line: &str) -> JobUpdate {
             validation: None,
         }],
         max_lines: 3,
+        checkpoint: 0,
     }
 }
 
 #[tokio::test]
-async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
+async fn a_job_is_enqueued_claimed_reported_and_ended() {
     for (_dir, store) in stores("way").await {
         let row = enqueued(&store).await;
         assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
-        let (row, lease) = store.claim("me", 2.0, 10.0).await.unwrap().unwrap();
+        let (row, lease) = store.claim_at("me", 2.0, 10.0).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.started_s, row.token),
             ("running", Some(2.0), 1)
         );
-        assert_eq!(store.claim("me", 3.0, 10.0).await.unwrap(), None);
+        assert_eq!(store.claim_at("me", 3.0, 10.0).await.unwrap(), None);
         for line in ["one", "two", "three", "four"] {
-            assert_eq!(store.renew(lease, 20.0, account(line)).await.unwrap(), Some(false));
+            assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
         assert!(store.ask_to_cancel(1).await.unwrap());
         assert_eq!(
-            store.renew(lease, 20.0, JobUpdate::default()).await.unwrap(),
+            store.renew_at(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
         );
-        assert!(store.end(lease, ending("cancelled"), account("five")).await.unwrap());
+        assert!(store.end(lease, outcome("cancelled"), report("five")).await.unwrap());
         let row = store.job(1).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.cancelling, row.ended_s),
@@ -125,10 +128,10 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
         let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
         assert_eq!(lines, [(4, "four"), (5, "five")]);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
-        assert_eq!(store.job_losses(1).await.unwrap(), account("").losses);
+        assert_eq!(store.job_losses(1).await.unwrap(), report("").losses);
         assert!(
             !store
-                .end(lease, ending("succeeded"), JobUpdate::default())
+                .end(lease, outcome("succeeded"), JobReport::default())
                 .await
                 .unwrap()
         );
@@ -136,34 +139,37 @@ async fn a_job_is_enqueued_taken_up_reported_on_and_ended() {
 }
 
 #[tokio::test]
-async fn one_whose_lease_ran_out_and_was_taken_over_writes_nothing_any_more() {
+async fn an_expired_lease_cannot_write() {
     for (_dir, store) in stores("fence").await {
         enqueued(&store).await;
-        let (_, stale) = store.claim("slow", 0.0, 10.0).await.unwrap().unwrap();
-        assert_eq!(store.claim("quick", 9.9, 30.0).await.unwrap(), None);
-        let (row, fresh) = store.claim("quick", 10.1, 30.0).await.unwrap().unwrap();
+        let (_, stale) = store.claim_at("slow", 0.0, 10.0).await.unwrap().unwrap();
+        assert_eq!(store.claim_at("quick", 9.9, 30.0).await.unwrap(), None);
+        let (row, fresh) = store.claim_at("quick", 10.1, 30.0).await.unwrap().unwrap();
         assert_eq!((row.token, row.started_s), (2, Some(0.0)));
-        assert_eq!(store.renew(stale, 99.0, account("from the dead")).await.unwrap(), None);
+        assert_eq!(
+            store.renew_at(stale, 99.0, report("from an expired lease")).await.unwrap(),
+            None
+        );
         assert!(
             !store
-                .end(stale, ending("failed"), account("from the dead"))
+                .end(stale, outcome("failed"), report("from an expired lease"))
                 .await
                 .unwrap()
         );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
         assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
         assert_eq!(
-            store.renew(fresh, 40.0, JobUpdate::default()).await.unwrap(),
+            store.renew_at(fresh, 40.0, JobReport::default()).await.unwrap(),
             Some(false)
         );
         assert_eq!(store.release_leases("slow").await.unwrap(), 0);
         assert_eq!(store.release_leases("quick").await.unwrap(), 1);
-        assert_eq!(store.claim("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
+        assert_eq!(store.claim_at("next", 11.0, 30.0).await.unwrap().unwrap().0.token, 3);
     }
 }
 
 #[tokio::test]
-async fn places_keys_and_names_are_given_once() {
+async fn the_queue_limit_keys_and_names_are_enforced() {
     for (_dir, store) in stores("once").await {
         let enqueue = async |new: NewJob| store.enqueue(new, 2, 0.0).await.unwrap();
         assert!(matches!(
@@ -185,7 +191,7 @@ async fn places_keys_and_names_are_given_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
+async fn concurrent_claims_never_get_the_same_job() {
     for (_dir, store) in stores("many").await {
         let enqueueing = (0..30).map(|_| {
             let store = store.clone();
@@ -201,9 +207,9 @@ async fn many_that_ask_at_once_never_get_the_same_job_nor_pass_the_limit() {
             tokio::spawn(async move {
                 let mut numbers = Vec::new();
                 while numbers.len() < 20 {
-                    match store.claim(&runner.to_string(), 0.0, 10.0).await.unwrap() {
+                    match store.claim_at(&runner.to_string(), 0.0, 10.0).await.unwrap() {
                         Some((row, _)) => numbers.push(row.number),
-                        // Those that others are about to take are passed over.
+                        // A claim skips jobs that others are claiming.
                         None if store.jobs(queued()).await.unwrap().is_empty() => break,
                         None => tokio::task::yield_now().await,
                     }
@@ -229,7 +235,7 @@ fn queued() -> JobPage {
 }
 
 #[tokio::test]
-async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
+async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
     for (_dir, store) in stores("list").await {
         for _ in 0..5 {
             enqueued(&store).await;
@@ -270,15 +276,15 @@ async fn jobs_are_listed_from_the_newest_and_the_oldest_ended_are_forgotten() {
     }
 }
 
-/// A job of that model, taken up, with its version reserved.
+/// Claims a new job and reserves a version of the model for it.
 async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
     enqueued(store).await;
-    let (_, lease) = store.claim("me", 0.0, 10.0).await.unwrap().unwrap();
+    let (_, lease) = store.claim_at("me", 0.0, 10.0).await.unwrap().unwrap();
     (lease, store.reserve_version(lease, model, 4).await.unwrap().unwrap())
 }
 
 #[tokio::test]
-async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_ended() {
+async fn versions_are_numbered_after_the_shipped_one() {
     for (_dir, store) in stores("versions").await {
         let (lease, version) = reserve(&store, "m").await;
         assert_eq!(
@@ -288,11 +294,11 @@ async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_end
         assert_eq!(store.published_versions().await.unwrap(), []);
         let published = |version, activates| JobOutcome {
             published: Some(("m".to_owned(), version, activates)),
-            ..ending("succeeded")
+            ..outcome("succeeded")
         };
         assert!(
             store
-                .end(lease, published(5, true), JobUpdate::default())
+                .end(lease, published(5, true), JobReport::default())
                 .await
                 .unwrap()
         );
@@ -300,13 +306,13 @@ async fn versions_count_up_from_the_shipped_one_and_count_once_their_job_has_end
         assert_eq!(version, 6);
         assert!(
             store
-                .end(lease, published(6, true), JobUpdate::default())
+                .end(lease, published(6, true), JobReport::default())
                 .await
                 .unwrap()
         );
         let listed = store.published_versions().await.unwrap();
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
-        // The first stays chosen until another is.
+        // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
         assert!(!store.delete_version("m", 5, 1.0).await.unwrap());
         store.set_active("m", 4, 1.0).await.unwrap();
@@ -336,8 +342,8 @@ async fn keys_are_found_by_id_and_revoked_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn several_may_open_a_new_store_at_once_and_all_see_the_same() {
-    for (_dir, config) in places("open").await {
+async fn a_new_store_can_be_opened_concurrently() {
+    for (_dir, config) in configs("open").await {
         let opening = (0..6).map(|_| {
             let config = config.clone();
             tokio::spawn(async move { Store::open(&config).await.unwrap() })
@@ -353,7 +359,7 @@ async fn several_may_open_a_new_store_at_once_and_all_see_the_same() {
 }
 
 #[tokio::test]
-async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
+async fn an_unknown_url_scheme_is_refused_without_the_password() {
     let dir = tempfile::tempdir().unwrap();
     let refused = async |database: Option<&str>, objects: Option<&str>| {
         let config = StoreConfig {
@@ -374,7 +380,7 @@ async fn a_url_of_another_kind_is_refused_without_telling_its_password() {
 }
 
 #[tokio::test]
-async fn a_postgresql_that_cannot_be_reached_as_asked_is_refused_with_the_reason() {
+async fn an_unreachable_postgresql_is_refused_with_the_reason() {
     let Some(url) = postgres("tls").await else { return };
     let refused = async |url: String| {
         let dir = tempfile::tempdir().unwrap();
@@ -385,12 +391,12 @@ async fn a_postgresql_that_cannot_be_reached_as_asked_is_refused_with_the_reason
         };
         Store::open(&config).await.err().unwrap().to_string()
     };
-    // The tests' server speaks no TLS.
+    // The test server has no TLS.
     let error = refused(format!("{url}?sslmode=require")).await;
     let reason = if cfg!(feature = "cloud") {
         "server does not support TLS"
     } else {
-        "built without; build it with --features cloud"
+        "built without it; build it with --features cloud"
     };
     assert!(error.contains(reason), "{error}");
     let nobody = tokio::net::TcpListener::bind("127.0.0.1:0")

@@ -1,11 +1,11 @@
-//! Objects that several machines share, in a directory and, where there is one, in S3.
+//! The object store that several machines share: in a directory, and in S3 if available.
 
 use foreframe::store::{Store, StoreConfig};
 use tempfile::TempDir;
 
-/// Two data directories with one place for objects, a directory or, where `FOREFRAME_TEST_S3` holds a URL, a bucket.
+/// Two data directories with one object store: a directory, and an S3 bucket if `FOREFRAME_TEST_S3` is set.
 #[tokio::test]
-async fn what_one_machine_pushes_another_pulls_lists_and_deletes() {
+async fn pushed_objects_are_visible_on_other_machines() {
     let shared = tempfile::tempdir().unwrap();
     let url = if cfg!(feature = "cloud") {
         std::env::var("FOREFRAME_TEST_S3").ok()
@@ -50,7 +50,7 @@ async fn what_one_machine_pushes_another_pulls_lists_and_deletes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn many_that_pull_a_directory_at_once_all_find_it_whole() {
+async fn concurrent_pulls_get_a_complete_directory() {
     let shared = tempfile::tempdir().unwrap();
     let url = shared.path().display().to_string();
     let (here, there) = (open_sharing(&url).await, open_sharing(&url).await);
@@ -77,7 +77,7 @@ async fn many_that_pull_a_directory_at_once_all_find_it_whole() {
 }
 
 #[tokio::test]
-async fn a_pull_copies_nothing_without_the_last_file_and_no_file_that_is_there() {
+async fn a_pull_skips_incomplete_directories_and_existing_files() {
     let shared = tempfile::tempdir().unwrap();
     let (dir, store) = open_sharing(&shared.path().display().to_string()).await;
     let (ours, kept) = (dir.path().join("reports/r"), shared.path().join("reports/r"));

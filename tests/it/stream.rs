@@ -1,4 +1,4 @@
-//! The stream over a real socket.
+//! The stream over a real WebSocket.
 
 use std::time::Duration;
 
@@ -14,12 +14,13 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::service::{
-    CONTEXT, PATIENCE, Running, app, context, frame, get, model, png, post, run, spec, start, until, with_data,
+    CONTEXT, InProcessServer, TIMEOUT, app, context, frame, get, model, png, poll_until, post, run, spec, start,
+    with_data,
 };
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
-async fn connect(server: &Running, model: &str, subprotocol: &str) -> Result<Socket, Box<Error>> {
+async fn connect(server: &InProcessServer, model: &str, subprotocol: &str) -> Result<Socket, Box<Error>> {
     let mut request = format!("ws://{}/v1/models/{model}/stream", server.address)
         .into_client_request()
         .unwrap();
@@ -30,7 +31,7 @@ async fn connect(server: &Running, model: &str, subprotocol: &str) -> Result<Soc
     Ok(socket)
 }
 
-async fn open(server: &Running, model: &str) -> Socket {
+async fn open(server: &InProcessServer, model: &str) -> Socket {
     let mut socket = connect(server, model, "foreframe.v1.json").await.unwrap();
     let ready = receive(&mut socket).await;
     assert_eq!((&ready["type"], &ready["next_seq"]), (&json!("ready"), &json!(0)));
@@ -38,7 +39,7 @@ async fn open(server: &Running, model: &str) -> Socket {
 }
 
 async fn receive(socket: &mut Socket) -> Value {
-    let message = tokio::time::timeout(PATIENCE, socket.next())
+    let message = tokio::time::timeout(TIMEOUT, socket.next())
         .await
         .unwrap()
         .unwrap()
@@ -63,7 +64,7 @@ fn status(error: &Error) -> u16 {
 }
 
 #[tokio::test]
-async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
+async fn a_stream_predicts_the_same_as_a_request() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
@@ -98,7 +99,7 @@ async fn a_stream_predicts_what_a_request_with_the_same_frames_does() {
 }
 
 #[tokio::test]
-async fn a_plan_is_predicted_under_and_without_one_the_action_is_held() {
+async fn without_a_plan_the_last_action_repeats() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut answers = Vec::new();
@@ -130,7 +131,7 @@ async fn a_plan_is_predicted_under_and_without_one_the_action_is_held() {
 }
 
 #[tokio::test]
-async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_number_that_is_next() {
+async fn a_gap_is_refused_with_the_next_seq() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut socket = open(&server, "plain").await;
@@ -140,6 +141,21 @@ async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_n
         (&json!("gap"), &json!("seq is 5; seq 0 is next"))
     );
     assert_eq!(gap["next_seq"], 0);
+    for seq in 0..CONTEXT as u64 {
+        ask(&mut socket, frame_message(seq)).await;
+    }
+    assert_eq!(ask(&mut socket, frame_message(9)).await["next_seq"], CONTEXT);
+    let next = ask(&mut socket, frame_message(CONTEXT as u64)).await;
+    assert_eq!((&next["type"], &next["seq"]), (&json!("prediction"), &json!(CONTEXT)));
+    drop(socket);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_repeated_frame_gets_the_cached_answer() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    let mut socket = open(&server, "plain").await;
     let mut answers = Vec::new();
     for seq in 0..CONTEXT as u64 {
         answers.push(ask(&mut socket, frame_message(seq)).await);
@@ -149,7 +165,6 @@ async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_n
         answers.last().unwrap()
     );
     assert_eq!(&ask(&mut socket, frame_message(0)).await, answers.last().unwrap());
-    assert_eq!(ask(&mut socket, frame_message(9)).await["next_seq"], CONTEXT);
     let next = ask(&mut socket, frame_message(CONTEXT as u64)).await;
     assert_eq!((&next["type"], &next["seq"]), (&json!("prediction"), &json!(CONTEXT)));
     drop(socket);
@@ -157,7 +172,7 @@ async fn a_frame_sent_twice_gets_the_same_answer_and_a_gap_is_refused_with_the_n
 }
 
 #[tokio::test]
-async fn what_is_refused_leaves_the_stream_where_it_was() {
+async fn refused_messages_do_not_change_the_stream() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut socket = open(&server, "moving").await;
@@ -180,7 +195,7 @@ async fn what_is_refused_leaves_the_stream_where_it_was() {
         (
             with(json!({"image": small})),
             "invalid",
-            "image is 8×8 px; model \"moving\" takes 16×12",
+            "image is 8×8 px; model \"moving\" takes 16×12; set fit to crop, letterbox or stretch to resize it",
         ),
         (with(json!({"action": [0.0]})), "invalid", "action holds 1 numbers"),
         (with(json!({"state": null})), "invalid", "state is missing"),
@@ -216,7 +231,7 @@ async fn what_is_refused_leaves_the_stream_where_it_was() {
 }
 
 #[tokio::test]
-async fn a_stream_that_cannot_be_opened_is_refused_before_the_upgrade() {
+async fn invalid_streams_are_refused_before_the_upgrade() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_streams: 1,
@@ -234,12 +249,12 @@ async fn a_stream_that_cannot_be_opened_is_refused_before_the_upgrade() {
         503
     );
     drop(socket);
-    until(async || connect(&server, "plain", "foreframe.v1.json").await.ok()).await;
+    poll_until(async || connect(&server, "plain", "foreframe.v1.json").await.ok()).await;
     server.stop().await;
 }
 
 #[tokio::test]
-async fn a_silent_stream_is_ended_with_a_word() {
+async fn an_idle_stream_is_warned_and_closed() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         stream_idle_ms: 20,
@@ -276,16 +291,16 @@ async fn a_client_that_never_reads_loses_its_stream() {
     let mut socket = open(&server, "large").await;
     let image = base64::Engine::encode(&base64::engine::general_purpose::STANDARD, vec![0; 128 * 128]);
     let message = json!({"type": "frame", "seq": 0, "timestamp_us": 0, "image": image, "format": "raw"}).to_string();
-    // Each small message is answered by a large one, the kept answer; nothing is read.
+    // Each small message is answered with the large cached answer, which is never read.
     let flood = async { while socket.send(Message::text(message.clone())).await.is_ok() {} };
     let _ = tokio::time::timeout(Duration::from_secs(20), flood).await;
-    until(async || connect(&server, "large", "foreframe.v1.json").await.ok()).await;
+    poll_until(async || connect(&server, "large", "foreframe.v1.json").await.ok()).await;
     drop(socket);
     server.stop().await;
 }
 
 #[tokio::test]
-async fn a_close_of_the_websocket_itself_is_answered() {
+async fn a_websocket_close_is_answered() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;
     let mut socket = open(&server, "plain").await;
@@ -297,12 +312,12 @@ async fn a_close_of_the_websocket_itself_is_answered() {
 }
 
 #[tokio::test]
-async fn stopping_ends_streams_with_1001_and_is_not_ready() {
+async fn shutdown_closes_streams_with_1001() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let server = run(app.clone()).await;
     let mut socket = open(&server, "plain").await;
-    let Running { shutdown, task, .. } = server;
+    let InProcessServer { shutdown, task, .. } = server;
     shutdown.send(()).unwrap();
     assert_eq!(
         receive(&mut socket).await,
@@ -313,5 +328,5 @@ async fn stopping_ends_streams_with_1001_and_is_not_ready() {
     };
     assert_eq!(close.code, CloseCode::Away);
     assert_eq!(get(&app, "/readyz").await.detail(503), "the server is stopping");
-    tokio::time::timeout(PATIENCE, task).await.unwrap().unwrap();
+    tokio::time::timeout(TIMEOUT, task).await.unwrap().unwrap();
 }

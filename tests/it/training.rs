@@ -1,17 +1,44 @@
-//! Training: both stages on a small moving scene, stopped and gone on with, refused and diverging.
+//! Training: both stages on a small moving scene, resuming, refusals, and divergence.
 
 use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::Dataset;
+use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
 use foreframe::registry;
+use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
+use foreframe::types::Seed;
 
 use crate::fixtures::moving_squares;
 
 fn squares(episodes: usize) -> Dataset {
     moving_squares(episodes, 12, 0.2)
+}
+
+#[test]
+fn a_resumed_flow_training_ends_with_the_same_bits() {
+    let small = [
+        "name=square",
+        "data.windows=40",
+        "data.validation_windows=4",
+        "fit.steps=12",
+        "fit.batch_size=4",
+        "model.flow={ channels = 8, stem_channels = 6, enlarged_channels = 3, fine_channels = 5, scene_hidden = 8 }",
+        "run.validate_every_steps=5",
+        "run.checkpoint_every_steps=4",
+        "run.warmup_steps=3",
+    ];
+    let settings: Vec<String> = small.iter().map(|&setting| setting.to_owned()).collect();
+    let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    let (unbroken, broken) = (dir.path().join("unbroken"), dir.path().join("broken"));
+    train(&config, &dataset, &unbroken).unwrap();
+    for updates in [2, 5] {
+        train_until(&config, &dataset, &broken, updates).unwrap();
+    }
+    train(&config, &dataset, &broken).unwrap();
+    assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
 }
 
 fn small_config(extra: &[&str]) -> TrainConfig {
@@ -38,7 +65,7 @@ fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<Training
     train_until(config, dataset, dir, usize::MAX)
 }
 
-/// Trains until so many updates were made in this call.
+/// Trains until this call has made `updates` updates.
 fn train_until(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -67,63 +94,42 @@ fn weights(dir: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn a_run_stopped_at_any_step_ends_in_the_same_bits() {
+fn a_stopped_and_resumed_run_has_the_same_bits() {
     let (dataset, config) = (squares(20), small_config(&[]));
     let dir = tempfile::tempdir().unwrap();
-    let unbroken = dir.path().join("unbroken");
-    train(&config, &dataset, &unbroken).unwrap();
+    let uninterrupted = dir.path().join("uninterrupted");
+    train(&config, &dataset, &uninterrupted).unwrap();
     for (name, stops) in [
         ("early", vec![1, 12]),
         ("codec", vec![30]),
         ("late", vec![25, 20, 14]),
         ("often", vec![9; 5]),
     ] {
-        let broken = dir.path().join(name);
+        let resumed = dir.path().join(name);
         for updates in stops {
-            let outcome = train_until(&config, &dataset, &broken, updates).unwrap();
+            let outcome = train_until(&config, &dataset, &resumed, updates).unwrap();
             assert!(
                 matches!(outcome, TrainingOutcome::Interrupted { .. }),
                 "{name}: {outcome:?}"
             );
         }
-        train(&config, &dataset, &broken).unwrap();
+        train(&config, &dataset, &resumed).unwrap();
         assert_eq!(
-            weights(&broken),
-            weights(&unbroken),
+            weights(&resumed),
+            weights(&uninterrupted),
             "{name}: the last checkpoints differ"
         );
         let model = |run: &Path| std::fs::read(run.join("model").join(registry::WEIGHTS_FILE)).unwrap();
-        assert_eq!(model(&broken), model(&unbroken), "{name}: the published weights differ");
+        assert_eq!(
+            model(&resumed),
+            model(&uninterrupted),
+            "{name}: the published weights differ"
+        );
     }
 }
 
 #[test]
-fn a_flow_training_stopped_at_any_step_ends_in_the_same_bits() {
-    let small = [
-        "name=square",
-        "data.windows=40",
-        "data.validation_windows=4",
-        "fit.steps=12",
-        "fit.batch_size=4",
-        "model.flow={ channels = 8, stem_channels = 6, enlarged_channels = 3, fine_channels = 5, scene_hidden = 8 }",
-        "run.validate_every_steps=5",
-        "run.checkpoint_every_steps=4",
-        "run.warmup_steps=3",
-    ];
-    let settings: Vec<String> = small.iter().map(|&setting| setting.to_owned()).collect();
-    let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
-    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
-    let (unbroken, broken) = (dir.path().join("unbroken"), dir.path().join("broken"));
-    train(&config, &dataset, &unbroken).unwrap();
-    for updates in [2, 5] {
-        train_until(&config, &dataset, &broken, updates).unwrap();
-    }
-    train(&config, &dataset, &broken).unwrap();
-    assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
-}
-
-#[test]
-fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_manifest() {
+fn training_lowers_the_loss_and_publishes_a_model() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "pretrain.steps=300",
@@ -163,7 +169,7 @@ fn a_trained_model_predicts_better_than_an_untrained_one_and_loads_with_its_mani
 }
 
 #[test]
-fn a_finished_run_is_answered_without_training_again() {
+fn a_finished_run_is_not_trained_again() {
     let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train(&config, &dataset, dir.path()).unwrap();
     let outcome = train_until(&config, &dataset, dir.path(), 1).unwrap();
@@ -171,7 +177,7 @@ fn a_finished_run_is_answered_without_training_again() {
 }
 
 #[test]
-fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
+fn a_diverging_run_keeps_its_last_good_checkpoint() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "fit.learning_rate=1",
@@ -181,23 +187,29 @@ fn a_diverging_training_says_where_and_keeps_the_last_good_checkpoint() {
         "fit.steps=500",
     ]);
     let error = train(&config, &dataset, dir.path()).unwrap_err();
-    let TrainError::Diverged { stage, step, kept, .. } = &error else {
+    let TrainError::Diverged {
+        stage,
+        step,
+        checkpoint_step,
+        ..
+    } = &error
+    else {
         panic!("{error}")
     };
     assert_eq!(stage.to_string(), "fit");
-    assert!(kept < step && step - kept <= 7, "{error}");
+    assert!(checkpoint_step < step && step - checkpoint_step <= 7, "{error}");
     assert!(dir.path().join("checkpoint.safetensors").is_file());
     assert!(!dir.path().join("model").exists());
     let again = train(&config, &dataset, dir.path()).unwrap_err();
     assert_eq!(
         again.to_string(),
         error.to_string(),
-        "the kept checkpoint leads to the same end"
+        "the same checkpoint leads to the same error"
     );
 }
 
 #[test]
-fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
+fn a_run_with_other_settings_or_data_is_not_resumed() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
     let error = train(&small_config(&["seed=2"]), &dataset, dir.path())
@@ -211,7 +223,7 @@ fn a_run_of_other_settings_or_data_is_not_gone_on_with() {
 }
 
 #[test]
-fn two_trainings_do_not_share_a_directory() {
+fn two_runs_cannot_share_a_directory() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
     let config = std::fs::File::open(dir.path().join("config.toml")).unwrap();
@@ -223,7 +235,7 @@ fn two_trainings_do_not_share_a_directory() {
 }
 
 #[test]
-fn a_directory_of_something_else_is_left_alone() {
+fn a_foreign_directory_is_refused_and_unchanged() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("thesis.tex"), "precious").unwrap();
     let error = train(&small_config(&[]), &squares(20), dir.path()).unwrap_err();
@@ -232,7 +244,7 @@ fn a_directory_of_something_else_is_left_alone() {
 }
 
 #[test]
-fn a_run_that_was_killed_at_its_start_is_no_obstacle() {
+fn files_of_a_killed_start_are_replaced() {
     let (dataset, config) = (squares(20), small_config(&[]));
     for left in ["dataset.sha256.partial", "dataset.sha256", "config.toml.partial"] {
         let dir = tempfile::tempdir().unwrap();
@@ -242,7 +254,7 @@ fn a_run_that_was_killed_at_its_start_is_no_obstacle() {
 }
 
 #[test]
-fn a_damaged_checkpoint_is_refused_with_what_to_do() {
+fn a_damaged_checkpoint_is_refused_with_advice() {
     let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train_until(&config, &dataset, dir.path(), 10).unwrap();
     let path = dir.path().join("checkpoint.safetensors");
@@ -250,13 +262,48 @@ fn a_damaged_checkpoint_is_refused_with_what_to_do() {
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     let error = train(&config, &dataset, dir.path()).unwrap_err().to_string();
     assert!(
-        error.contains("cannot be gone on from") && error.contains("delete it to start anew"),
+        error.contains("cannot resume from the checkpoint") && error.contains("delete it to start again"),
         "{error}"
     );
 }
 
 #[test]
-fn more_windows_than_there_are_is_refused_with_their_number() {
+fn a_data_set_without_training_windows_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("two-trials");
+    let mut two_trials = CollectConfig::new(Scenario::MovingObserver, 2, Seed(0), &out);
+    two_trials.world = WorldConfig {
+        frame_width_px: 12,
+        frame_height_px: 12,
+        max_duration_s: 4.0,
+        ..WorldConfig::default()
+    };
+    collect(&two_trials, &|_| {}, &AtomicBool::new(false)).unwrap();
+    let dataset = Dataset::open(&out).unwrap();
+    // Find a split that puts one trial into validation and none into training.
+    let split_seed = (0..10_000)
+        .find(|&seed| {
+            let splits = Splits::new(&dataset, Seed(seed));
+            splits.episodes(Split::Train).is_empty() && !splits.episodes(Split::Validation).is_empty()
+        })
+        .unwrap();
+    let config = small_config(&["data.windows=all", &format!("data.split_seed={split_seed}")]);
+    let run_dir = dir.path().join("run");
+    let error = train(&config, &dataset, &run_dir).unwrap_err();
+    assert!(
+        matches!(error, TrainError::NoWindows { train: 0, validation, .. } if validation > 0),
+        "{error}"
+    );
+    assert!(
+        error.to_string().contains("has 0 training windows and")
+            && error.to_string().contains("training needs at least 1 of each"),
+        "{error}"
+    );
+    assert!(!run_dir.exists());
+}
+
+#[test]
+fn too_many_windows_are_refused_with_their_number() {
     let dir = tempfile::tempdir().unwrap();
     let error = train(&small_config(&["data.windows=100000"]), &squares(20), dir.path())
         .unwrap_err()

@@ -1,4 +1,4 @@
-//! Too many requests for predictions.
+//! Overload by prediction requests.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,99 +8,99 @@ use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use super::{Args, watch_memory};
-use crate::figures::{Bounds, Latencies};
+use super::{SaturateArgs, watch_memory};
 use crate::http::{Http, Request};
-use crate::material::Material;
-use crate::pace::Pace;
-use crate::process::CpuShare;
+use crate::process_usage::CpuShare;
+use crate::report::{Bounds, Latencies};
+use crate::schedule::Schedule;
 use crate::server::Server;
+use crate::workload::Workload;
 
-/// Connections that ask again and again, in search of the peak.
+/// Numbers of connections tried to find the peak.
 const LEVELS: [usize; 3] = [16, 64, 128];
 
-/// What came of requests.
+/// Outcomes of requests.
 #[derive(Default)]
-struct Tally {
+struct RequestCounts {
     sent: u64,
     answered: Vec<Duration>,
     /// 429 and 503 that say when to try again.
     refused: u64,
-    /// All that should not be: other answers, or none.
+    /// Other answers, or none, with their counts.
     faults: BTreeMap<String, u64>,
 }
 
-pub(super) async fn run(args: &Args, bounds: &mut Bounds) {
+pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     let mut server = Server::start(&args.target, &[("max_queued_predictions", args.queue)]).await;
-    let request = Material::of(&args.target.model).predict_json();
+    let request = Workload::of(&args.target.model).predict_json();
     let mut peak_hz: f64 = 0.0;
     for level in LEVELS {
         let cpu = CpuShare::begin(server.process.clone());
         let answered = closed(level, &server, &request, args.peak_time()).await.answered.len();
         let (goodput_hz, each_us) = (answered as f64 / args.peak_s, cpu.each_us(answered));
         println!(
-            "requests: {goodput_hz:.0} predictions/s of {level} connections that ask again and again, for {each_us:.0} µs \
-             of the server's processor time each"
+            "requests: {goodput_hz:.0} predictions/s with {level} connections in a closed loop; {each_us:.0} µs of server \
+             processor time per prediction"
         );
         peak_hz = peak_hz.max(goodput_hz);
     }
     let (offered_hz, process) = (args.times * peak_hz, server.process.clone());
     let memory = tokio::spawn(watch_memory(process, args.time()));
     let cpu = CpuShare::begin(server.process.clone());
-    let (tally, held_back) = open(args, offered_hz, &server, &request).await;
-    let latencies = Latencies::of(tally.answered);
+    let (counts, not_sent) = open(args, offered_hz, &server, &request).await;
+    let latencies = Latencies::of(counts.answered);
     let (goodput_hz, each_us) = (latencies.len() as f64 / args.seconds, cpu.each_us(latencies.len()));
     println!(
-        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s for {each_us:.0} µs each, {} of {} \
-         refused with Retry-After, {held_back} not sent for want of a connection; predictions {latencies}",
-        args.seconds, tally.refused, tally.sent
+        "requests: {offered_hz:.0}/s offered for {} s: {goodput_hz:.0} predictions/s, {each_us:.0} µs each; {} of {} \
+         refused with Retry-After; {not_sent} not sent because no connection was free; latency {latencies}",
+        args.seconds, counts.refused, counts.sent
     );
-    args.hold_goodput(goodput_hz, peak_hz, bounds);
-    let faults = tally.faults;
-    bounds.hold(
+    args.check_goodput(goodput_hz, peak_hz, bounds);
+    let faults = counts.faults;
+    bounds.check(
         faults.is_empty(),
-        format!("every request was predicted or refused with Retry-After {faults:?}"),
+        format!("every request was predicted or refused with Retry-After; faults: {faults:?}"),
     );
-    args.hold_memory(&memory.await.unwrap(), &mut server, bounds);
+    args.check_memory(&memory.await.unwrap(), &mut server, bounds);
 }
 
-/// So many connections that ask again and again.
-async fn closed(connections: usize, server: &Server, request: &Request, time: Duration) -> Tally {
+/// Sends requests in a closed loop on each connection.
+async fn closed(connections: usize, server: &Server, request: &Request, time: Duration) -> RequestCounts {
     let until = Instant::now() + time;
     let mut asking = JoinSet::new();
     for _ in 0..connections {
-        let (mut http, request, mut tally) = (Http::new(server.address), request.clone(), Tally::default());
+        let (mut http, request, mut counts) = (Http::new(server.address), request.clone(), RequestCounts::default());
         asking.spawn(async move {
             while Instant::now() < until {
-                tally.ask(&mut http, &request, until).await;
+                counts.ask(&mut http, &request, until).await;
             }
-            tally
+            counts
         });
     }
     sum(asking).await
 }
 
-/// Requests at times, each on a connection that is free; and how many found none.
-async fn open(args: &Args, rate_hz: f64, server: &Server, request: &Request) -> (Tally, u64) {
+/// Sends scheduled requests on free connections. Returns also how many found no free connection.
+async fn open(args: &SaturateArgs, rate_hz: f64, server: &Server, request: &Request) -> (RequestCounts, u64) {
     let begin = Instant::now();
     let (until, limit) = (begin + args.time(), args.connections);
-    let (due, held_back) = (Arc::new(Semaphore::new(0)), Arc::new(AtomicU64::new(0)));
+    let (due, not_sent) = (Arc::new(Semaphore::new(0)), Arc::new(AtomicU64::new(0)));
     let mut asking = JoinSet::new();
     for _ in 0..args.connections {
-        let (mut http, request, mut tally) = (Http::new(server.address), request.clone(), Tally::default());
+        let (mut http, request, mut counts) = (Http::new(server.address), request.clone(), RequestCounts::default());
         let due = Arc::clone(&due);
         asking.spawn(async move {
             while let Ok(one) = due.acquire().await {
                 one.forget();
-                tally.ask(&mut http, &request, until).await;
+                counts.ask(&mut http, &request, until).await;
             }
-            tally
+            counts
         });
     }
-    let (of_pace, count) = (Arc::clone(&due), Arc::clone(&held_back));
-    Pace::lasting(begin, rate_hz, args.time()).start(move |_| {
-        if of_pace.available_permits() < limit {
-            of_pace.add_permits(1);
+    let (permits, count) = (Arc::clone(&due), Arc::clone(&not_sent));
+    Schedule::lasting(begin, rate_hz, args.time()).start(move |_| {
+        if permits.available_permits() < limit {
+            permits.add_permits(1);
         } else {
             count.fetch_add(1, Ordering::Relaxed);
         }
@@ -108,24 +108,24 @@ async fn open(args: &Args, rate_hz: f64, server: &Server, request: &Request) -> 
     tokio::time::sleep_until(until.into()).await;
     due.close();
     let never_sent = due.available_permits() as u64;
-    (sum(asking).await, held_back.load(Ordering::Relaxed) + never_sent)
+    (sum(asking).await, not_sent.load(Ordering::Relaxed) + never_sent)
 }
 
-async fn sum(asking: JoinSet<Tally>) -> Tally {
-    let mut sum = Tally::default();
-    for tally in asking.join_all().await {
-        sum.sent += tally.sent;
-        sum.refused += tally.refused;
-        sum.answered.extend(tally.answered);
-        for (fault, count) in tally.faults {
+async fn sum(asking: JoinSet<RequestCounts>) -> RequestCounts {
+    let mut sum = RequestCounts::default();
+    for counts in asking.join_all().await {
+        sum.sent += counts.sent;
+        sum.refused += counts.refused;
+        sum.answered.extend(counts.answered);
+        for (fault, count) in counts.faults {
             *sum.faults.entry(fault).or_default() += count;
         }
     }
     sum
 }
 
-impl Tally {
-    /// Asks and notes what came; a prediction counts if it came in time.
+impl RequestCounts {
+    /// Sends a request and records the outcome. A prediction counts if it is received before `until`.
     async fn ask(&mut self, http: &mut Http, request: &Request, until: Instant) {
         self.sent += 1;
         let asked = Instant::now();

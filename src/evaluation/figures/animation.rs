@@ -1,16 +1,23 @@
-//! What the model sees ahead over a whole trial, as an endless GIF.
+//! Predictions over a whole trial, as an endless GIF.
 
-use super::montage::{MontageRow, Style, montage};
+use super::montage::{MontageRow, Style, enlarged, montage};
 use crate::frame::{Frame, FrameError, codec};
 
-/// One moment: all three frames belong to the same time, `steps_ahead` after the last frame seen.
+/// Frames as an endless GIF, enlarged to at least [`super::montage::CELL_WIDTH_PX`]. Errors: `Size` if a frame gets too
+/// large.
+pub fn enlarged_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
+    let frames = frames.iter().map(enlarged).collect::<Result<Vec<Frame>, FrameError>>()?;
+    codec::encode_gif(&frames, delay_ms)
+}
+
+/// One moment: three frames of the same time, `steps_ahead` after the last frame seen.
 #[derive(Clone, Debug)]
 pub struct AnimationFrame {
-    /// What came.
+    /// The true frame.
     pub truth: Frame,
     /// What the model predicted.
     pub predicted: Frame,
-    /// What a trivial baseline predicted.
+    /// What a baseline predicted.
     pub copied: Frame,
 }
 
@@ -51,11 +58,9 @@ impl Animation {
                     cell("last seen", &moment.copied),
                 ],
             };
-            // Smaller than a panel: every moment costs bytes.
-            let panel = Style::for_frames_of(moment.truth.width());
             let style = Style {
-                scale: (panel.scale * 2 / 3).max(1),
                 grid_lines: 0,
+                ..Style::for_frames_of(moment.truth.width())
             };
             montage(&format!("{} frames ahead", self.steps_ahead), &[row], &style)
         });

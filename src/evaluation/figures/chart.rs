@@ -35,11 +35,11 @@ pub fn draw(chart: &Chart) -> Result<String, EvaluationError> {
 
 fn draw_into(svg: &mut String, chart: &Chart) -> Result<(), String> {
     let area = SVGBackend::with_string(svg, SIZE_PX).into_drawing_area();
-    area.fill(&WHITE).map_err(told)?;
+    area.fill(&WHITE).map_err(as_text)?;
     let (plot, legend) = area.split_horizontally(SIZE_PX.0 - LEGEND_WIDTH_PX);
     draw_plot(&plot, chart)?;
     draw_legend(&legend, chart)?;
-    area.present().map_err(told)
+    area.present().map_err(as_text)
 }
 
 fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
@@ -53,7 +53,7 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
             0.8..steps as f64 + 0.2,
             (low..high).log_scale().with_key_points(ticks(low, high)),
         )
-        .map_err(told)?;
+        .map_err(as_text)?;
     plot.configure_mesh()
         .x_labels(steps.min(12) + 1)
         .x_label_formatter(&|step| {
@@ -67,8 +67,8 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
         .max_light_lines(0)
         .bold_line_style(RGBColor(225, 225, 225))
         .draw()
-        .map_err(told)?;
-    // The model comes first, so it is drawn last: over the others.
+        .map_err(as_text)?;
+    // The model is the first series and is drawn last, over the others.
     for (method, values) in chart.series.iter().rev() {
         let points: Vec<(f64, f64)> = (1..)
             .zip(values)
@@ -76,23 +76,23 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
             .collect();
         if is_dashed(*method) {
             plot.draw_series(DashedLineSeries::new(points.iter().copied(), 6, 5, stroke(*method)))
-                .map_err(told)?;
+                .map_err(as_text)?;
         } else {
             plot.draw_series(LineSeries::new(points.iter().copied(), stroke(*method)))
-                .map_err(told)?;
+                .map_err(as_text)?;
         }
         plot.draw_series(
             points
                 .iter()
                 .map(|&point| Circle::new(point, 4, color(*method).filled())),
         )
-        .map_err(told)?;
+        .map_err(as_text)?;
     }
     Ok(())
 }
 
 fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
-    // From the worst to the best at the end, as the lines lie beside it.
+    // From the greatest to the least error at the last step, in the order of the lines' ends.
     let last = |(_, values): &&(Method, Vec<f64>)| values.last().copied().unwrap_or(0.0);
     let mut series: Vec<_> = chart.series.iter().collect();
     series.sort_by(|one, other| last(other).total_cmp(&last(one)));
@@ -104,16 +104,16 @@ fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
         } else {
             area.draw(&PathElement::new(ends, stroke(method)))
         }
-        .map_err(told)?;
+        .map_err(as_text)?;
         area.draw(&Circle::new((24, y), 4, color(method).filled()))
-            .map_err(told)?;
+            .map_err(as_text)?;
         area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 18)))
-            .map_err(told)?;
+            .map_err(as_text)?;
     }
     Ok(())
 }
 
-/// The codec is shown the true frame: no prediction.
+/// The codec sees the true frame, so it is no prediction.
 fn is_dashed(method: Method) -> bool {
     method == Method::CodecOnly
 }
@@ -122,11 +122,11 @@ fn stroke(method: Method) -> ShapeStyle {
     color(method).stroke_width(if method == Method::Model { 4 } else { 2 })
 }
 
-fn told(error: impl Display) -> String {
+fn as_text(error: impl Display) -> String {
     error.to_string()
 }
 
-/// A logarithmic axis has no zero; a value of none is drawn at the bottom.
+/// A logarithmic axis has no zero; a value of 0 is drawn at the bottom.
 fn shown(value: f64, low: f64) -> f64 {
     (value / UNIT).max(low)
 }
@@ -158,7 +158,7 @@ fn ticks(low: f64, high: f64) -> Vec<f64> {
     all.filter(|tick| (low..=high).contains(tick)).collect()
 }
 
-/// Colours that stay apart for most kinds of colour blindness (Okabe & Ito 2008).
+/// Colours that most colour-blind readers can tell apart (Okabe & Ito 2008, and two more).
 fn color(method: Method) -> RGBColor {
     match method {
         Method::Model => RGBColor(213, 94, 0),
@@ -167,7 +167,10 @@ fn color(method: Method) -> RGBColor {
         Method::MeanTrainingFrame => RGBColor(204, 121, 167),
         Method::LinearExtrapolation => RGBColor(230, 159, 0),
         Method::ConstantShift => RGBColor(86, 180, 233),
-        Method::CodecOnly => RGBColor(90, 90, 90),
+        Method::EgoMotion => RGBColor(0, 0, 0),
+        Method::MovingCutOut => RGBColor(190, 170, 0),
+        Method::NearestWindow => RGBColor(130, 80, 40),
+        Method::CodecOnly => RGBColor(110, 110, 110),
     }
 }
 
@@ -176,14 +179,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_axis_within_a_decade_has_ticks_and_one_over_many_has_few() {
+    fn a_long_axis_has_fewer_ticks_per_decade() {
         assert_eq!(ticks(0.9, 30.0), [1.0, 2.0, 5.0, 10.0, 20.0]);
         assert_eq!(ticks(1.5, 9.0), [2.0, 5.0]);
         assert_eq!(ticks(1e-4, 1e4).len(), 9);
     }
 
     #[test]
-    fn the_legend_stands_in_the_order_in_which_the_lines_end() {
+    fn the_legend_has_the_order_of_the_lines_ends() {
         let chart = Chart {
             file: "error.svg".to_owned(),
             caption: String::new(),

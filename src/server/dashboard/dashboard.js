@@ -1,12 +1,12 @@
 "use strict";
-// A simulated robot runs on the server; this page drives it, streams its frames to a model, and shows what the model
-// foresaw beside what came.
+// A simulated robot runs on the server. This page drives it, streams its frames to a model, and shows the predicted frames
+// beside the actual ones.
 
 const by_id = id => document.getElementById(id);
 const as_png = frame => `data:image/png;base64,${frame}`;
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
-// Where the server asks for a key, this tab keeps it: in headers, never in an address.
+// The tab keeps the API key and sends it in headers, never in a URL.
 let key = sessionStorage.getItem("key");
 class Locked extends Error {}
 
@@ -16,7 +16,7 @@ async function call(method, path, body) {
   const response = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
   const answer = response.status === 204 ? null : await response.json();
   if (response.status === 401) {
-    if (shown === key) lock(shown ? "This key is not known here, or was revoked." : "");
+    if (shown === key) lock(shown ? "This key is unknown or was revoked." : "");
     throw new Locked(answer.detail);
   }
   if (!response.ok) throw new Error(answer.detail);
@@ -24,7 +24,7 @@ async function call(method, path, body) {
 }
 
 function lock(why) {
-  run++; // The trial ends.
+  run++; // Ends the trial.
   key = null;
   sessionStorage.removeItem("key");
   if (why || by_id("unlock").hidden) by_id("refused").textContent = why;
@@ -34,8 +34,8 @@ function lock(why) {
 by_id("unlock").addEventListener("submit", async event => {
   event.preventDefault();
   const given = by_id("key").value.trim();
-  // What is no key may not even be sent as one.
-  if (!/^ffk_[0-9a-f]+_[\w-]+$/.test(given)) return lock("This is no key: keys look like ffk_0123456789ab_… and are told once, when they are made.");
+  // Do not send a text that cannot be a key.
+  if (!/^ffk_[0-9a-f]+_[\w-]+$/.test(given)) return lock("This is not a key. A key looks like ffk_0123456789ab_… and is shown once, when it is created.");
   key = given;
   try {
     await call("GET", "/v1/models");
@@ -53,7 +53,7 @@ by_id("unlock").addEventListener("submit", async event => {
   refresh();
 });
 
-// The keys that are held, as a command in m/s and rad/s.
+// The command of the pressed keys, in m/s and rad/s.
 const held = new Set();
 const KEYS = { w: "w", arrowup: "w", a: "a", arrowleft: "a", s: "s", arrowdown: "s", d: "d", arrowright: "d" };
 const [SPEED_M_S, TURN_RAD_S] = [0.35, 0.9];
@@ -79,12 +79,12 @@ for (const button of document.querySelectorAll("#pad button")) {
   for (const end of ["pointerup", "pointercancel", "pointerleave"]) button.addEventListener(end, () => hold(button.dataset.key, false));
 }
 
-// A stream of one model: `send` answers with the message that belongs to the frame.
+// A stream of one model. `send` resolves to the answer to that frame.
 class Stream {
   static open(model) {
     return new Promise((opened, failed) => {
       const address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/v1/models/${model}/stream`;
-      // A browser sets no headers of a WebSocket; the key goes along as a sub-protocol.
+      // A browser cannot set headers of a WebSocket, so the key is sent as a sub-protocol.
       const stream = new Stream(new WebSocket(address, ["foreframe.v1.json", ...(key ? [`foreframe.key.${key}`] : [])]));
       stream.waiting = { resolve: ready => opened(Object.assign(stream, { ready })), reject: failed };
     });
@@ -125,7 +125,7 @@ async function pixels(frame) {
 }
 const mse = (one, other) => one.reduce((sum, value, i) => sum + ((value - other[i]) / 255) ** 2, 0) / one.length;
 
-// The rows of film: one column for each predicted step.
+// Prepares the table: one column for each predicted step.
 function lay_out({ horizon, frame_width_px, frame_height_px }) {
   by_id("drive").style.setProperty("--horizon", horizon);
   by_id("drive").style.setProperty("--aspect", frame_width_px / frame_height_px);
@@ -133,7 +133,7 @@ function lay_out({ horizon, frame_width_px, frame_height_px }) {
   for (const row of [head, ...document.querySelectorAll("#film tbody tr")]) while (row.cells.length > 1) row.deleteCell(1);
   for (let step = 1; step <= horizon; step++) {
     head.insertCell().textContent = `t+${step}`;
-    for (const row of ["next", "foreseen", "came"]) by_id(row).insertCell().append(new Image());
+    for (const row of ["next", "predicted", "actual"]) by_id(row).insertCell().append(new Image());
     by_id("error").insertCell();
   }
 }
@@ -143,45 +143,48 @@ function show(row, frames) {
   });
 }
 
-// One trial after another until another model is chosen or the server ends it.
+// Runs trials until the user selects another model or leaves the page.
 let run = 0;
 async function drive(model) {
   const mine = ++run;
   const { context, horizon, frame_period_s, frame_width_px, frame_height_px, conditioning, actions, states } = model.spec;
-  const told = conditioning !== "none";
-  const scenario = model.lineage.scenario ?? (told ? "moving-observer" : "static-observer");
+  const [takes_actions, takes_state] = [conditioning.endsWith("action"), conditioning.startsWith("state")];
+  const scenario = model.lineage.scenario ?? (takes_actions ? "moving-observer" : "static-observer");
   const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: scenario === "static-observer" ? 30 : 3600 };
   lay_out(model.spec);
-  by_id("foreseen").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)}\u00a0s ago`;
+  by_id("predicted").cells[0].textContent = `predicted ${(horizon * frame_period_s).toFixed(1)}\u00a0s ago`;
   by_id("keys").hidden = scenario === "static-observer";
   const seed = Math.floor(Math.random() * 2 ** 32);
   const environment = await call("POST", "/v1/environments", { scenario, seed, world });
   const path = `/v1/environments/${environment.id}`;
+  // A closed or reloaded page deletes its environment; the request outlives the page.
+  const leave = () => fetch(path, { method: "DELETE", keepalive: true, headers: key ? { Authorization: `Bearer ${key}` } : {} });
+  addEventListener("pagehide", leave);
   let stream = null;
   try {
     let { observation, info } = environment;
     while (mine === run) {
       stream = await Stream.open(model.name);
-      const past = []; // What was seen and foreseen, the latest last.
+      const past = []; // Frames with their predictions, the latest last.
       for (let ended = false; !ended && mine === run;) {
         const started = performance.now();
         const action = command() ?? info.policy_action;
-        const answer = await stream.send(observation.frame, told ? action : undefined, states.length ? observation.state : undefined);
+        const answer = await stream.send(observation.frame, takes_actions ? action : undefined, takes_state ? observation.state : undefined);
         const round_trip_ms = performance.now() - started;
-        past.push({ frame: observation.frame, foreseen: answer.frames });
+        past.push({ frame: observation.frame, predicted: answer.frames });
         if (past.length > horizon + 1) past.shift();
         by_id("now").src = as_png(observation.frame);
         show("next", answer.frames ?? []);
         const origin = past[0];
-        if (past.length > horizon && origin.foreseen) {
-          show("foreseen", origin.foreseen);
-          show("came", past.slice(1).map(moment => moment.frame));
+        if (past.length > horizon && origin.predicted) {
+          show("predicted", origin.predicted);
+          show("actual", past.slice(1).map(moment => moment.frame));
           compare(origin, past.slice(1).map(moment => moment.frame));
         }
         const speed = action.map(value => value.toFixed(2));
-        by_id("status").textContent = (answer.type === "buffering" ? `${answer.have} of ${context} frames seen` :
+        by_id("status").textContent = (answer.type === "buffering" ? `${answer.have} of ${context} frames received` :
           `answered in ${round_trip_ms.toFixed(1)} ms, ${(answer.timing.compute_us / 1000).toFixed(1)} ms of it the model`) +
-          (told ? `; ${held.size ? "your keys" : "its own driver"}: ${speed[0]} m/s, ${speed[1]} rad/s` : "");
+          (takes_actions ? `; ${held.size ? "your keys" : "automatic driver"}: ${speed[0]} m/s, ${speed[1]} rad/s` : "");
         const step = await call("POST", `${path}/step`, { action });
         ({ observation, info } = step);
         ended = step.terminated || step.truncated;
@@ -191,17 +194,18 @@ async function drive(model) {
       if (mine === run) ({ observation, info } = await call("POST", `${path}/reset`, {}));
     }
   } finally {
+    removeEventListener("pagehide", leave);
     stream?.close();
-    await call("DELETE", path).catch(() => null); // It may be gone already.
+    await call("DELETE", path).catch(() => null); // It may already be deleted.
   }
 }
 
 async function compare(origin, came) {
-  const [last, foreseen, truth] = [await pixels(origin.frame), await Promise.all(origin.foreseen.map(pixels)), await Promise.all(came.map(pixels))];
+  const [last, predicted, truth] = [await pixels(origin.frame), await Promise.all(origin.predicted.map(pixels)), await Promise.all(came.map(pixels))];
   truth.forEach((frame, step) => {
     const cell = by_id("error").cells[step + 1];
-    if (!cell || !foreseen[step]) return;
-    const share = 100 * mse(foreseen[step], frame) / mse(last, frame);
+    if (!cell || !predicted[step]) return;
+    const share = 100 * mse(predicted[step], frame) / mse(last, frame);
     cell.textContent = Number.isFinite(share) ? `${share < 999 ? share.toFixed(0) : ">999"} %` : "–";
   });
 }
@@ -222,7 +226,7 @@ async function start() {
 by_id("model").addEventListener("change", () => { by_id("model").blur(); start(); });
 by_id("again").addEventListener("click", () => { by_id("again").blur(); start(); });
 
-// The tables of models and jobs.
+// Fills a table.
 function fill(id, rows, empty) {
   const body = by_id(id);
   const labels = [...body.parentElement.tHead.rows[0].cells].map(cell => cell.textContent);
@@ -252,11 +256,11 @@ function progress(job) {
   const words = [total ? `${done} of ${total}` : "", is_running ? message : "",
     is_running && remaining_s != null ? `${Math.ceil(remaining_s)} s left` : "",
     job.losses?.train == null ? "" : `loss ${job.losses.train.toPrecision(3)}`];
-  // A bar without a value says that it is not known how far the work is.
+  // A progress bar without a value means that the total is unknown.
   const bar = element("progress", total ? { max: total, value: done } : is_running ? {} : { max: 1, value: 0 });
   return element("span", {}, bar, element("span", { className: "quiet" }, words.filter(Boolean).join(", ")));
 }
-const does = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
+const task = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
 function skill({ metrics }) {
   const value = metrics.test?.skill;
   return value === undefined ? "not measured" : value.toFixed(2);
@@ -272,21 +276,22 @@ async function refresh() {
       `${model.name} v${model.active_version}`,
       `${model.spec.frame_width_px}×${model.spec.frame_height_px} px every ${model.spec.frame_period_s} s`,
       `${model.spec.context} → ${model.spec.horizon}`,
-      { none: "nothing", action: "actions", "state-action": "state and actions" }[model.spec.conditioning],
+      { none: "none", action: "actions", state: "state", "state-action": "state and actions" }[model.spec.conditioning],
       skill(model),
-    ]), "none is loaded; train one");
+    ]), "no model is loaded");
     if (names !== models.map(({ name }) => name).join()) {
       const chosen = by_id("model").value;
       by_id("model").replaceChildren(...models.map(({ name }) => new Option(name)));
-      const first = models.find(({ name }) => name === chosen) ?? models.find(({ spec }) => spec.conditioning !== "none") ?? models[0];
+      const first = models.find(({ name }) => name === chosen) ?? models.find(({ name }) => name === "static") ?? models[0];
       if (first) by_id("model").value = first.name;
       if (!chosen) start();
     }
+    if (!models.length) by_id("status").textContent = "No model is loaded. Put a model into the server's models directory, publish one with foreframe publish, or start a training job.";
     const { jobs } = await call("GET", "/v1/jobs?limit=20");
-    fill("jobs", jobs.map(job => [job.id, does(job.spec), job.state, progress(job)]), "none");
+    fill("jobs", jobs.map(job => [job.id, task(job.spec), job.state, progress(job)]), "none");
   } catch (error) {
-    if (error instanceof Locked) return; // Until there is a key.
-    // The server is away; the next refresh may find it.
+    if (error instanceof Locked) return; // Wait for a key.
+    // The server does not answer. Try again at the next refresh.
   }
   next_refresh = setTimeout(refresh, 1000);
 }

@@ -1,5 +1,5 @@
-//! One socket of a session: what comes is read and checked while what came before is computed and what was computed is
-//! sent, each in order.
+//! One WebSocket of a session. Three things run at the same time, each in order: it reads and checks messages, computes
+//! the answers to earlier ones, and sends the answers that are ready.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,23 +14,25 @@ use tracing::{debug, info, trace};
 use tungstenite::error::ProtocolError;
 
 use super::outbox::{Next, Outbox};
-use crate::server::error::bounded;
-use crate::server::images;
-use crate::server::protocol::{
-    ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, WarningCode,
+use super::protocol::{
+    ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, StreamLimits,
+    WarningCode,
 };
-use crate::server::sessions::core::{FrameStep, StepError};
-use crate::server::sessions::limits;
-use crate::server::sessions::session::{Hold, Holder, Session};
-use crate::server::{App, streams};
-use crate::serving::{ConditioningInput, RawConditioning, STEP};
+use super::session::{Owner, Ownership, Session};
+use super::step::{FrameStep, StepError};
+use crate::frame::fit::Fit;
+use crate::server::blocking::BlockingWork;
+use crate::server::config::ServerConfig;
+use crate::server::http::problem::bounded;
+use crate::server::http::streams::{Streams, stop_requested};
+use crate::server::images::ImageFormat;
+use crate::serving::Predictor;
 use crate::telemetry::names;
-use crate::types::{Action, RobotState};
 
-/// How long a client may take to hang up after the end was said, so that it has read it.
+/// How long a client may take to close the socket after the last message, so that it can read it.
 const LINGER: Duration = Duration::from_secs(1);
 
-/// What is answered in the order in which it came.
+/// A message that is answered in the order in which it came.
 enum PipelinedItem {
     Frame(Box<FrameStep>),
     Configure(ConfigureMessage),
@@ -38,28 +40,37 @@ enum PipelinedItem {
 }
 
 impl PipelinedItem {
-    /// What waits to be told is bounded as what is told.
+    /// The detail is shortened here already, since it waits in memory.
     fn refused(code: ErrorCode, detail: String) -> Self {
         Self::Refused(code, bounded(detail))
     }
 }
 
-/// What came over the socket.
+/// What the socket gave.
 enum Received {
     Message(Message),
-    /// For too long.
-    Nothing,
-    /// And after it no more can be told apart.
+    /// No message for too long.
+    Idle,
+    /// Bytes that are not a WebSocket message; nothing after them can be read.
     Unreadable(ClosingReason, String),
 }
 
-/// The client is gone: nothing more can be said to it.
+/// The client has closed the connection: nothing can be sent any more.
 struct ClientGone;
 
-pub(super) struct StreamConnection {
-    app: App,
-    hold: Hold,
-    is_kept: bool,
+/// What a stream needs of the server.
+pub(in crate::server) struct StreamServices {
+    pub(in crate::server) config: Arc<ServerConfig>,
+    pub(in crate::server) predictor: Predictor,
+    pub(in crate::server) blocking: BlockingWork,
+    pub(in crate::server) streams: Streams,
+}
+
+pub(in crate::server) struct StreamConnection {
+    services: StreamServices,
+    ownership: Ownership,
+    /// Whether the session outlives the stream.
+    is_persistent: bool,
     codec: Codec,
     outbox: Outbox,
     frames: Counter,
@@ -67,29 +78,34 @@ pub(super) struct StreamConnection {
 }
 
 impl StreamConnection {
-    /// Takes the session from whoever holds it.
-    pub(super) fn new(app: App, session: &Arc<Session>, is_kept: bool, codec: Codec) -> Self {
-        let outbox = Outbox::new(app.config().max_stream_buffer_bytes);
-        let hold = session.hold();
+    /// Takes over the session from the connection before. `is_persistent`: the session outlives the stream.
+    pub(in crate::server) fn new(
+        services: StreamServices,
+        session: &Arc<Session>,
+        is_persistent: bool,
+        codec: Codec,
+    ) -> Self {
+        let outbox = Outbox::new(services.config.max_stream_buffer_bytes);
+        let ownership = session.connect();
         let model = &session.model().manifest.name;
         Self {
             frames: counter!(names::STREAM_FRAMES, "model" => model.clone()),
             overtaken: counter!(names::STREAM_OVERTAKEN, "model" => model.clone()),
-            app,
-            hold,
-            is_kept,
+            services,
+            ownership,
+            is_persistent,
             codec,
             outbox,
         }
     }
 
-    pub(super) async fn run(self, socket: WebSocket) {
-        let session = self.hold.session();
+    pub(in crate::server) async fn run(self, socket: WebSocket) {
+        let session = self.ownership.session();
         info!(session.id = %session.id(), model.id = %session.model().manifest.name, "stream opened");
         let (mut sink, mut stream) = socket.split();
         self.outbox.push(self.ready()).await;
         let worked = async {
-            let (inbox, items) = mpsc::channel(self.app.config().max_pipelined_frames);
+            let (inbox, items) = mpsc::channel(self.services.config.max_pipelined_frames);
             let answered = self.answer(items).map(Ok);
             let (reason, ()) = tokio::try_join!(self.read(&mut stream, inbox), answered)?;
             self.outbox.close(reason);
@@ -101,42 +117,42 @@ impl StreamConnection {
             written = self.write(&mut sink) => written,
         };
         if ended.is_ok() {
-            // Closing with unread bytes would reset the connection before the client has read why.
-            read_out(&mut stream).await;
+            // Closing with unread input would reset the connection before the client has read the reason.
+            discard_input(&mut stream).await;
         }
         info!(
-            frames = self.hold.session().next_seq(),
-            gone = ended.is_err(),
+            frames = self.ownership.session().next_seq(),
+            client_gone = ended.is_err(),
             "stream closed"
         );
     }
 
     fn ready(&self) -> ServerMessage {
-        let session = self.hold.session();
+        let session = self.ownership.session();
         let manifest = &session.model().manifest;
         ServerMessage::Ready {
-            session: self.is_kept.then(|| session.id().to_owned()),
+            session: self.is_persistent.then(|| session.id().to_owned()),
             model: manifest.name.clone(),
             version: manifest.version,
             spec: Box::new(manifest.spec.clone()),
-            limits: limits(self.app.config(), self.is_kept),
+            limits: StreamLimits::new(&self.services.config, self.is_persistent),
             next_seq: session.next_seq(),
         }
     }
 
-    /// Reads until the stream shall end; says why.
+    /// Reads until the stream ends; gives the reason.
     async fn read(
         &self,
         stream: &mut SplitStream<WebSocket>,
         inbox: mpsc::Sender<PipelinedItem>,
     ) -> Result<ClosingReason, ClientGone> {
-        let mut stopping = self.app.streams().stopping();
+        let mut stopping = self.services.streams.stopping();
         tokio::select! {
             biased;
-            () = streams::told(&mut stopping) => Ok(ClosingReason::Shutdown),
-            holder = self.hold.lost() => Ok(match holder {
-                Holder::Connection(_) => ClosingReason::Replaced,
-                Holder::Deleted => ClosingReason::Deleted,
+            () = stop_requested(&mut stopping) => Ok(ClosingReason::Shutdown),
+            owner = self.ownership.lost() => Ok(match owner {
+                Owner::Connection(_) => ClosingReason::Replaced,
+                Owner::Deleted => ClosingReason::Deleted,
             }),
             end = self.read_all(stream, &inbox) => end,
         }
@@ -147,10 +163,12 @@ impl StreamConnection {
         stream: &mut SplitStream<WebSocket>,
         inbox: &mpsc::Sender<PipelinedItem>,
     ) -> Result<ClosingReason, ClientGone> {
+        // Frames are read before the messages ahead of them are answered, so the reader keeps its own copy.
+        let mut fit = self.ownership.session().settings().fit;
         loop {
             let message = match self.receive(stream).await? {
                 Received::Message(message) => message,
-                Received::Nothing => return Ok(ClosingReason::Idle),
+                Received::Idle => return Ok(ClosingReason::Idle),
                 Received::Unreadable(reason, detail) => {
                     inbox
                         .send(PipelinedItem::refused(ErrorCode::Malformed, detail))
@@ -163,12 +181,15 @@ impl StreamConnection {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
-                    self.checked(frame).map_or_else(
+                    self.checked(frame, fit).await.map_or_else(
                         |error| PipelinedItem::refused(error.code(), error.to_string()),
-                        PipelinedItem::Frame,
+                        |step| PipelinedItem::Frame(Box::new(step)),
                     )
                 }
-                Ok(ClientMessage::Configure(message)) => PipelinedItem::Configure(message),
+                Ok(ClientMessage::Configure(message)) => {
+                    fit = message.fit.or(fit);
+                    PipelinedItem::Configure(message)
+                }
                 Ok(ClientMessage::Ping(ping)) => {
                     let timestamp_us = ping.timestamp_us;
                     self.outbox.push(ServerMessage::Pong { timestamp_us }).await;
@@ -181,9 +202,9 @@ impl StreamConnection {
         }
     }
 
-    /// The next message of the protocol, warning once of silence.
+    /// The next message of the protocol. Sends a warning once if none comes for long.
     async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, ClientGone> {
-        let quarter = Duration::from_millis(self.app.config().stream_idle_ms) / 4;
+        let quarter = Duration::from_millis(self.services.config.stream_idle_ms) / 4;
         let mut is_warned = false;
         loop {
             let wait = if is_warned { quarter } else { 3 * quarter };
@@ -191,19 +212,19 @@ impl StreamConnection {
                 Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
                     return Ok(Received::Message(message));
                 }
-                // Answered by the WebSocket itself; a sign of life.
+                // The WebSocket library answers these; they show that the client is there.
                 Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
                 Ok(None) => return Err(ClientGone),
                 Ok(Some(Ok(Message::Close(_)))) => {
-                    // The answer to a close is sent with the next read.
-                    read_out(stream).await;
+                    // The library answers a close with the next read.
+                    discard_input(stream).await;
                     return Err(ClientGone);
                 }
                 Ok(Some(Err(error))) => return unreadable(error),
-                Err(_) if is_warned => return Ok(Received::Nothing),
+                Err(_) if is_warned => return Ok(Received::Idle),
                 Err(_) => {
                     is_warned = true;
-                    let detail = format!("nothing came; in {} ms the stream is closed", quarter.as_millis());
+                    let detail = format!("no message came; in {} ms the stream is closed", quarter.as_millis());
                     let code = WarningCode::Idle;
                     self.outbox.push(ServerMessage::Warning { code, detail }).await;
                 }
@@ -211,38 +232,21 @@ impl StreamConnection {
         }
     }
 
-    /// The frame, if it fits the model.
-    fn checked(&self, message: FrameMessage) -> Result<Box<FrameStep>, StepError> {
-        let manifest = &self.hold.session().model().manifest;
-        let action = |field| {
-            move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
-        };
-        let past: Option<Action> = message.action.map(action("action")).transpose()?;
-        let plan: Option<Vec<Action>> = message
-            .plan
-            .map(|plan| plan.into_iter().map(action("plan")).collect())
-            .transpose()?;
-        let state = message.state.map(RobotState::try_from).transpose();
-        let state = state.map_err(|source| StepError::Value { field: "state", source })?;
-        let told = RawConditioning {
-            past: past.as_slice(),
-            future: plan.as_deref(),
-            state: state.as_ref(),
-        };
-        Ok(Box::new(FrameStep {
-            seq: message.seq,
-            timestamp_us: message.timestamp_us,
-            premise: ConditioningInput::new(told, &STEP, &manifest.name, &manifest.spec)?,
-            frame: images::decode("image", message.image, message.format, manifest)?,
-            format: message.format,
-            is_overtaken: false,
-        }))
+    /// The frame, if it fits the model. Raw pixels need no other thread; an image file does.
+    async fn checked(&self, message: FrameMessage, fit: Option<Fit>) -> Result<FrameStep, StepError> {
+        let manifest = Arc::clone(&self.ownership.session().model().manifest);
+        if message.format == ImageFormat::Raw {
+            return FrameStep::new(message, fit, &manifest);
+        }
+        let check = move || FrameStep::new(message, fit, &manifest);
+        self.services.blocking.run(check).await?
     }
 
-    /// Answers what was read, in order, until there is no more.
+    /// Answers the items in order, until there is no more.
     async fn answer(&self, mut items: mpsc::Receiver<PipelinedItem>) {
-        // So that who never stops sending hears of the future at times.
-        let limit = self.app.config().max_pipelined_frames;
+        // A client that never stops sending still gets a prediction at times.
+        let limit = self.services.config.max_pipelined_frames;
+        let (predictor, blocking) = (&self.services.predictor, &self.services.blocking);
         let (mut following, mut overtaken_in_a_row) = (None, 0);
         loop {
             let item = match following.take() {
@@ -255,14 +259,14 @@ impl StreamConnection {
                 PipelinedItem::Frame(mut step) => {
                     let is_behind = matches!(&following, Some(PipelinedItem::Frame(newer)) if newer.seq > step.seq);
                     step.is_overtaken = is_behind && overtaken_in_a_row < limit;
-                    match self.hold.step(self.app.predictor(), *step).await {
+                    match self.ownership.step(predictor, blocking, *step).await {
                         Ok(answer) => answer,
-                        // The reader has been told as well, and says why.
-                        Err(StepError::NotHeld) => return,
+                        // The reader notices it too, and gives the reason.
+                        Err(StepError::NotOwner) => return,
                         Err(error) => self.error(error.code(), bounded(error.to_string())),
                     }
                 }
-                PipelinedItem::Configure(message) => self.hold.session().configure(message),
+                PipelinedItem::Configure(message) => self.ownership.session().configure(message),
                 PipelinedItem::Refused(code, detail) => self.error(code, detail),
             };
             if let ServerMessage::Overtaken { .. } = answer {
@@ -276,13 +280,14 @@ impl StreamConnection {
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
-        let next_seq = self.hold.session().next_seq();
+        let next_seq = self.ownership.session().next_seq();
         ServerMessage::Error { code, detail, next_seq }
     }
 
-    /// Sends what waits until the end, which is said; a client that reads nothing for too long is told so and left.
+    /// Sends the messages in the outbox, then the reason for the end. If the client reads nothing for too long, the stream
+    /// ends with that reason.
     async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), ClientGone> {
-        let limit = Duration::from_millis(self.app.config().stream_send_ms);
+        let limit = Duration::from_millis(self.services.config.stream_send_ms);
         loop {
             let (message, reason) = match self.outbox.next().await {
                 Next::Message(message) => (message, None),
@@ -290,7 +295,7 @@ impl StreamConnection {
             };
             match timeout(limit, sink.send(self.codec.encode(&message))).await {
                 Ok(sent) => sent.map_err(|_| ClientGone)?,
-                Err(_) => return self.leave(sink, limit).await,
+                Err(_) => return self.close_slow(sink, limit).await,
             }
             if let Some(reason) = reason {
                 return close(sink, code_of(reason), limit).await;
@@ -298,8 +303,9 @@ impl StreamConnection {
         }
     }
 
-    async fn leave(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), ClientGone> {
-        debug!("the client reads nothing");
+    /// Ends the stream of a client that does not read.
+    async fn close_slow(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), ClientGone> {
+        debug!("the client does not read");
         let reason = ClosingReason::Slow;
         let last = self.codec.encode(&ServerMessage::Closing { reason });
         timeout(limit, sink.send(last))
@@ -310,7 +316,7 @@ impl StreamConnection {
     }
 }
 
-/// Why what came could not be read, if its sender is still there to be told.
+/// Why the bytes could not be read, if the client is still there.
 fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
     let error = error.into_inner();
     let reason = match error.downcast_ref::<tungstenite::Error>() {
@@ -323,10 +329,10 @@ fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
     Ok(Received::Unreadable(reason, error.to_string()))
 }
 
-/// Reads what still comes, for a moment.
-async fn read_out(stream: &mut SplitStream<WebSocket>) {
+/// Discards input for a moment.
+async fn discard_input(stream: &mut SplitStream<WebSocket>) {
     let all = async { while let Some(Ok(_)) = stream.next().await {} };
-    // Whoever does not hang up by then is left.
+    // A client that has not closed by then gets no more time.
     let _ = timeout(LINGER, all).await;
 }
 

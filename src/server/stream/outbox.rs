@@ -1,5 +1,5 @@
-//! What waits to be read by a client: a bounded number of bytes. Predictions make room for newer ones; what else is said
-//! is never dropped, and whoever says it waits for room.
+//! The messages that wait to be sent to a client: a bounded number of bytes. If there is no room, the oldest predictions
+//! are dropped. Other messages are never dropped; they wait for room.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -7,10 +7,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use metrics::counter;
 use tokio::sync::Notify;
 
-use crate::server::protocol::{ClosingReason, ServerMessage, WarningCode};
+use super::protocol::{ClosingReason, ServerMessage, WarningCode};
 use crate::telemetry::names;
 
-/// What a message weighs besides its images and what it quotes, in bytes: more than any but `ready` takes.
+/// The assumed size of a message without its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
 
 /// What the writer does next.
@@ -18,7 +18,7 @@ const MESSAGE_BYTES: usize = 512;
 pub(super) enum Next {
     /// Send this.
     Message(ServerMessage),
-    /// Say why, and close.
+    /// Send the reason, and close.
     Close(ClosingReason),
 }
 
@@ -32,7 +32,7 @@ pub(super) struct Outbox {
 struct OutboxState {
     waiting: VecDeque<ServerMessage>,
     bytes: usize,
-    /// Predictions dropped since the last one that was taken.
+    /// Predictions dropped since the last one that was sent.
     dropped: u64,
     closing: Option<ClosingReason>,
 }
@@ -46,7 +46,7 @@ impl Outbox {
         }
     }
 
-    /// Adds a message. A prediction takes the place of the oldest ones where there is no room; anything else waits for it.
+    /// Adds a message. A prediction replaces the oldest ones if there is no room; any other message waits for room.
     pub(super) async fn push(&self, message: ServerMessage) {
         if matches!(message, ServerMessage::Prediction { .. }) {
             self.state().push_prediction(message, self.limit_bytes);
@@ -62,7 +62,7 @@ impl Outbox {
         loop {
             let changed = self.changed.notified();
             tokio::pin!(changed);
-            // From here on no change is missed.
+            // From here on, no change is missed.
             changed.as_mut().enable();
             if self.state().bytes + MESSAGE_BYTES <= self.limit_bytes.max(MESSAGE_BYTES) {
                 return;
@@ -71,7 +71,7 @@ impl Outbox {
         }
     }
 
-    /// Nothing follows but this, once all that waits has been sent.
+    /// Ends the outbox: after the waiting messages comes only this reason.
     pub(super) fn close(&self, reason: ClosingReason) {
         self.state().closing.get_or_insert(reason);
         self.changed.notify_waiters();
@@ -159,7 +159,7 @@ mod tests {
 
     use super::*;
     use crate::server::images::{ImageBytes, ImageFormat};
-    use crate::server::protocol::Timing;
+    use crate::server::stream::protocol::Timing;
 
     fn prediction(seq: u64, size: usize) -> ServerMessage {
         ServerMessage::Prediction {
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_predictions_make_room_and_the_next_one_sent_says_how_many() {
+    fn the_oldest_predictions_are_dropped_and_counted() {
         let mut state = OutboxState::default();
         state.push(pong(1));
         for seq in 0..5 {
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_waits_for_room_and_the_end_comes_last() {
+    fn other_messages_wait_for_room_and_the_end_comes_last() {
         let outbox = Outbox::new(2 * MESSAGE_BYTES);
         for timestamp_us in 0..2 {
             assert!(outbox.push(pong(timestamp_us)).now_or_never().is_some());
@@ -218,7 +218,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_waits_stays_within_the_limit_and_every_prediction_is_sent_or_counted(
+        fn the_outbox_stays_within_its_limit_and_counts_drops(
             pushes in proptest::collection::vec((any::<bool>(), 0usize..3000), 0..60),
         ) {
             let (mut state, limit) = (OutboxState::default(), 8000);
@@ -237,7 +237,7 @@ mod tests {
                     state.push_prediction(prediction(pushed, size), limit);
                     pushed += 1;
                 }
-                // One prediction and the warning are there even where they are over it.
+                // One prediction and the warning are accepted even over the limit.
                 prop_assert!(state.bytes <= limit + bytes(&slow()), "{}", state.bytes);
             }
             while count(&mut state) {}

@@ -1,5 +1,5 @@
-//! Gradients as values: taken, joined, measured.
-// A closure's vector instructions reach what is inlined into it, and only that.
+//! Gradients as values: computed from a loss, averaged over parts of a batch, and measured.
+// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 use std::collections::BTreeMap;
@@ -19,8 +19,8 @@ pub struct Gradients {
 }
 
 impl Gradients {
-    /// Gradients of the scalar `loss` for all parameters it depends on, but those whose name starts with one of the
-    /// `frozen` prefixes. Errors: `LossNotFinite`.
+    /// Gradients of the scalar `loss` for all parameters on which it depends, except those whose name starts with one of
+    /// the `frozen` prefixes. Errors: `LossNotFinite`.
     pub fn of(loss: &Tensor, parameters: &Parameters, frozen: &[&str]) -> Result<Self, OptimizerError> {
         let value = loss.to_dtype(DType::F64)?.to_scalar::<f64>()?;
         if !value.is_finite() {
@@ -67,7 +67,7 @@ impl Gradients {
         self.loss
     }
 
-    /// The gradient of the tensor of that name, if the loss depends on it.
+    /// The gradient of the tensor with this name, if the loss depends on it.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&Tensor> {
         self.by_name.get(name)
@@ -87,7 +87,7 @@ impl Gradients {
     }
 }
 
-/// Sum of squares, in f64 over blocks short enough that f32 loses nothing that matters.
+/// Sum of squares: short blocks in f32, the sum of the blocks in f64, so that the rounding error stays small.
 fn sum_of_squares(values: &[f32]) -> f64 {
     Arch::new().dispatch(
         #[inline(always)]

@@ -1,0 +1,106 @@
+//! Frames and requests made from the frames in `examples`, in the form that a model takes.
+
+use std::fs;
+use std::path::Path;
+
+use foreframe::frame::codec;
+use foreframe::nn::ModelSpec;
+use foreframe::registry::manifest;
+use foreframe::server::protocol::{ClientMessage, FrameMessage};
+use foreframe::server::{ImageBytes, ImageFormat};
+use serde_json::{Value, json};
+use tokio_tungstenite::tungstenite::Message;
+
+use crate::http::Request;
+
+const FRAMES: usize = 15;
+const BOUNDARY: &str = "frame-by-frame";
+
+/// The frames of `examples` and the model that they are sent to.
+pub(crate) struct Workload {
+    model: String,
+    spec: ModelSpec,
+    /// The frames as PNG files.
+    files: Vec<Vec<u8>>,
+    /// The frames as raw pixels.
+    images: Vec<Vec<u8>>,
+}
+
+impl Workload {
+    pub(crate) fn of(model: &str) -> Self {
+        let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let manifest = manifest::read(&project.join("models").join(model)).expect("the model is shipped");
+        let file = |index| fs::read(project.join(format!("examples/frames/frame-{index:03}.png"))).unwrap();
+        let files: Vec<Vec<u8>> = (0..FRAMES).map(file).collect();
+        let pixels = |file: &Vec<u8>| codec::decode(file).unwrap().pixels().to_vec();
+        Self {
+            model: model.to_owned(),
+            spec: manifest.spec,
+            images: files.iter().map(pixels).collect(),
+            files,
+        }
+    }
+
+    pub(crate) fn model(&self) -> &str {
+        &self.model
+    }
+
+    /// Frames that a session takes before its first prediction.
+    pub(crate) fn context(&self) -> u64 {
+        self.spec.context as u64
+    }
+
+    /// The stream message with frame `seq`.
+    pub(crate) fn frame(&self, seq: u64) -> Message {
+        message(&ClientMessage::Frame(FrameMessage {
+            seq,
+            timestamp_us: 0,
+            image: ImageBytes(self.images[seq as usize % FRAMES].clone()),
+            format: ImageFormat::Raw,
+            action: self.spec.action_inputs().map(|count| vec![0.1; count]),
+            state: self.spec.state_inputs().map(|count| vec![0.1; count]),
+            plan: None,
+        }))
+    }
+
+    /// A prediction request in JSON with base64 images.
+    pub(crate) fn predict_json(&self) -> Request {
+        let mut body = self.conditioning();
+        let images = self.files.iter().take(self.spec.context);
+        body["frames"] = images.map(|file| json!(ImageBytes(file.clone()))).collect();
+        Request::json(&self.predict_path(), &body)
+    }
+
+    /// The same request as a multipart form.
+    pub(crate) fn predict_form(&self) -> Request {
+        let mut body = Vec::new();
+        let head = |name: &str| format!("--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n");
+        for file in self.files.iter().take(self.spec.context) {
+            body.extend([head("frames").as_bytes(), file, b"\r\n"].concat());
+        }
+        let end = format!("{}{}\r\n--{BOUNDARY}--\r\n", head("request"), self.conditioning());
+        body.extend(end.as_bytes());
+        let content_type = format!("multipart/form-data; boundary={BOUNDARY}");
+        Request::post(&self.predict_path(), &content_type, &body)
+    }
+
+    fn predict_path(&self) -> String {
+        format!("/v1/models/{}/predict", self.model)
+    }
+
+    fn conditioning(&self) -> Value {
+        let mut conditioning = json!({});
+        if let Some(count) = self.spec.action_inputs() {
+            conditioning["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
+        }
+        if let Some(count) = self.spec.state_inputs() {
+            conditioning["state"] = json!(vec![0.1; count]);
+        }
+        conditioning
+    }
+}
+
+/// A message of the binary sub-protocol.
+pub(crate) fn message(message: &ClientMessage) -> Message {
+    Message::binary(rmp_serde::to_vec_named(message).unwrap())
+}

@@ -1,0 +1,157 @@
+//! `foreframe import`
+
+use std::path::PathBuf;
+
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use super::{CliError, interrupt, print_line, progress::ProgressLine};
+use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
+use crate::error_text::with_causes;
+use crate::frame::fit::Fit;
+
+/// How many left-out items are printed.
+const LISTED_ITEMS: usize = 10;
+
+/// Turn a recording into a data set.
+///
+/// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
+/// NumPy array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
+/// it, run the same command again: it continues.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  foreframe import ~/mycar/data --name mycar --every 4
+  foreframe import frames/ --name walk --rate 10
+  foreframe import frames/ --csv log.csv --action speed --action turn --unit speed=m/s --unit turn=rad/s
+  foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
+then
+  foreframe inspect mycar
+  foreframe train --preset paper --dataset mycar")]
+pub(super) struct ImportArgs {
+    /// A folder of images, a Donkeycar tub, a .npy file or a video
+    source: PathBuf,
+    /// The data set's name [default: the source's name]
+    #[arg(long)]
+    name: Option<String>,
+    /// The data set's directory [default: DATA_DIR/datasets/NAME]
+    #[arg(long, value_name = "DIR", conflicts_with = "name")]
+    out: Option<PathBuf>,
+    /// Width and height of the frames in pixels, as in 64x64
+    #[arg(long, value_name = "WxH", default_value = "64x64", value_parser = size)]
+    size: (u32, u32),
+    /// How images of another shape are fitted: crop, letterbox or stretch
+    #[arg(long, default_value = "crop")]
+    fit: Fit,
+    /// Frames per second: of the data set or, where the source has no times, of the recording
+    #[arg(long, value_name = "HZ")]
+    rate: Option<f64>,
+    /// Keep every Nth frame
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    every: usize,
+    /// The CSV file, if it is not the only one in the folder
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// The column or input with the images [default: found by name or type]
+    #[arg(long, value_name = "NAME")]
+    image: Option<String>,
+    /// The column with the times [default: found by name]
+    #[arg(long, value_name = "NAME")]
+    time: Option<String>,
+    /// A component of the action; may be given many times [default: found by name]
+    #[arg(long = "action", value_name = "NAME")]
+    actions: Vec<String>,
+    /// A component of the state; may be given many times [default: found by name]
+    #[arg(long = "state", value_name = "NAME")]
+    states: Vec<String>,
+    /// The unit of an action or state, as in speed=m/s; may be given many times
+    #[arg(long = "unit", value_name = "NAME=UNIT")]
+    units: Vec<String>,
+    /// Leave out what is damaged and list it, instead of stopping there
+    #[arg(long)]
+    skip_bad: bool,
+    #[command(flatten)]
+    settings: CommonArgs,
+}
+
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let sides = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    sides.ok_or_else(|| "write WIDTHxHEIGHT, as in 64x64".to_owned())
+}
+
+pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
+    let workspace = Workspace::new(args.settings.start()?);
+    let out = args.out.clone().unwrap_or_else(|| workspace.datasets_dir().join(name(&args)));
+    let config = ImportConfig {
+        source: args.source,
+        out: out.clone(),
+        options: ImportOptions {
+            frame_width_px: args.size.0,
+            frame_height_px: args.size.1,
+            fit: args.fit,
+            rate_hz: args.rate,
+            every: args.every,
+            csv: args.csv,
+            image: args.image,
+            time: args.time,
+            actions: args.actions,
+            states: args.states,
+            units: args.units,
+            skip_bad: args.skip_bad,
+        },
+    };
+    let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));
+    progress.label("importing");
+    let imported = import(
+        &config,
+        &|now| progress.update(now.done, now.total, String::new),
+        &cancelled,
+    );
+    progress.finish();
+    let imported = imported?;
+    let info = &imported.info;
+    print_line(format!(
+        "{}: {} episodes, {} frames of {}×{} px, {:.4} s apart, content {}",
+        out.display(),
+        info.episode_count,
+        info.frame_count,
+        info.frame_width_px,
+        info.frame_height_px,
+        info.frame_period_s,
+        info.content_hash
+    ))?;
+    if !imported.skipped.is_empty() {
+        print_line(format!("left out {} damaged items:", imported.skipped.len()))?;
+        for item in imported.skipped.iter().take(LISTED_ITEMS) {
+            print_line(format!("  {}: {}", item.place, item.reason))?;
+        }
+        if imported.skipped.len() > LISTED_ITEMS {
+            print_line(format!("  … all of them are in {}", out.join("meta/skipped.json").display()))?;
+        }
+    }
+    print_line(format!("next: foreframe train --dataset {}", out.display()))
+}
+
+/// The data set's name: the one given, or the source's.
+fn name(args: &ImportArgs) -> String {
+    args.name.clone().unwrap_or_else(|| {
+        let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
+        source.file_stem().map_or_else(|| "recording".to_owned(), |name| name.to_string_lossy().into_owned())
+    })
+}
+
+impl From<ImportError> for CliError {
+    fn from(error: ImportError) -> Self {
+        let text = with_causes(&error);
+        match error {
+            ImportError::Cancelled { .. } => Self::Interrupted(text),
+            ImportError::UnknownSource(_)
+            | ImportError::Option(_)
+            | ImportError::Record { .. }
+            | ImportError::Image { .. }
+            | ImportError::Empty(_)
+            | ImportError::OutExists { .. } => Self::Usage(text),
+            ImportError::Dataset(error) => error.into(),
+            ImportError::Io { ref source, .. } if source.kind() == std::io::ErrorKind::NotFound => Self::Usage(text),
+            _ => Self::Failed(text),
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! `foreframe models`
+
+use super::settings::{CommonArgs, with_checked_directories};
+use super::workspace::{Workspace, block_on, split_version};
+use super::{CliError, print_line};
+use crate::registry::{self, RegistryError};
+use crate::versions::Versions;
+
+/// List, activate and remove versions of models.
+///
+/// A model has the version that came with the program, in the models directory, and the versions that training jobs and
+/// `foreframe publish` added, in the data directory. Servers answer with the active version.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  foreframe models list
+  foreframe models activate moving@1
+  foreframe models remove moving@2")]
+pub(super) struct ModelsArgs {
+    #[command(subcommand)]
+    action: ModelsCommand,
+    #[command(flatten)]
+    settings: CommonArgs,
+}
+
+#[derive(clap::Subcommand)]
+enum ModelsCommand {
+    /// List every version of every model, which one is active, and its directory
+    #[command(after_help = "Example:\n  foreframe models list --data-dir /var/lib/foreframe")]
+    List,
+    /// Make a version the active one: running servers of the same store load it within seconds
+    #[command(after_help = "Example:\n  foreframe models activate moving@1")]
+    Activate {
+        /// The version, as NAME@VERSION
+        #[arg(value_name = "NAME@VERSION")]
+        version: String,
+    },
+    /// Delete a published version, or all published versions of a model
+    #[command(after_help = "Examples:\n  foreframe models remove moving@2\n  foreframe models remove moving")]
+    Remove {
+        /// One version that is not active (NAME@VERSION), or all published versions of a model (NAME)
+        #[arg(value_name = "NAME[@VERSION]")]
+        model: String,
+    },
+}
+
+pub(super) fn run(args: &ModelsArgs) -> Result<(), CliError> {
+    let loaded = args.settings.load()?;
+    let workspace = Workspace::new(with_checked_directories(loaded)?);
+    block_on(async {
+        let versions = workspace.versions().await?;
+        match &args.action {
+            ModelsCommand::List => list(&workspace, &versions).await,
+            ModelsCommand::Activate { version } => activate(&versions, version).await,
+            ModelsCommand::Remove { model } => remove(&versions, model).await,
+        }
+    })
+}
+
+async fn list(workspace: &Workspace, versions: &Versions) -> Result<(), CliError> {
+    let server = &workspace.config().server;
+    let all = versions.all().await?;
+    if all.is_empty() {
+        print_line(format!(
+            "there is no model in {} and none was published; `foreframe publish DIR` adds one",
+            server.models_dir.display()
+        ))?;
+    }
+    for (name, numbers) in all {
+        let active = versions.active(&name).await?;
+        for version in numbers {
+            let dir = if versions.shipped(&name) == Some(version) {
+                server.models_dir.join(&name)
+            } else {
+                server.data_dir.join("models").join(&name).join(version.to_string())
+            };
+            let state = if active == Some(version) { "active" } else { "" };
+            let label = format!("{name}@{version}");
+            print_line(format!("{label:24} {state:6} {}", dir.display()))?;
+        }
+    }
+    for path in registry::misnamed(&server.models_dir)? {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        print_line(format!("not used: {}: {}", path.display(), RegistryError::Name(name)))?;
+    }
+    Ok(())
+}
+
+async fn activate(versions: &Versions, model: &str) -> Result<(), CliError> {
+    let (name, Some(version)) = split_version(model)? else {
+        return Err(CliError::Usage(format!(
+            "{model:?} names no version; write NAME@VERSION, as in {model}@1; `foreframe models list` lists them"
+        )));
+    };
+    versions.choose(name, version).await?;
+    print_line(format!("{name}@{version} is the active version"))
+}
+
+async fn remove(versions: &Versions, model: &str) -> Result<(), CliError> {
+    let (name, version) = split_version(model)?;
+    let removed = versions.remove(name, version).await?;
+    for version in &removed {
+        print_line(format!("removed {name}@{version}"))?;
+    }
+    if version.is_some() {
+        return Ok(());
+    }
+    match versions.active(name).await? {
+        Some(shipped) => print_line(format!("{name}@{shipped} is the active version")),
+        None => print_line(format!(
+            "no version of {name} is left; a running server answers with it until it is restarted"
+        )),
+    }
+}

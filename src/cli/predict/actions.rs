@@ -1,0 +1,66 @@
+//! The file of a robot's states and actions.
+
+use std::path::Path;
+
+use serde::Deserialize;
+
+use crate::cli::CliError;
+use crate::nn::ModelSpec;
+use crate::types::{Action, RobotState};
+
+/// One entry for each image of the directory.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ActionsFile {
+    #[serde(default)]
+    states: Vec<RobotState>,
+    actions: Vec<Action>,
+}
+
+impl ActionsFile {
+    pub(super) fn read(path: &Path) -> Result<Self, CliError> {
+        let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
+        serde_json::from_slice(&bytes).map_err(|error| {
+            CliError::Usage(format!(
+                "{} is not an actions file: {error}; it is JSON of finite numbers, \
+                 {{\"states\": [[…], …], \"actions\": [[…], …]}}",
+                path.display()
+            ))
+        })
+    }
+
+    /// Whether the file holds what the model takes to predict after frame `last`. Errors: `Usage` with what is missing.
+    pub(super) fn check(&self, path: &Path, last: usize, spec: &ModelSpec) -> Result<(), CliError> {
+        if spec.state_inputs().is_some() && self.states.len() <= last {
+            return Err(CliError::Usage(format!(
+                "{} holds {} states; the state at frame {last} takes {}",
+                path.display(),
+                self.states.len(),
+                last + 1
+            )));
+        }
+        let needed = last + spec.horizon;
+        if spec.action_inputs().is_none() || self.actions.len() >= needed {
+            return Ok(());
+        }
+        let latest = self.actions.len().saturating_sub(spec.horizon);
+        let or_earlier = if latest + 1 >= spec.context {
+            format!(", or predict after an earlier frame with --at {latest}")
+        } else {
+            String::new()
+        };
+        Err(CliError::Usage(format!(
+            "{} holds {} actions; predicting {} frames after frame {last} takes {needed}; add the planned actions{or_earlier}",
+            path.display(),
+            self.actions.len(),
+            spec.horizon
+        )))
+    }
+
+    /// The state at frame `last` and the actions from it on, as far as the model takes them.
+    pub(super) fn conditioning(self, last: usize, spec: &ModelSpec) -> (Option<RobotState>, Option<Vec<Action>>) {
+        let state = self.states.into_iter().nth(last);
+        let future = self.actions.into_iter().skip(last).take(spec.horizon);
+        (state, spec.action_inputs().map(|_| future.collect()))
+    }
+}

@@ -1,0 +1,143 @@
+//! The images of a directory, in natural order.
+
+use std::cmp::Ordering;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use tracing::info;
+
+use crate::cli::CliError;
+use crate::error_text;
+use crate::frame::fit::{Fit, fit};
+use crate::frame::{Frame, codec};
+use crate::nn::ModelSpec;
+
+/// The endings of the files that are read.
+const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+
+/// The image files of a directory.
+pub(super) struct ImageFiles {
+    paths: Vec<PathBuf>,
+    fit: Option<Fit>,
+    /// Whether it was said that color images are converted.
+    has_reported_color: bool,
+}
+
+impl ImageFiles {
+    /// Lists the images of a directory; `fit` says what to do with images of another size than the model's.
+    pub(super) fn list(dir: &Path, fit: Option<Fit>) -> Result<Self, CliError> {
+        let unreadable = |error| CliError::io("read", dir, &error);
+        let mut paths = std::fs::read_dir(dir)
+            .map_err(unreadable)?
+            .map(|entry| entry.map(|entry| entry.path()))
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(unreadable)?;
+        paths.retain(|path| {
+            let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
+            ENDINGS.iter().any(|known| ending == *known)
+        });
+        paths.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
+        Ok(Self {
+            paths,
+            fit,
+            has_reported_color: false,
+        })
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.paths.len()
+    }
+
+    /// Reads some of the images as frames of the model's size. Errors: `Usage` for an image of another size that is not to
+    /// be fitted.
+    pub(super) fn read(&mut self, range: Range<usize>, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, CliError> {
+        let paths: Vec<PathBuf> = self.paths.get(range).unwrap_or_default().to_vec();
+        paths.iter().map(|path| self.read_one(path, model, spec)).collect()
+    }
+
+    fn read_one(&mut self, path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
+        let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
+        let unreadable = |error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error)));
+        let frame = codec::decode(&bytes).map_err(unreadable)?;
+        if !self.has_reported_color && codec::is_color(&bytes).map_err(unreadable)? {
+            info!(image = %path.display(), "color images are converted to gray");
+            self.has_reported_color = true;
+        }
+        let (width, height) = (spec.frame_width_px, spec.frame_height_px);
+        match self.fit {
+            Some(way) => fit(&frame, width, height, way).map_err(unreadable),
+            None if (frame.width(), frame.height()) != (width, height) => Err(CliError::Usage(format!(
+                "{} is {}×{} px; model {model:?} takes {width}×{height}; add --fit crop, --fit letterbox or --fit stretch",
+                path.display(),
+                frame.width(),
+                frame.height()
+            ))),
+            None => Ok(frame),
+        }
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.
+fn natural_order(a: &str, b: &str) -> Ordering {
+    let (mut left, mut right) = (a, b);
+    loop {
+        let (one, other) = (next_part(&mut left), next_part(&mut right));
+        let order = match (one, other) {
+            ("", "") => return a.cmp(b),
+            (one, other) if is_number(one) && is_number(other) => {
+                let (one, other) = (one.trim_start_matches('0'), other.trim_start_matches('0'));
+                one.len().cmp(&other.len()).then_with(|| one.cmp(other))
+            }
+            (one, other) => one.cmp(other),
+        };
+        if order != Ordering::Equal {
+            return order;
+        }
+    }
+}
+
+fn is_number(part: &str) -> bool {
+    part.starts_with(|c: char| c.is_ascii_digit())
+}
+
+/// Cuts off the first run of digits, or of other characters.
+fn next_part<'a>(text: &mut &'a str) -> &'a str {
+    let starts_with_digit = is_number(text);
+    let end = text.find(|c: char| c.is_ascii_digit() != starts_with_digit);
+    let (part, rest) = text.split_at(end.unwrap_or(text.len()));
+    *text = rest;
+    part
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_in_file_names_are_compared_as_numbers() {
+        let mut names = [
+            "10.png",
+            "2.png",
+            "frame-9.png",
+            "frame-010.png",
+            "1.png",
+            "frame-1b.png",
+        ];
+        names.sort_by(|a, b| natural_order(a, b));
+        assert_eq!(
+            names,
+            [
+                "1.png",
+                "2.png",
+                "10.png",
+                "frame-1b.png",
+                "frame-9.png",
+                "frame-010.png"
+            ]
+        );
+    }
+}

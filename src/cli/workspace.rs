@@ -1,0 +1,173 @@
+//! Finds data sets and models by path or by name, as a server with the same settings does.
+
+use std::collections::BTreeSet;
+use std::future::Future;
+use std::path::{Path, PathBuf};
+
+use super::CliError;
+use super::settings::open_store;
+use crate::config::Config;
+use crate::dataset::{self, Dataset};
+use crate::jobs::{self, JobError};
+use crate::registry::{self, LoadedModel, RegistryError};
+use crate::server::ServerConfig;
+use crate::versions::{VersionError, Versions};
+
+/// The directories of a configuration.
+pub(super) struct Workspace {
+    config: Config,
+}
+
+impl Workspace {
+    pub(super) fn new(config: Config) -> Self {
+        Self { config }
+    }
+
+    fn server(&self) -> &ServerConfig {
+        &self.config.server
+    }
+
+    /// Where data sets are kept by name.
+    pub(super) fn datasets_dir(&self) -> PathBuf {
+        self.server().data_dir.join("datasets")
+    }
+
+    /// Reads a data set by its directory or its name.
+    pub(super) fn open_dataset(&self, dataset: &Path) -> Result<(PathBuf, Dataset), CliError> {
+        let dir = self.find_dataset(dataset)?;
+        let dataset = Dataset::open(&dir)?;
+        Ok((dir, dataset))
+    }
+
+    /// The directory of a data set, by its directory or its name; fetched if data sets are shared with other servers.
+    pub(super) fn find_dataset(&self, dataset: &Path) -> Result<PathBuf, CliError> {
+        let name = dataset.to_str().filter(|name| registry::is_valid_name(name));
+        if let (Some(name), true) = (name, self.server().objects_url.is_some() && !dataset.exists()) {
+            return block_on(async {
+                let store = open_store(&self.config).await?;
+                Ok(jobs::datasets::fetch(store.objects(), name).await?)
+            });
+        }
+        Ok(dataset::find(&self.datasets_dir(), dataset)?)
+    }
+
+    /// Loads a model by its directory, its name or NAME@VERSION. A name alone is the version that a server would serve.
+    pub(super) fn load_model(&self, model: &str) -> Result<(PathBuf, LoadedModel), CliError> {
+        if let Some(dir) = registry::directory_of(model)? {
+            let loaded = registry::load(&dir)?;
+            return Ok((dir, loaded));
+        }
+        let (name, version) = split_version(model)?;
+        if !registry::is_valid_name(name) {
+            return Err(RegistryError::Name(name.to_owned()).into());
+        }
+        if !self.server().store().exists() {
+            return self.load_shipped(name, version);
+        }
+        block_on(async {
+            let versions = self.versions().await?;
+            let active = versions.active(name).await?;
+            let Some(version) = version.or(active) else {
+                return Err(self.unknown_model(name, versions.all().await?.into_keys()));
+            };
+            Ok((
+                versions.directory(name, version).await?,
+                versions.load(name, version).await?,
+            ))
+        })
+    }
+
+    fn load_shipped(&self, name: &str, version: Option<u32>) -> Result<(PathBuf, LoadedModel), CliError> {
+        let dir = registry::find(&self.server().models_dir, name)?;
+        let loaded = registry::load_as(&dir, name)?;
+        let found = loaded.manifest.version;
+        match version {
+            Some(version) if version != found => Err(VersionError::Unknown {
+                model: name.to_owned(),
+                version,
+                available: vec![found],
+            }
+            .into()),
+            _ => Ok((dir, loaded)),
+        }
+    }
+
+    fn unknown_model(&self, name: &str, known: impl Iterator<Item = String>) -> CliError {
+        RegistryError::Unknown {
+            name: name.to_owned(),
+            dir: self.server().models_dir.clone(),
+            known: known.collect(),
+        }
+        .into()
+    }
+
+    /// The versions of all models; opens the store.
+    pub(super) async fn versions(&self) -> Result<Versions, CliError> {
+        Ok(Versions::new(
+            open_store(&self.config).await?,
+            &self.server().models_dir,
+        ))
+    }
+
+    /// The names of all models, shipped and published, sorted.
+    pub(super) fn model_names(&self) -> Result<Vec<String>, CliError> {
+        let shipped = registry::list(&self.server().models_dir)?
+            .into_iter()
+            .map(|(name, _)| name);
+        let mut names: BTreeSet<String> = shipped.collect();
+        if self.server().store().exists() {
+            let published = block_on(async { Ok(self.versions().await?.all().await?) })?;
+            names.extend(published.into_keys());
+        }
+        Ok(names.into_iter().collect())
+    }
+
+    /// The settings.
+    pub(super) fn config(&self) -> &Config {
+        &self.config
+    }
+}
+
+/// A model's name and, after an `@`, its version.
+pub(super) fn split_version(model: &str) -> Result<(&str, Option<u32>), CliError> {
+    let Some((name, version)) = model.split_once('@') else {
+        return Ok((model, None));
+    };
+    match version.parse() {
+        Ok(version) => Ok((name, Some(version))),
+        Err(_) => Err(CliError::Usage(format!(
+            "{model:?} is not NAME or NAME@VERSION; a version is a whole number, as in paper@2"
+        ))),
+    }
+}
+
+/// Runs a short task of the store to its end.
+pub(super) fn block_on<T>(task: impl Future<Output = Result<T, CliError>>) -> Result<T, CliError> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(CliError::failed)?;
+    runtime.block_on(task)
+}
+
+impl From<JobError> for CliError {
+    fn from(error: JobError) -> Self {
+        match error {
+            JobError::NotFound { .. } => Self::Usage(error.to_string()),
+            other => Self::failed(other),
+        }
+    }
+}
+
+impl From<VersionError> for CliError {
+    fn from(error: VersionError) -> Self {
+        match error {
+            VersionError::Unknown { .. } | VersionError::Active { .. } | VersionError::Shipped { .. } => {
+                Self::Usage(error.to_string())
+            }
+            VersionError::Registry(error) => error.into(),
+            VersionError::Store(error) => error.into(),
+            other => Self::failed(other),
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! The address to listen on, as people write it.
+
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
+
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
+
+use super::DEFAULT_PORT;
+
+/// Reads `HOST:PORT` or `HOST`. Errors: text that is neither, or a host name that cannot be resolved.
+pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    resolve(&text).ok_or_else(|| D::Error::custom("not HOST:PORT"))
+}
+
+/// The address of a host name or an IP address, with or without a port. Of several addresses, the first IPv4 address:
+/// clients that know only 127.0.0.1 then reach `localhost` too.
+fn resolve(text: &str) -> Option<SocketAddr> {
+    if let Ok(ip) = text.parse::<IpAddr>() {
+        return Some(SocketAddr::new(ip, DEFAULT_PORT));
+    }
+    let has_port = text.contains(':');
+    let addresses: Vec<SocketAddr> = if has_port {
+        text.to_socket_addrs().ok()?.collect()
+    } else {
+        (text, DEFAULT_PORT).to_socket_addrs().ok()?.collect()
+    };
+    let first_ipv4 = addresses.iter().find(|address| address.is_ipv4());
+    first_ipv4.or_else(|| addresses.first()).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_host_is_an_address_or_a_name_and_the_port_may_be_left_out() {
+        for (text, address) in [
+            ("127.0.0.1:9000", "127.0.0.1:9000"),
+            ("localhost:9000", "127.0.0.1:9000"),
+            ("0.0.0.0", "0.0.0.0:8642"),
+            ("::1", "[::1]:8642"),
+            ("[::1]:9000", "[::1]:9000"),
+        ] {
+            assert_eq!(resolve(text), Some(address.parse().unwrap()), "{text}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_host_and_port_is_refused() {
+        for text in ["", "localhost:http", "localhost:99999", ":8642:"] {
+            assert_eq!(resolve(text), None, "{text}");
+        }
+    }
+}

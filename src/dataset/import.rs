@@ -1,0 +1,284 @@
+//! Turns recordings of real robots into data sets.
+//!
+//! A source ([`images`], [`donkeycar`], [`numpy`], [`video`]) lists its records: time, action, state and where the image
+//! is. [`timing`] cuts them into episodes at one frame rate. [`writer`] reads the images, resizes them, and writes shards.
+//! Only one shard is in memory at a time.
+
+mod donkeycar;
+mod images;
+mod numpy;
+mod recording;
+mod timing;
+mod video;
+mod writer;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use serde::{Deserialize, Serialize};
+
+use self::recording::Recording;
+use super::{DatasetError, DatasetInfo};
+use crate::frame::FrameError;
+use crate::frame::fit::Fit;
+
+/// What to import, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImportConfig {
+    /// The recording: a folder of images, a Donkeycar tub, a NumPy file or a video.
+    pub source: PathBuf,
+    /// The data set's directory.
+    pub out: PathBuf,
+    /// How its records are read.
+    pub options: ImportOptions,
+}
+
+/// How a recording is read. All of it has defaults.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ImportOptions {
+    /// Width of the data set's frames in pixels.
+    pub frame_width_px: u32,
+    /// Height of the data set's frames in pixels.
+    pub frame_height_px: u32,
+    /// How images of another shape are fitted.
+    pub fit: Fit,
+    /// Frames per second of the data set. Without timestamps: of the recording. `None` keeps the recording's rate.
+    pub rate_hz: Option<f64>,
+    /// Keeps every Nth frame; actions in between are averaged.
+    pub every: usize,
+    /// A CSV file with one line per image.
+    pub csv: Option<PathBuf>,
+    /// The CSV column, or the array, of the images; by default the usual names.
+    pub image: Option<String>,
+    /// The CSV column of the time in seconds (or `_ms`, `_us`, `_ns` by its name).
+    pub time: Option<String>,
+    /// Names of the action's components; by default those that the source marks as actions.
+    pub actions: Vec<String>,
+    /// Names of the state's components; by default those that the source marks as states.
+    pub states: Vec<String>,
+    /// Units as `NAME=UNIT`.
+    pub units: Vec<String>,
+    /// Leaves out what is damaged, counts it and lists it, instead of stopping there.
+    pub skip_bad: bool,
+}
+
+impl Default for ImportOptions {
+    fn default() -> Self {
+        Self {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            fit: Fit::Crop,
+            rate_hz: None,
+            every: 1,
+            csv: None,
+            image: None,
+            time: None,
+            actions: Vec::new(),
+            states: Vec::new(),
+            units: Vec::new(),
+            skip_bad: false,
+        }
+    }
+}
+
+/// Something in the recording that was left out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SkippedItem {
+    /// File and line, frame or position.
+    pub place: String,
+    /// What was wrong.
+    pub reason: String,
+}
+
+/// What an import made.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    /// The data set.
+    pub info: DatasetInfo,
+    /// What was left out.
+    pub skipped: Vec<SkippedItem>,
+}
+
+/// How many frames are written, of how many.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ImportProgress {
+    /// Frames written, those of an earlier run included.
+    pub done: u64,
+    /// Frames in all.
+    pub total: u64,
+}
+
+/// Why a recording could not be imported: file and place, what was wrong, what would be right.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ImportError {
+    /// The source is of no known kind.
+    #[error(
+        "{} is not a recording that can be imported; give a folder of PNG or JPEG images (with or without a CSV), a \
+         Donkeycar tub (manifest.json), a .npy file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
+        .0.display()
+    )]
+    UnknownSource(PathBuf),
+    /// An option does not fit the source.
+    #[error("{0}")]
+    Option(String),
+    /// A file could not be read or written.
+    #[error("could not {action} {}", path.display())]
+    Io {
+        /// `read`, `write`, …
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A record is wrong.
+    #[error("{place}: {reason}; mend it, or leave out what is damaged with --skip-bad")]
+    Record {
+        /// File and line, frame or position.
+        place: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// An image cannot be decoded.
+    #[error("{place}: {} is damaged; replace it, or leave out what is damaged with --skip-bad", path.display())]
+    Image {
+        /// File and line of the record.
+        place: String,
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: FrameError,
+    },
+    /// Nothing is left to import.
+    #[error("{} holds no two consecutive frames; a data set needs more", .0.display())]
+    Empty(PathBuf),
+    /// Another import uses the directory with other options, or it holds something else.
+    #[error("{} exists and belongs to something else ({what}); name a new directory", path.display())]
+    OutExists {
+        /// The directory.
+        path: PathBuf,
+        /// What is there.
+        what: String,
+    },
+    /// A program that is needed is missing or failed.
+    #[error("{0}")]
+    Program(String),
+    /// It was cancelled; what was written stays.
+    #[error("stopped after {done} of {total} frames; the same command continues")]
+    Cancelled {
+        /// Frames written.
+        done: u64,
+        /// Frames in all.
+        total: u64,
+    },
+    /// The data set could not be written.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+}
+
+impl ImportError {
+    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+
+    fn record(place: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Record {
+            place: place.into(),
+            reason: reason.into(),
+        }
+    }
+
+    /// The item to list when what is damaged is left out; `None` if it is no damage of a single item.
+    fn skippable(&self) -> Option<SkippedItem> {
+        match self {
+            Self::Record { place, reason } => Some(SkippedItem {
+                place: place.clone(),
+                reason: reason.clone(),
+            }),
+            Self::Image { place, path, source } => Some(SkippedItem {
+                place: place.clone(),
+                reason: format!("{} is damaged: {source}", path.display()),
+            }),
+            _ => None,
+        }
+    }
+}
+
+/// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once
+/// if the data set is complete. Errors: every [`ImportError`].
+pub fn import(
+    config: &ImportConfig,
+    on_progress: &(dyn Fn(ImportProgress) + Sync),
+    cancelled: &AtomicBool,
+) -> Result<Imported, ImportError> {
+    let options = &config.options;
+    options.validate()?;
+    let directory = writer::Directory::claim(config)?;
+    if let Some(finished) = directory.finished()? {
+        return Ok(finished);
+    }
+    let recording = open(config)?;
+    let plan = timing::plan(recording, options)?;
+    directory.write(plan, on_progress, cancelled)
+}
+
+/// Reads the records of a source, after finding out of which kind it is.
+fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
+    let (source, options) = (&config.source, &config.options);
+    if !source.exists() {
+        return Err(ImportError::io("read", source)(std::io::ErrorKind::NotFound.into()));
+    }
+    if donkeycar::is_tub(source) {
+        return donkeycar::open(source, options);
+    }
+    if source.is_dir() {
+        return images::open(source, options);
+    }
+    match extension(source).as_str() {
+        "npy" => numpy::open(source, options),
+        "mp4" | "mkv" | "avi" | "mov" | "webm" => video::open(source, &config.out, options),
+        _ => Err(ImportError::UnknownSource(source.clone())),
+    }
+}
+
+impl ImportOptions {
+    fn validate(&self) -> Result<(), ImportError> {
+        if self.every == 0 {
+            return Err(ImportError::Option("--every is 0; it must be at least 1".to_owned()));
+        }
+        if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
+            return Err(ImportError::Option(format!(
+                "--rate is {rate}; it must be 0.01 to 1000 frames per second"
+            )));
+        }
+        for (what, side) in [("width", self.frame_width_px), ("height", self.frame_height_px)] {
+            if !(1..=crate::frame::MAX_SIDE_PX).contains(&side) {
+                return Err(ImportError::Option(format!(
+                    "the frame's {what} is {side} px; it must be 1 to {} px",
+                    crate::frame::MAX_SIDE_PX
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// The unit that `--unit NAME=UNIT` gives a channel; empty if none does.
+    fn unit(&self, name: &str) -> String {
+        let given = self.units.iter().filter_map(|unit| unit.split_once('='));
+        given
+            .filter(|(channel, _)| *channel == name)
+            .map(|(_, unit)| unit.to_owned())
+            .next()
+            .unwrap_or_default()
+    }
+}
+
+/// The extension in lower case; empty if there is none.
+fn extension(path: &Path) -> String {
+    path.extension()
+        .map(|extension| extension.to_string_lossy().to_lowercase())
+        .unwrap_or_default()
+}

@@ -1,0 +1,309 @@
+//! Writes the planned episodes as shards. What is on disk depends on the source and the options alone, so an import that was
+//! killed continues after its last whole shard.
+
+use std::fs::{self, File, TryLockError};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::super::files::{sha256_of_file, write_atomically};
+use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
+use super::super::shard::{EncodedEpisode, ShardStart, build};
+use super::super::shard_reader::records;
+use super::super::store::{FinishedShard, complete};
+use super::super::{DatasetError, DatasetInfo, EpisodeData};
+use super::recording::{Record, Recording};
+use super::timing::{ImportPlan, PlannedFrame};
+use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
+use crate::files::{remove_stale_partials, sha256_hex};
+use crate::frame::fit::fit;
+
+/// A shard is closed once it has so many frames. It holds whole episodes.
+const SHARD_FRAMES: usize = 2000;
+/// Images that are decoded in parallel.
+const CHUNK_FRAMES: usize = 256;
+/// What was left out, with the shard in which it would have been.
+const SKIPPED: &str = "meta/skipped.json";
+
+/// What decides the bytes of the data set.
+#[derive(Serialize)]
+struct Arguments<'a> {
+    program_version: &'static str,
+    source: &'a Path,
+    options: &'a ImportOptions,
+}
+
+/// The directory of an import, locked by this process.
+pub(super) struct Directory<'a> {
+    config: &'a ImportConfig,
+    _lock: File,
+}
+
+impl<'a> Directory<'a> {
+    /// Takes an unused directory, or one with the same import. Errors: `OutExists`, `Io`, `Dataset` (busy).
+    pub(super) fn claim(config: &'a ImportConfig) -> Result<Self, ImportError> {
+        let out = &config.out;
+        let path = out.join(IMPORT_ARGUMENTS);
+        let arguments = Arguments {
+            program_version: env!("CARGO_PKG_VERSION"),
+            source: &config.source.canonicalize().map_err(ImportError::io("read", &config.source))?,
+            options: &config.options,
+        };
+        let text = serde_json::to_string_pretty(&arguments)
+            .map_err(|error| ImportError::Option(format!("the options cannot be written: {error}")))?;
+        let occupied = |what: &str| ImportError::OutExists {
+            path: out.clone(),
+            what: what.to_owned(),
+        };
+        match fs::read_to_string(&path) {
+            Ok(found) if found == text => {}
+            Ok(_) => return Err(occupied("an import with another source or other options")),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+                let is_unused = !out.exists() || fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_none());
+                if !is_unused {
+                    return Err(occupied("other files"));
+                }
+                write_atomically(&path, text.as_bytes())?;
+            }
+            Err(error) => return Err(ImportError::io("read", &path)(error)),
+        }
+        let lock = File::open(&path).map_err(ImportError::io("read", &path))?;
+        lock.try_lock().map_err(|error| match error {
+            TryLockError::WouldBlock => ImportError::Dataset(DatasetError::Busy { path: out.clone() }),
+            TryLockError::Error(source) => ImportError::io("lock", &path)(source),
+        })?;
+        remove_stale_partials(out);
+        Ok(Self { config, _lock: lock })
+    }
+
+    /// The data set, if it is complete. Errors: `Dataset`, `Io`.
+    pub(super) fn finished(&self) -> Result<Option<Imported>, ImportError> {
+        if !self.config.out.join(INFO).exists() {
+            return Ok(None);
+        }
+        Ok(Some(Imported {
+            info: DatasetMetadata::read(&self.config.out)?.info_in(&self.config.out)?,
+            skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
+        }))
+    }
+
+    fn skipped_path(&self) -> PathBuf {
+        self.config.out.join(SKIPPED)
+    }
+
+    fn read_skipped(&self) -> Result<Vec<(usize, SkippedItem)>, ImportError> {
+        let path = self.skipped_path();
+        match fs::read(&path) {
+            Ok(text) => serde_json::from_slice(&text)
+                .map_err(|error| ImportError::record(path.display().to_string(), error.to_string())),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Vec::new()),
+            Err(error) => Err(ImportError::io("read", &path)(error)),
+        }
+    }
+
+    /// Writes the shards that are missing, then the tables. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
+    pub(super) fn write(
+        &self,
+        plan: ImportPlan,
+        on_progress: &(dyn Fn(ImportProgress) + Sync),
+        cancelled: &AtomicBool,
+    ) -> Result<Imported, ImportError> {
+        let shards = shards(&plan.episodes);
+        let info = description(self.config, &plan);
+        let mut writer = ShardWriter {
+            out: &self.config.out,
+            plan: &plan,
+            options: &self.config.options,
+            info: &info,
+            written: Vec::new(),
+            start: ShardStart { episode: 0, frame: 0 },
+        };
+        let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
+        let mut done = 0;
+        let mut skipped = self.read_skipped()?;
+        for episodes in shards {
+            let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
+            if cancelled.load(Ordering::Relaxed) {
+                return Err(ImportError::Cancelled { done, total });
+            }
+            if !writer.resume() {
+                let shard = writer.written.len();
+                skipped.retain(|(of, _)| *of < shard);
+                let (encoded, bad) = writer.encode(episodes, cancelled, &|frames| {
+                    on_progress(ImportProgress {
+                        done: done + frames as u64,
+                        total,
+                    });
+                })?;
+                let Some(encoded) = encoded else {
+                    return Err(ImportError::Cancelled { done, total });
+                };
+                skipped.extend(bad.into_iter().map(|item| (shard, item)));
+                self.write_skipped(&skipped)?;
+                writer.write(&encoded)?;
+            }
+            done += frames as u64;
+            on_progress(ImportProgress { done, total });
+        }
+        let ShardWriter { written, .. } = writer;
+        if written.iter().all(|shard| shard.records.is_empty()) {
+            return Err(ImportError::Empty(self.config.source.clone()));
+        }
+        // Those that the source's lists have are found again by every run; they come first.
+        let listed = plan.recording.skipped.iter().cloned();
+        let all: Vec<(usize, SkippedItem)> = listed.map(|item| (0, item)).chain(skipped).collect();
+        self.write_skipped(&all)?;
+        let info = complete(&self.config.out, info, &written)?;
+        video::clean_up(&self.config.out);
+        Ok(Imported {
+            info,
+            skipped: all.into_iter().map(|(_, item)| item).collect(),
+        })
+    }
+
+    fn write_skipped(&self, skipped: &[(usize, SkippedItem)]) -> Result<(), ImportError> {
+        let text = serde_json::to_vec_pretty(skipped)
+            .map_err(|error| ImportError::Option(format!("the list of skipped items cannot be written: {error}")))?;
+        Ok(write_atomically(&self.skipped_path(), &text)?)
+    }
+}
+
+fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
+    DatasetInfo {
+        name: plan.recording.name.clone(),
+        frame_width_px: config.options.frame_width_px,
+        frame_height_px: config.options.frame_height_px,
+        frame_period_s: plan.frame_period_s,
+        action_channels: plan.recording.action_channels.clone(),
+        state_channels: plan.recording.state_channels.clone(),
+        ..DatasetInfo::default()
+    }
+}
+
+/// Ranges of episodes, each one shard.
+fn shards(episodes: &[Vec<PlannedFrame>]) -> Vec<Range<usize>> {
+    let (mut shards, mut start, mut frames) = (Vec::new(), 0, 0);
+    for (index, episode) in episodes.iter().enumerate() {
+        frames += episode.len();
+        if frames >= SHARD_FRAMES || index + 1 == episodes.len() {
+            shards.push(start..index + 1);
+            (start, frames) = (index + 1, 0);
+        }
+    }
+    shards
+}
+
+struct ShardWriter<'a> {
+    out: &'a Path,
+    plan: &'a ImportPlan,
+    options: &'a ImportOptions,
+    info: &'a DatasetInfo,
+    written: Vec<FinishedShard>,
+    start: ShardStart,
+}
+
+impl ShardWriter<'_> {
+    /// Takes the next shard from disk if an earlier run wrote it.
+    fn resume(&mut self) -> bool {
+        let path = self.out.join(shard_path(self.written.len()));
+        let found = records(&path).ok().zip(sha256_of_file(&path).ok());
+        found.is_some_and(|(records, sha256)| {
+            self.push(FinishedShard { sha256, records });
+            true
+        })
+    }
+
+    fn push(&mut self, shard: FinishedShard) {
+        self.start = ShardStart {
+            episode: self.start.episode + shard.records.len(),
+            frame: self.start.frame + shard.frames(),
+        };
+        self.written.push(shard);
+    }
+
+    fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), ImportError> {
+        let built = build(self.info, self.start, episodes)?;
+        write_atomically(&self.out.join(shard_path(self.written.len())), &built.bytes)?;
+        let records = serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
+        self.push(FinishedShard {
+            sha256: sha256_hex(&built.bytes),
+            records,
+        });
+        Ok(())
+    }
+
+    /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
+    /// are returned if the import was cancelled.
+    #[expect(clippy::type_complexity, reason = "episodes, if not cancelled, and what was left out")]
+    fn encode(
+        &self,
+        episodes: Range<usize>,
+        cancelled: &AtomicBool,
+        on_frames: &dyn Fn(usize),
+    ) -> Result<(Option<Vec<EncodedEpisode>>, Vec<SkippedItem>), ImportError> {
+        let Recording { records, images, .. } = &self.plan.recording;
+        let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
+        for episode in &self.plan.episodes[episodes] {
+            let mut data = EpisodeData::default();
+            for chunk in episode.chunks(CHUNK_FRAMES) {
+                if cancelled.load(Ordering::Relaxed) {
+                    return Ok((None, bad));
+                }
+                let read = |frame: &PlannedFrame| {
+                    let record = &records[frame.record];
+                    let image = images.read(record.image, &record.place)?;
+                    let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
+                    fit(&image, width, height, self.options.fit).map_err(|source| ImportError::Image {
+                        place: record.place.clone(),
+                        path: record.place.clone().into(),
+                        source,
+                    })
+                };
+                let frames: Vec<_> = chunk.par_iter().map(read).collect();
+                for (planned, frame) in chunk.iter().zip(frames) {
+                    match frame {
+                        Ok(frame) => push(&mut data, planned, &records[planned.record], frame.pixels()),
+                        Err(error) => match error.skippable().filter(|_| self.options.skip_bad) {
+                            Some(item) => {
+                                bad.push(item);
+                                self.close(&mut data, &mut encoded)?;
+                            }
+                            None => return Err(error),
+                        },
+                    }
+                }
+                count += chunk.len();
+                on_frames(count);
+            }
+            self.close(&mut data, &mut encoded)?;
+        }
+        Ok((Some(encoded), bad))
+    }
+
+    /// Ends an episode; one of a single frame is of no use and left out.
+    fn close(&self, data: &mut EpisodeData, encoded: &mut Vec<EncodedEpisode>) -> Result<(), ImportError> {
+        let data = std::mem::take(data);
+        if data.timestamps_s.len() > 1 {
+            let episode = self.start.episode + encoded.len();
+            encoded.push(EncodedEpisode::new(self.info, episode, relative(data))?);
+        }
+        Ok(())
+    }
+}
+
+fn push(data: &mut EpisodeData, planned: &PlannedFrame, record: &Record, pixels: &[u8]) {
+    data.timestamps_s.push(record.timestamp_s);
+    data.pixels.extend_from_slice(pixels);
+    data.actions.extend_from_slice(&planned.action);
+    data.states.extend_from_slice(&record.state);
+}
+
+/// The same with times from the episode's start.
+fn relative(mut data: EpisodeData) -> EpisodeData {
+    let start_s = data.timestamps_s[0];
+    data.timestamps_s.iter_mut().for_each(|time_s| *time_s -= start_s);
+    data
+}

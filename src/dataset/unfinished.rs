@@ -1,0 +1,110 @@
+//! The finished trials of shards that a stopped collection could not complete. They are saved beside the data, one file for
+//! each shard, until the same command resumes the collection and writes the complete shard.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
+use super::shard::{EncodedEpisode, ShardStart, build};
+use super::shard_reader::{Column, batches, image_bytes, records};
+use super::{DatasetError, DatasetInfo, files};
+
+/// Their directory in the data set's.
+const DIRECTORY: &str = "unfinished";
+
+fn path(out: &Path, shard: usize) -> PathBuf {
+    out.join(DIRECTORY).join(format!("shard-{shard:06}.parquet"))
+}
+
+/// Saves the first trials of a shard; `first` is the number of its first trial. Errors: `Io`.
+pub(super) fn save(
+    info: &DatasetInfo,
+    out: &Path,
+    (shard, first): (usize, u64),
+    episodes: &[EncodedEpisode],
+) -> Result<(), DatasetError> {
+    let start = ShardStart {
+        episode: first as usize,
+        frame: 0,
+    };
+    files::write_atomically(&path(out, shard), &build(info, start, episodes)?.bytes)
+}
+
+/// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
+pub(super) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedEpisode> {
+    read(info, &path(out, shard)).unwrap_or_default()
+}
+
+/// How many trials of a shard are saved.
+pub(super) fn count(out: &Path, shard: usize) -> usize {
+    let path = path(out, shard);
+    if path.is_file() {
+        records(&path).map_or(0, |records| records.len())
+    } else {
+        0
+    }
+}
+
+/// Deletes the saved trials of all shards, after every shard is complete. Errors: `Io`.
+pub(super) fn remove_all(out: &Path) -> Result<(), DatasetError> {
+    let dir = out.join(DIRECTORY);
+    match fs::remove_dir_all(&dir) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(DatasetError::io("delete", &dir)(error)),
+        _ => Ok(()),
+    }
+}
+
+fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetError> {
+    let corrupt = |reason: &str| DatasetError::Corrupt {
+        path: path.to_owned(),
+        reason: reason.to_owned(),
+    };
+    let mut rows = Rows::default();
+    for batch in &batches(path)? {
+        let column = Column { batch, path };
+        rows.images.extend(image_column(&column, IMAGE)?);
+        if info.has_masks {
+            rows.masks.extend(image_column(&column, MASK)?);
+        }
+        rows.states.extend(column.vectors(STATE, info.state_channels.len())?);
+        rows.actions.extend(column.vectors(ACTION, info.action_channels.len())?);
+        rows.timestamps_s
+            .extend(column.numbers::<arrow_array::types::Float32Type>(TIMESTAMP)?);
+    }
+    let records = records(path)?;
+    if records.iter().map(|record| record.frames).sum::<usize>() != rows.images.len() {
+        return Err(corrupt("its records do not count its rows"));
+    }
+    let episodes = records.into_iter().map(|record| {
+        let frames = record.frames;
+        EncodedEpisode {
+            images: rows.images.drain(..frames).collect(),
+            masks: info.has_masks.then(|| rows.masks.drain(..frames).collect()),
+            states: rows.states.drain(..frames * info.state_channels.len()).collect(),
+            actions: rows.actions.drain(..frames * info.action_channels.len()).collect(),
+            timestamps_s: rows.timestamps_s.drain(..frames).collect(),
+            record,
+        }
+    });
+    Ok(episodes.collect())
+}
+
+/// All frames of a file, column by column.
+#[derive(Default)]
+struct Rows {
+    images: Vec<Vec<u8>>,
+    masks: Vec<Vec<u8>>,
+    states: Vec<f32>,
+    actions: Vec<f32>,
+    timestamps_s: Vec<f32>,
+}
+
+fn image_column(column: &Column<'_>, key: &str) -> Result<Vec<Vec<u8>>, DatasetError> {
+    let images = image_bytes(column.batch, key).ok_or_else(|| DatasetError::Corrupt {
+        path: column.path.to_owned(),
+        reason: format!("it has no column \"{key}\" of images"),
+    })?;
+    Ok((0..column.batch.num_rows())
+        .map(|row| images.value(row).to_vec())
+        .collect())
+}

@@ -1,0 +1,60 @@
+//! Texts of errors for people: an error with its causes in one line, and lists of names.
+
+use std::error::Error;
+use std::fmt::Display;
+
+/// The error and all its causes, joined by colons. A cause that the text already contains is not repeated.
+#[must_use]
+pub fn with_causes(error: &dyn Error) -> String {
+    let mut joined = error.to_string();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        let text = cause.to_string();
+        if !joined.contains(&text) {
+            joined = format!("{joined}: {text}");
+        }
+        source = cause.source();
+    }
+    joined
+}
+
+/// The items, separated by commas.
+#[must_use]
+pub fn comma_separated<T: Display>(items: &[T]) -> String {
+    items.iter().map(T::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// `are: a, b` or `are none`. Messages about an unknown name write it after "there".
+#[must_use]
+pub(crate) fn existing(names: &[String]) -> String {
+    if names.is_empty() {
+        "are none".to_owned()
+    } else {
+        format!("are: {}", comma_separated(names))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("could not write the file")]
+    struct WithoutCause(#[source] io::Error);
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("the shard is lost: {0}")]
+    struct WithCause(#[source] WithoutCause);
+
+    #[test]
+    fn every_cause_appears_once() {
+        let full = WithoutCause(io::ErrorKind::StorageFull.into());
+        assert_eq!(with_causes(&full), "could not write the file: no storage space");
+        assert_eq!(
+            with_causes(&WithCause(full)),
+            "the shard is lost: could not write the file: no storage space"
+        );
+    }
+}

@@ -1,0 +1,101 @@
+//! The memory of jobs: the default limit, and an estimate of what a training needs.
+
+use crate::dataset::DatasetInfo;
+use crate::training::TrainConfig;
+use crate::training::config::CodecStart;
+
+const MIB: u64 = 1 << 20;
+/// Bytes of an f32.
+const VALUE: u64 = 4;
+/// Copies of the weights: weights, best weights, gradients, two moments, and a checkpoint of four of these.
+const WEIGHT_COPIES: u64 = 9;
+/// Values for each pixel and frame of a batch: input, target and prediction.
+const PIXEL_VALUES: u64 = 3;
+/// Values for each hidden unit and frame of a batch that the backward pass needs: gates, cell and hidden state.
+const HIDDEN_VALUES: u64 = 10;
+/// How many frames the principal components are computed from at most, and how many copies of them are made.
+const PRINCIPAL_FRAMES: u64 = 8192;
+const PRINCIPAL_COPIES: u64 = 4;
+
+/// Three quarters of the memory that this process can use, in MiB; 0 if that is unknown.
+#[must_use]
+pub fn default_limit_mb() -> u64 {
+    let limits = [machine_bytes(), cgroup_bytes()];
+    limits
+        .into_iter()
+        .flatten()
+        .min()
+        .map_or(0, |bytes| bytes / MIB * 3 / 4)
+}
+
+fn machine_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib << 10)
+}
+
+/// The memory limit of this process's control group, or of the group that its container shows as the root.
+fn cgroup_bytes() -> Option<u64> {
+    let group = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let path = group.lines().find_map(|line| line.strip_prefix("0::")).unwrap_or("/");
+    let files = [
+        format!("/sys/fs/cgroup{path}/memory.max"),
+        "/sys/fs/cgroup/memory.max".to_owned(),
+        "/sys/fs/cgroup/memory/memory.limit_in_bytes".to_owned(),
+    ];
+    let limits = files
+        .iter()
+        .filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok());
+    limits.min()
+}
+
+/// The least memory that a training on a data set needs, in MiB. It leaves out what is hard to know, so a training that
+/// passes this check can still reach its limit.
+#[must_use]
+pub(super) fn training_mb(config: &TrainConfig, dataset: &DatasetInfo) -> u64 {
+    let count = |value: usize| value as u64;
+    let (features, hidden) = (count(config.model.features), count(config.model.hidden));
+    let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
+    let frames = dataset.frame_count as u64;
+    let codec = 2 * pixels * features;
+    let network = 2 * 4 * hidden * (features + hidden) + hidden * features;
+    let weights = VALUE * WEIGHT_COPIES * (codec + network);
+    let window = count(config.model.context + config.model.horizon);
+    let fit_frames = count(config.fit.batch_size) * window;
+    let fit = VALUE * fit_frames * (PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden);
+    let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
+    let principal = match config.pretrain.start {
+        CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,
+        CodecStart::Random => 0,
+    };
+    let work = [fit, pretrain, principal].into_iter().max().unwrap_or(0);
+    (frames * pixels + weights + work).div_ceil(MIB)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_limit_is_below_the_memory_of_the_machine() {
+        if let Some(bytes) = machine_bytes() {
+            assert!((1..bytes / MIB).contains(&default_limit_mb()));
+        }
+    }
+
+    #[test]
+    fn a_huge_training_needs_more_than_a_usual_one() {
+        let dataset = DatasetInfo {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            frame_count: 1000,
+            ..DatasetInfo::default()
+        };
+        let usual = TrainConfig::layered("paper", None, &[]).unwrap();
+        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[fit]\nbatch_size = 4096\n";
+        let huge = TrainConfig::layered("paper", Some(huge), &[]).unwrap();
+        let (usual, huge) = (training_mb(&usual, &dataset), training_mb(&huge, &dataset));
+        assert!(usual < 2048 && huge > 4096, "{usual} {huge}");
+    }
+}

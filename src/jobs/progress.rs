@@ -1,0 +1,196 @@
+//! Buffers the report of a running job between two writes to the store. Pure: the time is an argument, in seconds since
+//! 1970.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+use crate::store::LossRow;
+
+/// How many lines and points are buffered at most; the oldest are dropped first.
+const MAX_WAITING: usize = 1000;
+/// The shortest time that a rate is computed from, in seconds.
+const MIN_MEASURED_S: f64 = 1.0;
+
+/// How much of a job is done.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct JobProgress {
+    /// Units done: trials of a collection, steps of a training, windows of an evaluation.
+    pub done: u64,
+    /// Units in total; 0 until it is known.
+    pub total: u64,
+    /// Units per second in this attempt, or in this stage of a training.
+    pub rate_per_s: Option<f64>,
+    /// Seconds left at that rate.
+    pub remaining_s: Option<f64>,
+    /// What the job is doing.
+    pub message: String,
+}
+
+/// The latest losses of a training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Losses {
+    /// On the training windows.
+    pub train: Option<f64>,
+    /// On the validation windows.
+    pub validation: Option<f64>,
+}
+
+/// A job's progress as the store keeps it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct StoredProgress {
+    /// How much is done.
+    pub progress: JobProgress,
+    /// The latest losses.
+    pub losses: Losses,
+}
+
+/// The part of a running job's report that is not yet written to the store.
+#[derive(Debug, Default)]
+pub(super) struct ReportBuffer {
+    stored: StoredProgress,
+    lines: VecDeque<(f64, String)>,
+    points: VecDeque<LossRow>,
+    /// When the rate measurement started, and how many units were done then, for example in an earlier attempt.
+    measured_from: Option<(f64, u64)>,
+    /// Units that are saved.
+    checkpoint: u64,
+}
+
+impl ReportBuffer {
+    /// Continues from the stored progress.
+    pub(super) fn new(stored: StoredProgress) -> Self {
+        Self {
+            stored,
+            ..Self::default()
+        }
+    }
+
+    /// Sets the units done, their total, and what the job is doing.
+    pub(super) fn progress(&mut self, (done, total): (u64, u64), message: &str, now_s: f64) {
+        // Without a total nothing is measured yet; fewer units than before belong to new work.
+        let restarts = total != self.stored.progress.total || done < self.stored.progress.done;
+        if total == 0 || restarts {
+            self.measured_from = None;
+        }
+        let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
+        let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
+        let rate = (gained > 0.0 && elapsed_s >= MIN_MEASURED_S).then(|| gained / elapsed_s);
+        self.stored.progress = JobProgress {
+            done,
+            total,
+            rate_per_s: rate,
+            remaining_s: rate.map(|rate| total.saturating_sub(done) as f64 / rate),
+            message: message.to_owned(),
+        };
+    }
+
+    /// Restarts the rate measurement, because the units of a new stage take a different time.
+    pub(super) fn stage(&mut self) {
+        self.measured_from = None;
+    }
+
+    /// Sets the latest losses. A loss that is `None` keeps its last value.
+    pub(super) fn losses(&mut self, losses: Losses) {
+        let last = self.stored.losses;
+        self.stored.losses = Losses {
+            train: losses.train.or(last.train),
+            validation: losses.validation.or(last.validation),
+        };
+    }
+
+    /// Sets how many units are saved.
+    pub(super) fn checkpoint(&mut self, units: u64) {
+        self.checkpoint = self.checkpoint.max(units);
+    }
+
+    /// How many units are saved, as far as this attempt knows.
+    pub(super) fn saved(&self) -> u64 {
+        self.checkpoint
+    }
+
+    /// Adds a line to the log.
+    pub(super) fn line(&mut self, line: String, now_s: f64) {
+        push(&mut self.lines, (now_s, line));
+    }
+
+    /// Adds a point to the loss curves.
+    pub(super) fn point(&mut self, point: LossRow) {
+        push(&mut self.points, point);
+    }
+
+    /// The progress to store.
+    pub(super) fn stored(&self) -> &StoredProgress {
+        &self.stored
+    }
+
+    /// Removes and returns the buffered lines and points.
+    pub(super) fn drain(&mut self) -> (Vec<(f64, String)>, Vec<LossRow>) {
+        (self.lines.drain(..).collect(), self.points.drain(..).collect())
+    }
+
+    /// Puts back what could not be written, before what was added since.
+    pub(super) fn restore_unwritten(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
+        let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
+        lines
+            .into_iter()
+            .chain(later.0)
+            .for_each(|line| push(&mut self.lines, line));
+        points
+            .into_iter()
+            .chain(later.1)
+            .for_each(|point| push(&mut self.points, point));
+    }
+}
+
+fn push<T>(waiting: &mut VecDeque<T>, item: T) {
+    if waiting.len() == MAX_WAITING {
+        waiting.pop_front();
+    }
+    waiting.push_back(item);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rate_and_time_left_count_only_this_attempt() {
+        let mut buffer = ReportBuffer::default();
+        buffer.progress((100, 200), "", 10.0);
+        buffer.progress((120, 200), "", 20.0);
+        let progress = &buffer.stored().progress;
+        assert_eq!((progress.rate_per_s, progress.remaining_s), (Some(2.0), Some(40.0)));
+    }
+
+    #[test]
+    fn a_resumed_attempt_measures_no_earlier_work() {
+        let mut buffer = ReportBuffer::default();
+        buffer.progress((0, 0), "reading the data set", 0.0);
+        buffer.progress((500, 1000), "fit", 10.0);
+        assert_eq!(buffer.stored().progress.rate_per_s, None);
+        buffer.progress((501, 1000), "fit", 10.001);
+        assert_eq!(buffer.stored().progress.rate_per_s, None);
+        buffer.progress((520, 1000), "fit", 20.0);
+        assert_eq!(buffer.stored().progress.rate_per_s, Some(2.0));
+    }
+
+    #[test]
+    fn unwritten_lines_come_before_later_ones() {
+        let mut buffer = ReportBuffer::default();
+        buffer.line("one".to_owned(), 1.0);
+        let (lines, points) = buffer.drain();
+        buffer.line("two".to_owned(), 2.0);
+        buffer.restore_unwritten(lines, points);
+        let (lines, _) = buffer.drain();
+        assert_eq!(lines, [(1.0, "one".to_owned()), (2.0, "two".to_owned())]);
+    }
+
+    #[test]
+    fn the_buffer_is_bounded_while_the_store_is_unreachable() {
+        let mut buffer = ReportBuffer::default();
+        (0..5000).for_each(|i| buffer.line(i.to_string(), 0.0));
+        let (lines, _) = buffer.drain();
+        assert_eq!((lines.len(), lines[0].1.as_str()), (MAX_WAITING, "4000"));
+    }
+}

@@ -1,0 +1,15 @@
+//! HTTP itself, before any resource: connections, limits, who may call, and the one shape that errors have.
+
+pub(super) mod admission;
+pub(super) mod connections;
+pub(super) mod extract;
+pub(super) mod listener;
+pub(super) mod middleware;
+pub(super) mod multipart;
+pub(super) mod origin;
+pub(super) mod page;
+pub(super) mod problem;
+pub(super) mod streams;
+
+pub mod keys;
+pub mod shutdown;

@@ -1,0 +1,84 @@
+//! Open connections, one task each, so that the server can ask all to end, wait for them, and cut them off.
+
+use std::convert::Infallible;
+use std::pin::pin;
+use std::time::Duration;
+
+use axum::Router;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tracing::debug;
+
+use super::listener::{BoundedConnection, BoundedListener};
+use super::streams::stop_requested;
+use crate::server::config::ServerConfig;
+
+/// The open connections. Dropping this cuts them off. After an upgrade, a connection belongs to its stream's task.
+pub(in crate::server) struct Connections {
+    tasks: JoinSet<()>,
+    http: http1::Builder,
+    router: Router,
+    stopping: watch::Receiver<bool>,
+}
+
+impl Connections {
+    pub(in crate::server) fn new(router: Router, config: &ServerConfig, stopping: watch::Receiver<bool>) -> Self {
+        let mut http = http1::Builder::new();
+        http.timer(TokioTimer::new())
+            .header_read_timeout(Duration::from_millis(config.header_read_ms))
+            .max_header_size(config.max_header_bytes);
+        Self {
+            tasks: JoinSet::new(),
+            http,
+            router,
+            stopping,
+        }
+    }
+
+    /// Accepts connections until the future is dropped.
+    pub(in crate::server) async fn accept(&mut self, listener: &BoundedListener) -> Infallible {
+        loop {
+            tokio::select! {
+                connection = listener.accept() => {
+                    self.tasks.spawn(answer(connection, self.http.clone(), self.router.clone(), self.stopping.clone()));
+                }
+                // Removes tasks that have ended, so that the set holds only the open connections.
+                Some(_) = self.tasks.join_next() => {}
+            }
+        }
+    }
+
+    /// Waits until every connection has ended.
+    pub(in crate::server) async fn ended(&mut self) {
+        while self.tasks.join_next().await.is_some() {}
+    }
+}
+
+/// Answers a connection's requests. After the stop signal, it answers only requests that have arrived.
+///
+/// `hyper_util`'s `GracefulShutdown` does not serve here: it does not support upgrades of HTTP/1 connections, and it
+/// closes an idle connection before it reads a request that has already arrived.
+async fn answer(
+    connection: BoundedConnection,
+    http: http1::Builder,
+    router: Router,
+    mut stopping: watch::Receiver<bool>,
+) {
+    let service = TowerToHyperService::new(router);
+    let mut connection = pin!(http.serve_connection(TokioIo::new(connection), service).with_upgrades());
+    let result = tokio::select! {
+        // The connection first: it reads what has arrived before an idle connection is closed.
+        biased;
+        result = connection.as_mut() => result,
+        () = stop_requested(&mut stopping) => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = result {
+        debug!(%error, "connection failed");
+    }
+}

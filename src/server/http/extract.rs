@@ -1,0 +1,168 @@
+//! Extractors: the parts of a request as typed values. Errors are problem details.
+
+use std::marker::PhantomData;
+
+use axum::extract::path::ErrorKind;
+use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection};
+use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::request::Parts;
+use axum::http::{StatusCode, header};
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{DeserializeOwned, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+
+use super::problem::ApiError;
+
+/// A JSON body. It must be an object: serde would also accept a list of the fields' values.
+pub(in crate::server) struct Json<T>(pub(in crate::server) T);
+
+struct Object<T>(T);
+
+impl<'de, T: Deserialize<'de>> Deserialize<'de> for Object<T> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_map(ObjectVisitor(PhantomData))
+    }
+}
+
+struct ObjectVisitor<T>(PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>> Visitor<'de> for ObjectVisitor<T> {
+    type Value = Object<T>;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("an object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Object<T>, A::Error> {
+        T::deserialize(MapAccessDeserializer::new(map)).map(Object)
+    }
+}
+
+impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Json<T> {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
+        let axum::Json(Object(value)) = axum::Json::from_request(request, state).await?;
+        Ok(Self(value))
+    }
+}
+
+/// The path's parameters.
+pub(in crate::server) struct Path<T>(pub(in crate::server) T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Path<T> {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        let axum::extract::Path(value) = axum::extract::Path::from_request_parts(parts, state).await?;
+        Ok(Self(value))
+    }
+}
+
+/// The query's parameters.
+pub(in crate::server) struct Query<T>(pub(in crate::server) T);
+
+impl<T: DeserializeOwned, S: Send + Sync> FromRequestParts<S> for Query<T> {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+        let axum::extract::Query(value) = axum::extract::Query::from_request_parts(parts, state)
+            .await
+            .map_err(|rejection| ApiError::Unprocessable(rejection.body_text()))?;
+        Ok(Self(value))
+    }
+}
+
+/// The media type of the response that the client wants.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::server) enum ResponseFormat {
+    Json,
+    Png,
+    Gif,
+}
+
+impl ResponseFormat {
+    /// The first supported media type in an `Accept` header; JSON if the header is absent.
+    fn from_accept(accept: &str) -> Result<Self, ApiError> {
+        let named = accept
+            .split(',')
+            .map(|part| part.split(';').next().unwrap_or("").trim());
+        for media_type in named {
+            match media_type {
+                "application/json" | "application/*" | "*/*" | "" => return Ok(Self::Json),
+                "image/png" | "image/*" => return Ok(Self::Png),
+                "image/gif" => return Ok(Self::Gif),
+                _ => {}
+            }
+        }
+        Err(ApiError::NotAcceptable(format!(
+            "a prediction is not available as {accept}; accept application/json, image/png and image/gif"
+        )))
+    }
+}
+
+impl<S: Send + Sync> FromRequestParts<S> for ResponseFormat {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
+        let accept = parts.headers.get(header::ACCEPT).map_or(Ok("*/*"), |accept| {
+            accept
+                .to_str()
+                .map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))
+        })?;
+        Self::from_accept(accept)
+    }
+}
+
+impl From<JsonRejection> for ApiError {
+    fn from(rejection: JsonRejection) -> Self {
+        match rejection {
+            JsonRejection::MissingJsonContentType(_) => Self::UnsupportedMedia(
+                "the body must be JSON, and the header Content-Type must say application/json".to_owned(),
+            ),
+            JsonRejection::JsonDataError(error) => Self::Unprocessable(error.body_text()),
+            JsonRejection::BytesRejection(error) => error.into(),
+            other => Self::Malformed(other.body_text()),
+        }
+    }
+}
+
+impl From<BytesRejection> for ApiError {
+    fn from(rejection: BytesRejection) -> Self {
+        if rejection.status() == StatusCode::PAYLOAD_TOO_LARGE {
+            Self::TooLarge("the body is longer than this server takes".to_owned())
+        } else {
+            Self::Malformed(rejection.body_text())
+        }
+    }
+}
+
+impl From<PathRejection> for ApiError {
+    fn from(rejection: PathRejection) -> Self {
+        let detail = match &rejection {
+            PathRejection::FailedToDeserializePathParams(error) => match error.kind() {
+                ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } => {
+                    Some(format!("\"{value}\" in the path is not a whole number, or too large"))
+                }
+                _ => None,
+            },
+            _ => None,
+        };
+        Self::Malformed(detail.unwrap_or_else(|| rejection.body_text()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_supported_media_type_is_chosen() {
+        assert_eq!(
+            ResponseFormat::from_accept("text/html, image/gif;q=0.8, */*"),
+            Ok(ResponseFormat::Gif)
+        );
+        assert_eq!(ResponseFormat::from_accept("*/*"), Ok(ResponseFormat::Json));
+        assert!(ResponseFormat::from_accept("text/html").is_err());
+    }
+}

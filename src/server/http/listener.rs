@@ -1,0 +1,197 @@
+//! A listener with a bounded number of connections. A connection over the bound gets a 503 response and is closed.
+
+use std::future::poll_fn;
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use metrics::{counter, gauge};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Handle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::Sleep;
+use tracing::warn;
+
+use super::problem::CONNECTIONS_FULL_RESPONSE;
+use crate::server::config::ServerConfig;
+use crate::telemetry::names;
+
+/// How many connections can be refused with a response at the same time; more are closed without one.
+const MAX_REFUSING: usize = 64;
+/// How long a client may take to close its side after the last response, so that it can read it.
+const LINGER: Duration = Duration::from_secs(1);
+/// How long to wait if the system has no file descriptor left for a connection.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+pub(in crate::server) struct BoundedListener {
+    inner: TcpListener,
+    places: Arc<Semaphore>,
+    refusing: Arc<Semaphore>,
+    write_stall: Duration,
+}
+
+impl BoundedListener {
+    pub(in crate::server) fn new(inner: TcpListener, config: &ServerConfig) -> Self {
+        Self {
+            inner,
+            places: Arc::new(Semaphore::new(config.max_connections)),
+            refusing: Arc::new(Semaphore::new(MAX_REFUSING)),
+            write_stall: Duration::from_millis(config.write_stall_ms),
+        }
+    }
+
+    /// The next connection that has a place. Nothing is lost when the future is dropped.
+    pub(in crate::server) async fn accept(&self) -> BoundedConnection {
+        loop {
+            let stream = match self.inner.accept().await {
+                Ok((stream, _)) => stream,
+                Err(error) => {
+                    pause_after(&error).await;
+                    continue;
+                }
+            };
+            // Responses are small and clients wait for them: do not delay them to fill a packet.
+            if let Err(error) = stream.set_nodelay(true) {
+                warn!(%error, "could not set TCP_NODELAY");
+            }
+            match Arc::clone(&self.places).try_acquire_owned() {
+                Ok(place) => return BoundedConnection::new(stream, place, self.write_stall),
+                Err(_) => self.refuse(stream),
+            }
+        }
+    }
+
+    fn refuse(&self, stream: TcpStream) {
+        warn!("too many connections: refused one");
+        counter!(names::HTTP_CONNECTIONS_REFUSED).increment(1);
+        if let Ok(place) = Arc::clone(&self.refusing).try_acquire_owned() {
+            tokio::spawn(async move {
+                // A client that is gone or slow gets no more time.
+                let _ = tokio::time::timeout(LINGER, refuse_and_close(stream)).await;
+                drop(place);
+            });
+        }
+    }
+}
+
+async fn pause_after(error: &io::Error) {
+    let is_of_client = matches!(
+        error.kind(),
+        io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionAborted | io::ErrorKind::ConnectionReset
+    );
+    if !is_of_client {
+        warn!(%error, "could not accept a connection");
+        tokio::time::sleep(ACCEPT_PAUSE).await;
+    }
+}
+
+async fn refuse_and_close(stream: TcpStream) -> io::Result<()> {
+    stream.writable().await?;
+    // Shorter than any socket's send buffer, so one write is enough.
+    stream.try_write(CONNECTIONS_FULL_RESPONSE.as_bytes())?;
+    close_gently(stream).await
+}
+
+/// Closes the writing side, and discards input until the client closes too. Closing with unread input would reset the
+/// connection before the client has read the response.
+async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
+    poll_fn(|cx| Pin::new(&mut stream).poll_shutdown(cx)).await?;
+    let mut unread = [0; 4096];
+    loop {
+        stream.readable().await?;
+        match stream.try_read(&mut unread) {
+            Ok(0) => return Ok(()),
+            Err(error) if error.kind() != io::ErrorKind::WouldBlock => return Err(error),
+            _ => {}
+        }
+    }
+}
+
+/// A connection that holds its place until it has ended, and fails if its client reads nothing for too long. After it is
+/// dropped, the client still has time to read the last response.
+pub(in crate::server) struct BoundedConnection {
+    /// `None` after the drop.
+    open: Option<(TcpStream, OwnedSemaphorePermit)>,
+    write_stall: Duration,
+    stalled: Option<Pin<Box<Sleep>>>,
+}
+
+impl BoundedConnection {
+    fn new(stream: TcpStream, place: OwnedSemaphorePermit, write_stall: Duration) -> Self {
+        gauge!(names::HTTP_CONNECTIONS).increment(1.0);
+        Self {
+            open: Some((stream, place)),
+            write_stall,
+            stalled: None,
+        }
+    }
+
+    fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
+        let (stream, _) = self.open.as_mut().ok_or(io::ErrorKind::NotConnected)?;
+        Ok(Pin::new(stream))
+    }
+
+    /// Passes on the result of a write. A write that makes no progress fails after the limit.
+    fn limit_stall<T>(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
+        if written.is_ready() {
+            self.stalled = None;
+            return written;
+        }
+        let limit = self.write_stall;
+        let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(limit)));
+        sleep
+            .as_mut()
+            .poll(cx)
+            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "the client does not read")))
+    }
+}
+
+impl Drop for BoundedConnection {
+    fn drop(&mut self) {
+        gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
+        // Without a runtime, the connection is closed at once.
+        if let (Some((stream, place)), Ok(runtime)) = (self.open.take(), Handle::try_current()) {
+            runtime.spawn(async move {
+                let _ = tokio::time::timeout(LINGER, close_gently(stream)).await;
+                drop(place);
+            });
+        }
+    }
+}
+
+impl AsyncRead for BoundedConnection {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.stream()?.poll_read(cx, buffer)
+    }
+}
+
+impl AsyncWrite for BoundedConnection {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let written = self.stream()?.poll_write(cx, bytes);
+        self.limit_stall(cx, written)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bytes: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let written = self.stream()?.poll_write_vectored(cx, bytes);
+        self.limit_stall(cx, written)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        true
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.stream()?.poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.stream()?.poll_shutdown(cx)
+    }
+}

@@ -1,0 +1,147 @@
+//! What every request gets: an id, a span in the log, a deadline, and metrics.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use axum::extract::{MatchedPath, Request};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use metrics::{counter, histogram};
+use tracing::{Instrument, debug, info_span};
+
+use super::problem::{self, ApiError};
+use crate::server::config::ServerConfig;
+use crate::telemetry::names;
+
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+/// The maximum length of a client's own id; a longer one is replaced.
+const MAX_ID_LEN: usize = 64;
+
+/// What [`trace`] needs; clones share it.
+#[derive(Clone)]
+pub(in crate::server) struct RequestTrace {
+    ids: Arc<RequestIds>,
+    limit: Duration,
+    draining: Arc<AtomicBool>,
+}
+
+impl RequestTrace {
+    /// `draining` is true while the server stops.
+    pub(in crate::server) fn new(config: &ServerConfig, draining: Arc<AtomicBool>) -> Self {
+        Self {
+            ids: Arc::new(RequestIds::new()),
+            limit: Duration::from_millis(config.request_deadline_ms),
+            draining,
+        }
+    }
+}
+
+/// Makes ids for requests that have none: the start time of the server, and a count.
+struct RequestIds {
+    started: u64,
+    next: AtomicU64,
+}
+
+impl RequestIds {
+    fn new() -> Self {
+        let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        Self {
+            // A clock before 1970 gives the time 0: ids then are still unique within this process.
+            started: since_1970.map_or(0, |time| time.as_secs()),
+            next: AtomicU64::new(1),
+        }
+    }
+
+    /// The client's own id if it is short and of plain characters, else a new one. (`tower-http`'s request ids would keep
+    /// any id of a client.)
+    fn of(&self, headers: &HeaderMap) -> String {
+        let allowed = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.' | b':');
+        let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok());
+        match given.filter(|id| (1..=MAX_ID_LEN).contains(&id.len()) && id.bytes().all(allowed)) {
+            Some(id) => id.to_owned(),
+            None => format!("{:x}-{}", self.started, self.next.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+}
+
+/// Runs the request in a span with its id, within the deadline; writes the body of an error; counts the response.
+pub(in crate::server) async fn trace(trace: RequestTrace, request: Request, next: Next) -> Response {
+    let id = trace.ids.of(request.headers());
+    let span = info_span!("request", id = %id, method = %request.method(), path = request.uri().path());
+    let (method, route, limit) = (method(request.method()), route(&request), trace.limit);
+    let work = async move {
+        let started = Instant::now();
+        let response = match refuse_encoded(request.headers()) {
+            Ok(()) => tokio::time::timeout(limit, next.run(request)).await,
+            Err(refused) => Ok(refused.into_response()),
+        };
+        let response = response.unwrap_or_else(|_| {
+            let limit_ms = limit.as_millis();
+            ApiError::Timeout(format!(
+                "the request took longer than {limit_ms} ms to arrive and be answered"
+            ))
+            .into_response()
+        });
+        let (elapsed, status) = (started.elapsed(), response.status());
+        debug!(
+            status = status.as_u16(),
+            elapsed_us = elapsed.as_micros() as u64,
+            "answered"
+        );
+        let status = status.as_str().to_owned();
+        counter!(names::HTTP_REQUESTS, "method" => method, "route" => route.clone(), "status" => status).increment(1);
+        histogram!(names::HTTP_REQUEST_SECONDS, "route" => route).record(elapsed);
+        response
+    };
+    let mut response = problem::finish(work.instrument(span).await, &id);
+    let headers = response.headers_mut();
+    if let Ok(id) = HeaderValue::from_str(&id) {
+        headers.insert(REQUEST_ID, id);
+    }
+    if trace.draining.load(Ordering::Acquire) && !headers.contains_key(header::CONNECTION) {
+        headers.insert(header::CONNECTION, HeaderValue::from_static("close"));
+    }
+    response
+}
+
+/// A small compressed body can become a huge one, so the server decodes none.
+fn refuse_encoded(headers: &HeaderMap) -> Result<(), ApiError> {
+    match headers.get(header::CONTENT_ENCODING) {
+        Some(encoding) if encoding != "identity" => Err(ApiError::UnsupportedMedia(
+            "the body has a Content-Encoding; send it without".to_owned(),
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// A label with few values, whatever clients send.
+fn method(method: &Method) -> &'static str {
+    match *method {
+        Method::GET => "GET",
+        Method::HEAD => "HEAD",
+        Method::POST => "POST",
+        Method::DELETE => "DELETE",
+        Method::OPTIONS => "OPTIONS",
+        _ => "other",
+    }
+}
+
+/// The route's template: a label with few values.
+fn route(request: &Request) -> String {
+    let matched = request.extensions().get::<MatchedPath>();
+    matched.map_or_else(|| "none".to_owned(), |path| path.as_str().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_encoded_body_is_refused() {
+        let with = |encoding| HeaderMap::from_iter([(header::CONTENT_ENCODING, HeaderValue::from_static(encoding))]);
+        assert!(refuse_encoded(&HeaderMap::new()).is_ok() && refuse_encoded(&with("identity")).is_ok());
+        assert!(refuse_encoded(&with("gzip")).is_err() && refuse_encoded(&with("identity, br")).is_err());
+    }
+}

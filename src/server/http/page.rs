@@ -1,0 +1,49 @@
+//! Pages of lists that are ordered by name or id.
+
+use serde::Deserialize;
+
+use super::problem::ApiError;
+
+/// Entries of a page by default.
+const DEFAULT_LIMIT: usize = 100;
+/// The maximum number of entries of a page.
+const MAX_LIMIT: usize = 1000;
+
+/// Which page of a list.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+pub(in crate::server) struct Page {
+    /// Only entries after this one: the `next` of the previous page.
+    #[serde(default)]
+    pub(in crate::server) after: String,
+    /// The maximum number of entries, 1 to 1000. Default: 100.
+    #[serde(default)]
+    #[param(minimum = 1, maximum = 1000)]
+    limit: Option<usize>,
+}
+
+impl Page {
+    /// The maximum number of entries. Errors: `Unprocessable` if it is out of range.
+    pub(in crate::server) fn limit(&self) -> Result<usize, ApiError> {
+        let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
+        if (1..=MAX_LIMIT).contains(&limit) {
+            return Ok(limit);
+        }
+        Err(ApiError::Unprocessable(format!(
+            "limit is {limit}; it must be 1 to {MAX_LIMIT}"
+        )))
+    }
+
+    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`Page::limit`].
+    pub(in crate::server) fn of<T>(
+        &self,
+        all: impl IntoIterator<Item = T>,
+        key: impl Fn(&T) -> &str,
+    ) -> Result<(Vec<T>, Option<String>), ApiError> {
+        let limit = self.limit()?;
+        let mut rest = all.into_iter().filter(|entry| key(entry) > self.after.as_str());
+        let page: Vec<T> = rest.by_ref().take(limit).collect();
+        let next = rest.next().and_then(|_| page.last().map(|last| key(last).to_owned()));
+        Ok((page, next))
+    }
+}

@@ -1,0 +1,187 @@
+//! The HTTP status of an error, and the one shape that errors have: problem details (RFC 9457).
+
+use axum::body::Body;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use tracing::error;
+
+/// When the client may try again if nothing better is known, in seconds.
+const RETRY_AFTER_S: u64 = 1;
+/// The maximum length of a detail in bytes: it may quote a long value that a client sent.
+const MAX_DETAIL_BYTES: usize = 1000;
+
+/// An error as a client sees it: problem details, RFC 9457.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct Problem {
+    /// The kind of problem, as a URN.
+    #[serde(rename = "type")]
+    pub kind: String,
+    /// The kind of problem in words.
+    pub title: &'static str,
+    /// The HTTP status.
+    pub status: u16,
+    /// What was wrong, and what would be right.
+    pub detail: String,
+    /// The request's id, as in the header `x-request-id`.
+    pub instance: String,
+}
+
+/// Why a request failed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(in crate::server) enum ApiError {
+    Malformed(String),
+    Unauthorized(&'static str),
+    Forbidden(String),
+    NotFound(String),
+    MethodNotAllowed,
+    NotAcceptable(String),
+    Timeout(String),
+    Conflict(String),
+    Gone(String),
+    TooLarge(String),
+    UnsupportedMedia(String),
+    Unprocessable(String),
+    UpgradeRequired,
+    Internal(String),
+    Unavailable { detail: String, retry_after_s: u64 },
+}
+
+impl ApiError {
+    pub(in crate::server) fn unavailable(detail: impl Into<String>) -> Self {
+        Self::Unavailable {
+            detail: detail.into(),
+            retry_after_s: RETRY_AFTER_S,
+        }
+    }
+
+    fn status(&self) -> (StatusCode, &'static str) {
+        match self {
+            Self::Malformed(_) => (StatusCode::BAD_REQUEST, "malformed"),
+            Self::Unauthorized(_) => (StatusCode::UNAUTHORIZED, "unauthorized"),
+            Self::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
+            Self::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
+            Self::MethodNotAllowed => (StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed"),
+            Self::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable"),
+            Self::Timeout(_) => (StatusCode::REQUEST_TIMEOUT, "timeout"),
+            Self::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
+            Self::Gone(_) => (StatusCode::GONE, "gone"),
+            Self::TooLarge(_) => (StatusCode::PAYLOAD_TOO_LARGE, "too-large"),
+            Self::UnsupportedMedia(_) => (StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported-media-type"),
+            Self::Unprocessable(_) => (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable"),
+            Self::UpgradeRequired => (StatusCode::UPGRADE_REQUIRED, "upgrade-required"),
+            Self::Internal(_) => (StatusCode::INTERNAL_SERVER_ERROR, "internal"),
+            Self::Unavailable { .. } => (StatusCode::SERVICE_UNAVAILABLE, "unavailable"),
+        }
+    }
+
+    fn detail(self) -> String {
+        match self {
+            Self::Malformed(detail)
+            | Self::Forbidden(detail)
+            | Self::NotFound(detail)
+            | Self::NotAcceptable(detail)
+            | Self::Timeout(detail)
+            | Self::Conflict(detail)
+            | Self::Gone(detail)
+            | Self::TooLarge(detail)
+            | Self::UnsupportedMedia(detail)
+            | Self::Unprocessable(detail)
+            | Self::Unavailable { detail, .. } => detail,
+            Self::Unauthorized(detail) => detail.to_owned(),
+            Self::MethodNotAllowed => "this path does not support that method; see /openapi.json".to_owned(),
+            Self::UpgradeRequired => "this path is a WebSocket; connect with a WebSocket handshake".to_owned(),
+            // The cause is in the log, under the request's id.
+            Self::Internal(_) => "the server failed; the reason is in its log, under the id of this request".to_owned(),
+        }
+    }
+}
+
+impl IntoResponse for ApiError {
+    /// A response without body: [`finish`] writes the body, because it knows the request's id.
+    fn into_response(self) -> Response {
+        if let Self::Internal(cause) = &self {
+            error!(cause, "request failed");
+        }
+        let (status, slug) = self.status();
+        let mut response = status.into_response();
+        let headers = response.headers_mut();
+        match &self {
+            Self::Unavailable { retry_after_s, .. } => {
+                headers.insert(header::RETRY_AFTER, HeaderValue::from(*retry_after_s));
+            }
+            Self::Unauthorized(_) => {
+                headers.insert(
+                    header::WWW_AUTHENTICATE,
+                    HeaderValue::from_static("Bearer realm=\"foreframe\""),
+                );
+            }
+            _ => {}
+        }
+        response.extensions_mut().insert(Problem {
+            kind: format!("urn:foreframe:problem:{slug}"),
+            title: status.canonical_reason().unwrap_or(slug),
+            status: status.as_u16(),
+            detail: bounded(self.detail()),
+            instance: String::new(),
+        });
+        response
+    }
+}
+
+/// Writes the body of an error response.
+pub(in crate::server) fn finish(mut response: Response, request_id: &str) -> Response {
+    let Some(problem) = response.extensions_mut().remove::<Problem>() else {
+        return response;
+    };
+    let problem = Problem {
+        instance: request_id.to_owned(),
+        ..problem
+    };
+    *response.body_mut() = Body::from(json(&problem));
+    let headers = response.headers_mut();
+    headers.remove(header::CONTENT_LENGTH);
+    headers.insert(
+        header::CONTENT_TYPE,
+        HeaderValue::from_static("application/problem+json"),
+    );
+    response
+}
+
+#[expect(clippy::expect_used, reason = "a struct of texts and a number is always valid JSON")]
+fn json(problem: &Problem) -> Vec<u8> {
+    serde_json::to_vec(problem).expect("a problem that is not JSON is a bug")
+}
+
+/// The detail, shortened in the middle if it is too long.
+pub(in crate::server) fn bounded(detail: String) -> String {
+    if detail.len() <= MAX_DETAIL_BYTES {
+        return detail;
+    }
+    let head = detail.floor_char_boundary(MAX_DETAIL_BYTES / 2);
+    let tail = detail.ceil_char_boundary(detail.len() - MAX_DETAIL_BYTES / 2);
+    format!("{} … {}", &detail[..head], &detail[tail..])
+}
+
+/// The response to a connection over the limit, as bytes on the wire: no request is read from it.
+pub(in crate::server) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavailable\r\n\
+    Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\r\n\
+    {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
+    \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_detail_keeps_its_beginning_and_its_end() {
+        let long = format!("unknown field `{}` at line 1", "ä".repeat(1000));
+        let bounded = bounded(long.clone());
+        assert!(
+            bounded.len() < MAX_DETAIL_BYTES + 10 && bounded.starts_with("unknown field `ä"),
+            "{bounded}"
+        );
+        assert!(bounded.ends_with("ä` at line 1"), "{bounded}");
+        assert_eq!(super::bounded("short".to_owned()), "short");
+    }
+}

@@ -1,0 +1,74 @@
+//! All routes with the layers around them. A route is declared once, at its handler; this also makes the contract.
+
+use axum::extract::DefaultBodyLimit;
+use axum::middleware::{from_fn, from_fn_with_state};
+use axum::{Extension, Router};
+use utoipa::openapi::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+
+use super::config::ServerConfig;
+use super::http::keys;
+use super::http::middleware::{self, RequestTrace};
+use super::http::origin::{self, OriginPolicy};
+use super::http::problem::ApiError;
+use super::openapi;
+use super::routes::{
+    contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict, preview,
+    rollouts, sessions, streams,
+};
+use super::state::App;
+
+/// Every route of the service.
+pub fn router(app: App) -> Router {
+    let config = app.config();
+    let api = api_routes(config).route_layer(from_fn_with_state(app.keys().clone(), keys::check));
+    let (router, contract) = open_routes().merge(api).split_for_parts();
+    let document = openapi::text(contract);
+    let trace = RequestTrace::new(config, app.draining());
+    let origins = OriginPolicy::new(config, app.keys().clone());
+    router
+        .merge(docs::routes())
+        .layer(Extension(contract::ContractText::from(document)))
+        .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
+        .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
+        .layer(DefaultBodyLimit::max(config.max_body_bytes))
+        .layer(from_fn_with_state(origins, origin::check))
+        .layer(from_fn(move |request, next| {
+            middleware::trace(trace.clone(), request, next)
+        }))
+        .with_state(app)
+}
+
+/// The OpenAPI 3.1 document of the whole service, as JSON with a line break at its end.
+#[must_use]
+pub fn openapi_document() -> String {
+    openapi::text(contract(&ServerConfig::default()))
+}
+
+fn contract(config: &ServerConfig) -> OpenApi {
+    open_routes().merge(api_routes(config)).into_openapi()
+}
+
+/// The routes that need no API key.
+fn open_routes() -> OpenApiRouter<App> {
+    OpenApiRouter::with_openapi(openapi::frame())
+        .merge(dashboard::routes())
+        .merge(health::routes())
+        .merge(metrics::routes())
+        .merge(contract::routes())
+}
+
+/// The routes that need an API key if authentication is on.
+fn api_routes(config: &ServerConfig) -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .merge(models::routes())
+        .merge(predict::routes())
+        .merge(preview::routes())
+        .merge(rollouts::routes())
+        .merge(sessions::routes())
+        .merge(streams::routes())
+        .merge(jobs::routes(config.max_job_bytes))
+        .merge(job_events::routes())
+        .merge(datasets::routes())
+        .merge(environments::routes())
+}

@@ -1,0 +1,19 @@
+//! The handlers, one resource a file. Each file declares its routes in a function `routes`.
+
+pub(super) mod contract;
+pub(super) mod dashboard;
+pub(super) mod datasets;
+pub(super) mod docs;
+pub(super) mod environments;
+pub(super) mod health;
+pub(super) mod job_events;
+pub(super) mod jobs;
+pub(super) mod metrics;
+pub(super) mod models;
+pub(super) mod predict;
+pub(super) mod preview;
+pub(super) mod rollouts;
+pub(super) mod sessions;
+pub(super) mod streams;
+
+mod picture;

@@ -1,0 +1,250 @@
+//! The data sets, and pictures of their episodes.
+
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+use serde::Serialize;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::picture::PictureError;
+use crate::dataset::{self, Dataset, DatasetError, DatasetInfo};
+use crate::error_text::with_causes;
+use crate::evaluation::figures::animation::enlarged_gif;
+use crate::evaluation::figures::montage::{MontageRow, Style, montage};
+use crate::frame::{Frame, FrameError, codec};
+use crate::jobs::{JobError, datasets};
+use crate::server::http::extract::{Path, Query};
+use crate::server::http::page::Page;
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::types::Channel;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(get))
+        .routes(routes!(delete))
+        .routes(routes!(sheet))
+        .routes(routes!(animation))
+}
+
+/// The maximum number of frames of an animation.
+const MAX_ANIMATED: usize = 300;
+/// The maximum number of frames of a contact sheet, and of one of its rows.
+const MAX_SHOWN: usize = 32;
+const ROW_FRAMES: usize = 8;
+
+/// A page of data sets.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct DatasetList {
+    /// In the order of their names.
+    datasets: Vec<DatasetDescription>,
+    /// The value of `after` for the next page; absent on the last page.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next: Option<String>,
+}
+
+/// A data set.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct DatasetDescription {
+    /// Its name on this server.
+    name: String,
+    /// The name in its own description.
+    title: String,
+    /// Number of episodes.
+    episodes: usize,
+    /// Number of frames in all episodes.
+    frames: usize,
+    /// Width of every frame in pixels.
+    frame_width_px: u32,
+    /// Height of every frame in pixels.
+    frame_height_px: u32,
+    /// Seconds from one frame to the next.
+    frame_period_s: f64,
+    /// Components of an action.
+    actions: Vec<Channel>,
+    /// Components of a state.
+    states: Vec<Channel>,
+    /// Hash of its content.
+    content_hash: String,
+    /// The scenario of the simulation, if it was simulated.
+    scenario: Option<String>,
+    /// The seed of the simulation, if it was simulated.
+    seed: Option<u64>,
+    /// Whether it has masks that tell what is seen at each pixel.
+    has_masks: bool,
+}
+
+impl DatasetDescription {
+    fn new(name: String, info: DatasetInfo) -> Self {
+        Self {
+            name,
+            title: info.name,
+            episodes: info.episode_count,
+            frames: info.frame_count,
+            frame_width_px: info.frame_width_px,
+            frame_height_px: info.frame_height_px,
+            frame_period_s: info.frame_period_s,
+            actions: info.action_channels,
+            states: info.state_channels,
+            content_hash: info.content_hash,
+            scenario: info.scenario,
+            seed: info.seed.map(|seed| seed.0),
+            has_masks: info.has_masks,
+        }
+    }
+}
+
+/// Lists the finished data sets.
+#[utoipa::path(
+    get, path = "/v1/datasets", tag = "datasets", params(Page),
+    responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
+)]
+async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
+    let names = datasets::names(app.store().objects()).await?;
+    let (names, next) = page.of(names, |name| name)?;
+    let mut datasets = Vec::new();
+    for name in names {
+        // A damaged data set, or one that is being deleted, must not hide the others.
+        datasets.extend(describe(&app, &name).await.ok());
+    }
+    Ok(axum::Json(DatasetList { datasets, next }))
+}
+
+/// Describes a data set.
+#[utoipa::path(
+    get, path = "/v1/datasets/{dataset}", tag = "datasets",
+    params(("dataset" = String, Path, description = "The data set's name")),
+    responses((status = 200, body = DatasetDescription), (status = 404, description = "No such data set", body = Problem))
+)]
+async fn get(State(app): State<App>, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
+    describe(&app, &name).await.map(axum::Json)
+}
+
+/// Deletes a data set that no job uses; also an unfinished one of a collection that was cancelled or failed.
+#[utoipa::path(
+    delete, path = "/v1/datasets/{dataset}", tag = "datasets",
+    params(("dataset" = String, Path, description = "The data set's name")),
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 404, description = "No such data set", body = Problem),
+        (status = 409, description = "A job that has not ended uses it", body = Problem),
+    )
+)]
+async fn delete(State(app): State<App>, Path(name): Path<String>) -> Result<StatusCode, ApiError> {
+    let open = app.jobs().open().await?;
+    if let Some(job) = open.into_iter().find(|job| job.spec.dataset() == name) {
+        let kind = "data set";
+        return Err(JobError::InUse {
+            kind,
+            name,
+            job: job.id,
+        }
+        .into());
+    }
+    datasets::delete(app.store().objects(), &name).await.map_err(absent)?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// A contact sheet of an episode.
+#[utoipa::path(
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.png", tag = "datasets",
+    params(
+        ("dataset" = String, Path, description = "The data set's name"),
+        ("episode" = usize, Path, description = "The episode's number, from 0"),
+    ),
+    responses(
+        (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
+        (status = 404, description = "No such data set or episode", body = Problem),
+    )
+)]
+async fn sheet(
+    State(app): State<App>,
+    Path((name, episode)): Path<(String, usize)>,
+) -> Result<impl IntoResponse, ApiError> {
+    let title = format!("{name}, episode {episode}");
+    let png = picture(&app, &name, episode, move |frames, _| contact_sheet(&title, frames)).await?;
+    Ok(([(header::CONTENT_TYPE, "image/png")], png))
+}
+
+/// An episode in motion.
+#[utoipa::path(
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.gif", tag = "datasets",
+    params(
+        ("dataset" = String, Path, description = "The data set's name"),
+        ("episode" = usize, Path, description = "The episode's number, from 0"),
+    ),
+    responses(
+        (status = 200, description = "The animation", body = Vec<u8>, content_type = "image/gif"),
+        (status = 404, description = "No such data set or episode", body = Problem),
+    )
+)]
+async fn animation(
+    State(app): State<App>,
+    Path((name, episode)): Path<(String, usize)>,
+) -> Result<impl IntoResponse, ApiError> {
+    let gif = picture(&app, &name, episode, |mut frames, period_s| {
+        frames.truncate(MAX_ANIMATED);
+        enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+    });
+    Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
+}
+
+async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError> {
+    let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
+    Ok(DatasetDescription::new(name.to_owned(), info))
+}
+
+/// A picture of an episode's frames, given them and the seconds from one to the next.
+async fn picture(
+    app: &App,
+    name: &str,
+    episode: usize,
+    draw: impl FnOnce(Vec<Frame>, f64) -> Result<Vec<u8>, FrameError> + Send + 'static,
+) -> Result<Vec<u8>, ApiError> {
+    let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
+    let drawn = app.blocking().run(move || {
+        let frames = Dataset::episode_frames(&dir, episode)?;
+        let period_s = dataset::describe(&dir)?.frame_period_s;
+        Ok::<_, ApiError>(draw(frames, period_s).map_err(PictureError::from)?)
+    });
+    drawn.await?
+}
+
+/// Frames spread evenly over an episode, in rows, each with its number.
+fn contact_sheet(title: &str, frames: Vec<Frame>) -> Result<Vec<u8>, FrameError> {
+    let stride = frames.len().div_ceil(MAX_SHOWN).max(1);
+    let style = Style::for_frames_of(frames.first().map_or(1, Frame::width));
+    let shown: Vec<(String, Frame)> = frames
+        .into_iter()
+        .enumerate()
+        .step_by(stride)
+        .map(|(number, frame)| (number.to_string(), frame))
+        .collect();
+    let rows: Vec<MontageRow> = shown
+        .chunks(ROW_FRAMES)
+        .map(|cells| MontageRow {
+            label: String::new(),
+            cells: cells.to_vec(),
+        })
+        .collect();
+    montage(title, &rows, &style).and_then(|sheet| codec::encode_png(&sheet))
+}
+
+/// The data set is in the path, so that it does not exist is 404, not 422.
+fn absent(error: JobError) -> ApiError {
+    match error {
+        JobError::NotFound { .. } => ApiError::NotFound(error.to_string()),
+        other => other.into(),
+    }
+}
+
+impl From<DatasetError> for ApiError {
+    fn from(error: DatasetError) -> Self {
+        match error {
+            DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
+            _ => Self::Internal(with_causes(&error)),
+        }
+    }
+}

@@ -1,0 +1,291 @@
+//! The simulator over HTTP, with reset and step as in Gymnasium; for training policies and for the page at `/`.
+
+use std::sync::{MutexGuard, PoisonError};
+use std::time::Instant;
+
+use axum::extract::State;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::nn::spec::MAX_MODEL_SIDE_PX;
+use crate::server::environments::SharedEnvironment;
+use crate::server::http::extract::{Json, Path};
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::images::{self, ImageBytes, ImageFormat};
+use crate::server::state::App;
+use crate::sim::{self, Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
+use crate::types::{Action, Channel, Seed, ValueError};
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(create))
+        .routes(routes!(reset))
+        .routes(routes!(step))
+        .routes(routes!(delete))
+}
+
+/// The environment to create.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct NewEnvironment {
+    /// `static-observer`, `moving-observer` or `crowded`.
+    scenario: Scenario,
+    /// The seed of the sequence of trials; the same seed and actions give the same frames.
+    #[serde(default)]
+    seed: u64,
+    /// Frame size and period, the camera, how long a trial lasts.
+    #[serde(default)]
+    world: WorldConfig,
+}
+
+/// How the next episode begins.
+#[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct ResetRequest {
+    /// Begins the sequence of this seed. Without it, the next trial of the current sequence begins.
+    #[serde(default)]
+    seed: Option<u64>,
+}
+
+/// The action until the next frame.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct StepRequest {
+    /// In the order and units of the environment's `action`; limited to what the robot can do: ±0.7 m/s, ±1.92 rad/s.
+    action: Vec<f32>,
+}
+
+/// An observation.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct ObservationBody {
+    /// The camera's frame: PNG, base64.
+    frame: ImageBytes,
+    /// In the order and units of the environment's `state`.
+    state: Vec<f32>,
+}
+
+/// Information beside the observation.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Info {
+    /// Time since the start of the episode, in seconds.
+    time_s: f64,
+    /// The next action of the simulator's own driver.
+    policy_action: Vec<f32>,
+    /// The random parameters of the episode; only at its start.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    trial: Option<TrialParameters>,
+}
+
+/// An environment at the start of an episode.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct EnvironmentBody {
+    /// Its id.
+    id: String,
+    /// The scenario.
+    scenario: Scenario,
+    /// Components of an action, in their order.
+    action: Vec<Channel>,
+    /// Components of a state, in their order.
+    state: Vec<Channel>,
+    /// The settings of the world.
+    world: WorldConfig,
+    /// The observation.
+    observation: ObservationBody,
+    /// Information beside the observation.
+    info: Info,
+}
+
+/// The start of an episode.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct ResetBody {
+    /// The observation.
+    observation: ObservationBody,
+    /// Information beside the observation.
+    info: Info,
+}
+
+/// The result of a step.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct StepBody {
+    /// The observation after the step.
+    observation: ObservationBody,
+    /// 1 if the other robot is in the middle of the view, 0 if it is out of view; minus 1 for a collision.
+    reward: f32,
+    /// The other robot has reached its goal.
+    terminated: bool,
+    /// The time of the episode is over.
+    truncated: bool,
+    /// Information beside the observation.
+    info: Info,
+}
+
+/// Why a request to an environment failed.
+#[derive(Debug, thiserror::Error)]
+enum EnvironmentError {
+    #[error("world: a frame of {width}×{height} px; the maximum is {MAX_MODEL_SIDE_PX}×{MAX_MODEL_SIDE_PX} px")]
+    FrameSize { width: u32, height: u32 },
+    #[error("world: {0}")]
+    World(SimError),
+    #[error("action: {0}")]
+    Value(#[from] ValueError),
+    #[error("action: {0}")]
+    Step(SimError),
+    #[error("the episode is over; reset the environment to begin the next")]
+    Ended,
+    #[error(transparent)]
+    Image(#[from] images::ImageError),
+}
+
+/// Creates a simulated robot that you can drive. If all environments are in use, it replaces the one that was idle the
+/// longest, if that was idle for some seconds.
+#[utoipa::path(
+    post, path = "/v1/environments", tag = "environments", request_body = NewEnvironment,
+    responses(
+        (status = 201, description = "Created; the header Location names it", body = EnvironmentBody),
+        (status = 422, description = "Not a valid world; the answer names the field", body = Problem),
+        (status = 503, description = "All environments are in use", body = Problem),
+    )
+)]
+async fn create(State(app): State<App>, Json(request): Json<NewEnvironment>) -> Result<Response, ApiError> {
+    let (environment, body) = app.blocking().run(move || begin(&request)).await??;
+    let id = app.environments().add(environment, Instant::now())?;
+    let location = HeaderValue::from_str(&format!("/v1/environments/{id}"));
+    let mut response = (StatusCode::CREATED, axum::Json(EnvironmentBody { id, ..body })).into_response();
+    if let Ok(location) = location {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// Begins the next episode.
+#[utoipa::path(
+    post, path = "/v1/environments/{id}/reset", tag = "environments", request_body = ResetRequest,
+    params(("id" = String, Path, description = "The environment's id")),
+    responses(
+        (status = 200, body = ResetBody),
+        (status = 404, description = "No such environment; one that nobody steps is dropped", body = Problem),
+    )
+)]
+async fn reset(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    Json(request): Json<ResetRequest>,
+) -> Result<axum::Json<ResetBody>, ApiError> {
+    let environment = app.environments().get(&id, Instant::now())?;
+    let work = move || restart(&mut lock(&environment), request.seed.map(Seed));
+    Ok(axum::Json(app.blocking().run(work).await??))
+}
+
+/// Applies an action for one frame period.
+#[utoipa::path(
+    post, path = "/v1/environments/{id}/step", tag = "environments", request_body = StepRequest,
+    params(("id" = String, Path, description = "The environment's id")),
+    responses(
+        (status = 200, body = StepBody),
+        (status = 404, description = "No such environment; one that nobody steps is dropped", body = Problem),
+        (status = 409, description = "The episode is over", body = Problem),
+        (status = 422, description = "Not an action of this environment", body = Problem),
+    )
+)]
+async fn step(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    Json(request): Json<StepRequest>,
+) -> Result<axum::Json<StepBody>, ApiError> {
+    let environment = app.environments().get(&id, Instant::now())?;
+    let work = move || advance(&mut lock(&environment), request.action);
+    Ok(axum::Json(app.blocking().run(work).await??))
+}
+
+/// Deletes an environment.
+#[utoipa::path(
+    delete, path = "/v1/environments/{id}", tag = "environments",
+    params(("id" = String, Path, description = "The environment's id")),
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 404, description = "No such environment", body = Problem),
+    )
+)]
+async fn delete(State(app): State<App>, Path(id): Path<String>) -> Result<StatusCode, ApiError> {
+    app.environments().remove(&id, Instant::now())?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), EnvironmentError> {
+    let (width, height) = (request.world.frame_width_px, request.world.frame_height_px);
+    if width.max(height) > MAX_MODEL_SIDE_PX {
+        return Err(EnvironmentError::FrameSize { width, height });
+    }
+    let mut environment = Environment::new(request.scenario, request.world.clone()).map_err(EnvironmentError::World)?;
+    let ResetBody { observation, info } = restart(&mut environment, Some(Seed(request.seed)))?;
+    let body = EnvironmentBody {
+        id: String::new(),
+        scenario: request.scenario,
+        action: sim::action_channels(),
+        state: sim::state_channels(),
+        world: request.world.clone(),
+        observation,
+        info,
+    };
+    Ok((environment, body))
+}
+
+fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, EnvironmentError> {
+    let (observation, trial) = environment.reset(seed).map_err(EnvironmentError::World)?;
+    Ok(ResetBody {
+        info: info(environment.world(), &observation, Some(trial)),
+        observation: body(observation)?,
+    })
+}
+
+fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, EnvironmentError> {
+    let action = Action::try_from(action)?;
+    let StepResult {
+        observation,
+        reward,
+        terminated,
+        truncated,
+    } = environment.step(&action).map_err(|error| match error {
+        SimError::Ended => EnvironmentError::Ended,
+        other => EnvironmentError::Step(other),
+    })?;
+    Ok(StepBody {
+        info: info(environment.world(), &observation, None),
+        observation: body(observation)?,
+        reward,
+        terminated,
+        truncated,
+    })
+}
+
+fn body(observation: Observation) -> Result<ObservationBody, EnvironmentError> {
+    Ok(ObservationBody {
+        frame: images::encode_one(&observation.frame, ImageFormat::Png)?,
+        state: observation.state.into(),
+    })
+}
+
+fn info(world: Option<&World>, observation: &Observation, trial: Option<TrialParameters>) -> Info {
+    Info {
+        time_s: observation.time_s,
+        policy_action: world.map_or_else(Vec::new, |world| world.policy_action().into()),
+        trial,
+    }
+}
+
+fn lock(environment: &SharedEnvironment) -> MutexGuard<'_, Environment> {
+    environment.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl From<EnvironmentError> for ApiError {
+    fn from(error: EnvironmentError) -> Self {
+        match error {
+            EnvironmentError::Ended => Self::Conflict(error.to_string()),
+            EnvironmentError::Image(image) => image.into(),
+            _ => Self::Unprocessable(error.to_string()),
+        }
+    }
+}

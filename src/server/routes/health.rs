@@ -1,0 +1,48 @@
+//! Whether the server is alive and whether it is ready.
+
+use axum::extract::State;
+use serde::Serialize;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz))
+}
+
+/// The state of the server.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Health {
+    /// `alive` or `ready`.
+    status: &'static str,
+}
+
+/// Tells whether the server is alive.
+#[utoipa::path(get, path = "/livez", tag = "health", responses((status = 200, body = Health)))]
+async fn livez() -> axum::Json<Health> {
+    axum::Json(Health { status: "alive" })
+}
+
+/// Tells whether the server is ready: there is a model, every model has made its first prediction, the store can be
+/// written, and the server is not stopping.
+#[utoipa::path(
+    get, path = "/readyz", tag = "health",
+    responses((status = 200, body = Health), (status = 503, description = "Not ready", body = Problem))
+)]
+async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> {
+    if app.is_draining() {
+        return Err(ApiError::unavailable("the server is stopping"));
+    }
+    if let Some(advice) = app.no_model_advice() {
+        return Err(ApiError::unavailable(advice));
+    }
+    if !app.predictor().is_ready() {
+        return Err(ApiError::unavailable("the models are warming up"));
+    }
+    if let Err(error) = app.store().check_writable().await {
+        return Err(ApiError::unavailable(format!("the store cannot be written: {error}")));
+    }
+    Ok(axum::Json(Health { status: "ready" }))
+}

@@ -1,0 +1,335 @@
+//! Collection, training and evaluation in the background.
+
+use axum::extract::{DefaultBodyLimit, State};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
+use utoipa_axum::routes;
+
+use crate::error_text::with_causes;
+use crate::jobs::pipeline::report_key;
+use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
+use crate::server::http::extract::{Json, Path, Query};
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::store::{LogRow, LossRow};
+
+/// `max_job_bytes`: the maximum size of the request body of a new job.
+pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(create).layer(DefaultBodyLimit::max(max_job_bytes)))
+        .routes(routes!(list))
+        .routes(routes!(get))
+        .routes(routes!(cancel))
+        .routes(routes!(resume))
+        .routes(routes!(logs))
+        .routes(routes!(metrics))
+        .routes(routes!(file))
+}
+
+/// Jobs on a page by default.
+const DEFAULT_LIMIT: usize = 50;
+/// The maximum number of jobs on a page, or of lines of a log in an answer.
+const MAX_LIMIT: usize = 1000;
+
+/// A page of jobs.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct JobList {
+    /// The newest first.
+    jobs: Vec<Job>,
+    /// The value of `before` for the next page; absent on the last page.
+    next: Option<String>,
+}
+
+/// Which jobs to list.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct ListQuery {
+    /// `collect`, `train` or `evaluate`.
+    kind: Option<String>,
+    /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
+    state: Option<JobState>,
+    /// Only jobs that are older than the one with this id.
+    before: Option<String>,
+    /// The maximum number of jobs, 1 to 1000. Default: 50.
+    limit: Option<usize>,
+}
+
+/// Lines of a job's log.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Log {
+    /// The oldest first.
+    lines: Vec<LogLine>,
+}
+
+/// A line of a job's log.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub(super) struct LogLine {
+    /// The number of the line, from 1. The oldest lines are removed.
+    pub(super) seq: i64,
+    /// Time in seconds since 1970.
+    unix_s: f64,
+    /// What happened.
+    line: String,
+}
+
+impl From<LogRow> for LogLine {
+    fn from(row: LogRow) -> Self {
+        Self {
+            seq: row.seq,
+            unix_s: row.time_s,
+            line: row.line,
+        }
+    }
+}
+
+/// Which lines of a log to list.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct LogQuery {
+    /// Only lines after the one with this number.
+    after: Option<i64>,
+    /// The maximum number of lines, 1 to 1000. Default: 1000.
+    limit: Option<usize>,
+}
+
+/// The loss curves of a training.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct LossCurves {
+    /// In the order of the training.
+    points: Vec<CurvePoint>,
+}
+
+/// A point of the loss curves.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct CurvePoint {
+    /// `pretrain` or `fit`.
+    stage: String,
+    /// Optimizer steps in that stage.
+    step: i64,
+    /// Loss on the training windows of that step.
+    train: Option<f64>,
+    /// Loss on the validation windows, if it was computed.
+    validation: Option<f64>,
+}
+
+impl From<LossRow> for CurvePoint {
+    fn from(row: LossRow) -> Self {
+        Self {
+            stage: row.stage,
+            step: row.step,
+            train: row.train,
+            validation: row.validation,
+        }
+    }
+}
+
+/// Queues a collection, a training or an evaluation. Each process runs one job at a time. A finished training publishes
+/// the next version of its model. The first version of a name becomes active at once, later ones when they are activated.
+#[utoipa::path(
+    post, path = "/v1/jobs", tag = "jobs", request_body = JobSpec,
+    params(("Idempotency-Key" = Option<String>, Header,
+        description = "The client's own key for this request: a second request with the same key makes no second job")),
+    responses(
+        (status = 202, description = "Queued; the header Location names the job", body = Job),
+        (status = 400, description = "Not JSON", body = Problem),
+        (status = 409, description = "Its result exists already, or another job makes it", body = Problem),
+        (status = 413, description = "The body exceeds its limit", body = Problem),
+        (status = 415, description = "Content-Type is not JSON", body = Problem),
+        (status = 422, description = "Not a valid job; the answer names the field", body = Problem),
+        (status = 503, description = "Too many jobs wait", body = Problem),
+    )
+)]
+async fn create(State(app): State<App>, headers: HeaderMap, Json(spec): Json<JobSpec>) -> Result<Response, ApiError> {
+    let key = headers
+        .get("idempotency-key")
+        .map(|key| key.to_str().map(str::to_owned));
+    let key = key.transpose().map_err(|_| {
+        ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned())
+    })?;
+    Ok(accepted(app.jobs().submit(spec, key).await?))
+}
+
+/// Lists jobs, the newest first.
+#[utoipa::path(
+    get, path = "/v1/jobs", tag = "jobs", params(ListQuery),
+    responses(
+        (status = 200, body = JobList),
+        (status = 422, description = "No such kind or state", body = Problem),
+    )
+)]
+async fn list(State(app): State<App>, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
+    let limit = page(query.limit, DEFAULT_LIMIT)?;
+    let filter = JobFilter {
+        kind: query.kind,
+        state: query.state,
+        before: query.before,
+        limit: limit + 1,
+    };
+    let mut jobs = app.jobs().list(filter).await?;
+    let has_more = jobs.len() > limit;
+    jobs.truncate(limit);
+    let next = jobs.last().filter(|_| has_more).map(|job| job.id.clone());
+    Ok(axum::Json(JobList { jobs, next }))
+}
+
+/// Describes a job and its progress.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}", tag = "jobs",
+    params(("id" = String, Path, description = "The job's id")),
+    responses((status = 200, body = Job), (status = 404, description = "No such job", body = Problem))
+)]
+async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiError> {
+    Ok(axum::Json(app.jobs().get(&id).await?))
+}
+
+/// Cancels a job. A job that waits ends at once; a job that runs ends at its next checkpoint.
+#[utoipa::path(
+    post, path = "/v1/jobs/{id}/cancel", tag = "jobs",
+    params(("id" = String, Path, description = "The job's id")),
+    responses(
+        (status = 202, description = "It will stop", body = Job),
+        (status = 404, description = "No such job", body = Problem),
+        (status = 409, description = "It has ended", body = Problem),
+    )
+)]
+async fn cancel(State(app): State<App>, Path(id): Path<String>) -> Result<Response, ApiError> {
+    Ok(accepted(app.jobs().cancel(&id).await?))
+}
+
+/// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
+#[utoipa::path(
+    post, path = "/v1/jobs/{id}/resume", tag = "jobs",
+    params(("id" = String, Path, description = "The job's id")),
+    responses(
+        (status = 202, description = "Queued again", body = Job),
+        (status = 404, description = "No such job", body = Problem),
+        (status = 409, description = "It has not ended, or has succeeded", body = Problem),
+        (status = 503, description = "Too many jobs wait", body = Problem),
+    )
+)]
+async fn resume(State(app): State<App>, Path(id): Path<String>) -> Result<Response, ApiError> {
+    Ok(accepted(app.jobs().resume(&id).await?))
+}
+
+/// The log of a job.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/logs", tag = "jobs",
+    params(("id" = String, Path, description = "The job's id"), LogQuery),
+    responses((status = 200, body = Log), (status = 404, description = "No such job", body = Problem))
+)]
+async fn logs(
+    State(app): State<App>,
+    Path(id): Path<String>,
+    Query(query): Query<LogQuery>,
+) -> Result<axum::Json<Log>, ApiError> {
+    let limit = page(query.limit, MAX_LIMIT)?;
+    let lines = app.jobs().log(&id, query.after.unwrap_or(0), limit).await?;
+    Ok(axum::Json(Log {
+        lines: lines.into_iter().map(LogLine::from).collect(),
+    }))
+}
+
+/// The loss curves of a training.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/metrics", tag = "jobs",
+    params(("id" = String, Path, description = "The job's id")),
+    responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
+)]
+async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
+    let points = app.jobs().losses(&id).await?;
+    Ok(axum::Json(LossCurves {
+        points: points.into_iter().map(CurvePoint::from).collect(),
+    }))
+}
+
+/// A file of an evaluation: its report or a figure. The job's `result.files` lists them.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/files/{file}", tag = "jobs",
+    params(
+        ("id" = String, Path, description = "The job's id"),
+        ("file" = String, Path, description = "The file's name"),
+    ),
+    responses(
+        (status = 200, description = "The file", body = Vec<u8>, content_type = "application/octet-stream"),
+        (status = 404, description = "No such job or file", body = Problem),
+    )
+)]
+async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) -> Result<impl IntoResponse, ApiError> {
+    let job = app.jobs().get(&id).await?;
+    let files = job.result.as_ref().and_then(|result| result["files"].as_array());
+    // Only a name from the job's own list becomes part of a path.
+    if !files.is_some_and(|files| files.iter().any(|known| *known == file)) {
+        return Err(ApiError::NotFound(format!("job {id} has no file of that name")));
+    }
+    let bytes = report_file(&app, &id, &file).await?;
+    Ok(([(header::CONTENT_TYPE, media_type(&file))], bytes))
+}
+
+/// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.
+async fn report_file(app: &App, id: &str, file: &str) -> Result<Vec<u8>, ApiError> {
+    let objects = app.store().objects();
+    let path = objects.data_dir().join(report_key(id)).join(file);
+    let local = path.clone();
+    if !app.blocking().run(move || local.is_file()).await? {
+        let pulled = objects.pull(&report_key(id), file).await;
+        pulled.map_err(|error| ApiError::Internal(error.to_string()))?;
+    }
+    let bytes = app.blocking().run(move || std::fs::read(path)).await?;
+    bytes.map_err(|_| ApiError::NotFound(format!("the file of job {id} no longer exists")))
+}
+
+fn media_type(file: &str) -> &'static str {
+    match file.rsplit('.').next() {
+        Some("json") => "application/json",
+        Some("md") => "text/markdown; charset=utf-8",
+        Some("png") => "image/png",
+        Some("gif") => "image/gif",
+        Some("svg") => "image/svg+xml",
+        _ => "application/octet-stream",
+    }
+}
+
+/// The response to an accepted job: the job, and where to find it.
+fn accepted(job: Job) -> Response {
+    let location = HeaderValue::from_str(&format!("/v1/jobs/{}", job.id));
+    let mut response = (StatusCode::ACCEPTED, axum::Json(job)).into_response();
+    if let Ok(location) = location {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    response
+}
+
+fn page(limit: Option<usize>, default: usize) -> Result<usize, ApiError> {
+    let limit = limit.unwrap_or(default);
+    if (1..=MAX_LIMIT).contains(&limit) {
+        return Ok(limit);
+    }
+    Err(ApiError::Unprocessable(format!(
+        "limit: {limit} is out of range; it must be 1 to {MAX_LIMIT}"
+    )))
+}
+
+impl From<JobError> for ApiError {
+    fn from(error: JobError) -> Self {
+        match error {
+            JobError::Unknown { .. } => Self::NotFound(error.to_string()),
+            JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
+            JobError::IllegalTransition { .. }
+            | JobError::Taken { .. }
+            | JobError::Occupied { .. }
+            | JobError::InUse { .. } => Self::Conflict(error.to_string()),
+            JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
+            JobError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
+            JobError::Record { .. }
+            | JobError::Instance(_)
+            | JobError::Threads(_)
+            | JobError::Dataset(_)
+            | JobError::Versions(_)
+            | JobError::Store(_) => Self::Internal(with_causes(&error)),
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! The metrics of the service, for Prometheus.
+
+use std::convert::Infallible;
+use std::time::{Duration, Instant};
+
+use axum::extract::State;
+use axum::http::header;
+use axum::response::IntoResponse;
+use metrics::gauge;
+use tracing::warn;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::jobs::{JobSpec, JobState};
+use crate::server::state::App;
+use crate::telemetry::{self, names};
+
+const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
+/// How often the samples of histograms are sorted into their buckets.
+const FOLD_INTERVAL: Duration = Duration::from_secs(5);
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new().routes(routes!(metrics))
+}
+
+/// All metrics in Prometheus' text format.
+#[utoipa::path(
+    get, path = "/metrics", tag = "health",
+    responses((status = 200, description = "Prometheus' text format", content_type = "text/plain"))
+)]
+async fn metrics(State(app): State<App>) -> impl IntoResponse {
+    gauge!(names::STREAMS).set(app.streams().count() as f64);
+    gauge!(names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
+    gauge!(names::MODELS_LOADED).set(app.predictor().models().len() as f64);
+    match app.store().count_jobs().await {
+        Ok(counts) => measure_jobs(&counts),
+        // The other metrics are still useful.
+        Err(error) => warn!(%error, "could not count the jobs"),
+    }
+    ([(header::CONTENT_TYPE, TEXT_FORMAT)], telemetry::render())
+}
+
+/// A state without jobs gets 0, so that a job that has left it is no longer counted there.
+fn measure_jobs(counts: &[(String, String, i64)]) {
+    for kind in JobSpec::KINDS {
+        for state in JobState::ALL.map(JobState::name) {
+            let found = counts
+                .iter()
+                .find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
+            gauge!(names::JOBS, "kind" => kind, "state" => state).set(found.map_or(0, |(.., count)| *count) as f64);
+        }
+    }
+}
+
+/// Bounds the memory of histograms if nobody reads the metrics.
+pub(in crate::server) async fn keep_folded() -> Infallible {
+    let mut ticks = tokio::time::interval(FOLD_INTERVAL);
+    loop {
+        ticks.tick().await;
+        telemetry::run_upkeep();
+    }
+}

@@ -1,0 +1,200 @@
+//! The models and their versions.
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use serde::Serialize;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::error_text::with_causes;
+use crate::nn::ModelSpec;
+use crate::registry::Manifest;
+use crate::server::blocking::run_to_completion;
+use crate::server::http::extract::{Path, Query};
+use crate::server::http::page::Page;
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::versions::VersionError;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(get))
+        .routes(routes!(delete))
+        .routes(routes!(activate))
+}
+
+/// The loaded models.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct ModelList {
+    /// In the order of their names.
+    models: Vec<ModelDescription>,
+    /// The value of `after` for the next page; absent on the last page.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next: Option<String>,
+    /// What to do if there is no model; absent if there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    notice: Option<String>,
+}
+
+/// A model: its inputs and outputs, its scores and its origin.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct ModelDescription {
+    /// Its name.
+    name: String,
+    /// Its versions.
+    versions: Vec<u32>,
+    /// The version that answers requests.
+    active_version: u32,
+    /// Frame size, context, horizon, conditioning, units and order of action and state.
+    spec: ModelSpec,
+    /// Scores on data that it was not trained on.
+    #[schema(value_type = Object)]
+    metrics: serde_json::Value,
+    /// Its origin.
+    lineage: Lineage,
+}
+
+/// The origin of a model.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Lineage {
+    /// Name of the data set it was trained on.
+    dataset: String,
+    /// Hash of the content of that data set.
+    dataset_hash: String,
+    /// The scenario of the simulation, if the data was simulated.
+    scenario: Option<String>,
+    /// The seed of the training.
+    seed: u64,
+    /// The command that made it.
+    command: String,
+    /// Hash of the weights.
+    weights_sha256: String,
+    /// Number of trained parameters.
+    parameters: u64,
+    /// Multiplications and additions for a predicted frame.
+    multiply_adds_per_frame: u64,
+    /// The version of the program that made it.
+    program_version: String,
+    /// The commit of the program that made it, if known.
+    git_commit: Option<String>,
+}
+
+impl ModelDescription {
+    /// Of the active version and the numbers of all versions.
+    fn new(manifest: &Manifest, mut versions: Vec<u32>, metrics: serde_json::Value) -> Self {
+        // A model that was given to the server at its start may be in no directory.
+        if let Err(place) = versions.binary_search(&manifest.version) {
+            versions.insert(place, manifest.version);
+        }
+        Self {
+            name: manifest.name.clone(),
+            versions,
+            active_version: manifest.version,
+            spec: manifest.spec.clone(),
+            metrics,
+            lineage: Lineage {
+                dataset: manifest.dataset.name.clone(),
+                dataset_hash: manifest.dataset.content_hash.clone(),
+                scenario: manifest.dataset.scenario.clone(),
+                seed: manifest.seed.0,
+                command: manifest.command.clone(),
+                weights_sha256: manifest.weights_sha256.clone(),
+                parameters: manifest.parameters,
+                multiply_adds_per_frame: manifest.multiply_adds_per_frame,
+                program_version: manifest.program.version.clone(),
+                git_commit: manifest.program.git_commit.clone(),
+            },
+        }
+    }
+}
+
+/// Lists the loaded models.
+#[utoipa::path(
+    get, path = "/v1/models", tag = "models", params(Page),
+    responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range", body = Problem))
+)]
+async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
+    let (manifests, next) = page.of(app.predictor().models(), |manifest| &manifest.name)?;
+    let mut versions = app.versions().all().await?;
+    let mut models = Vec::with_capacity(manifests.len());
+    for manifest in &manifests {
+        let versions = versions.remove(&manifest.name).unwrap_or_default();
+        let metrics = app.versions().metrics(manifest).await?;
+        models.push(ModelDescription::new(manifest, versions, metrics));
+    }
+    let notice = app.no_model_advice();
+    Ok(axum::Json(ModelList { models, next, notice }))
+}
+
+/// Describes one model.
+#[utoipa::path(
+    get, path = "/v1/models/{model}", tag = "models",
+    params(("model" = String, Path, description = "The model's name")),
+    responses(
+        (status = 200, body = ModelDescription),
+        (status = 404, description = "No such model; the answer lists the models", body = Problem),
+    )
+)]
+async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
+    let manifest = app.predictor().model(&model)?;
+    let versions = app.versions().of(&model).await?;
+    let metrics = app.versions().metrics(&manifest).await?;
+    Ok(axum::Json(ModelDescription::new(&manifest, versions, metrics)))
+}
+
+/// Makes a version the active one, on every server of the store and after a restart. Open streams keep their version.
+#[utoipa::path(
+    post, path = "/v1/models/{model}/versions/{version}/activate", tag = "models",
+    params(
+        ("model" = String, Path, description = "The model's name"),
+        ("version" = u32, Path, description = "The version"),
+    ),
+    responses(
+        (status = 200, description = "It is active", body = ModelDescription),
+        (status = 404, description = "No such version; the answer lists the versions", body = Problem),
+        (status = 422, description = "Its files are damaged or do not fit; the previous version stays active", body = Problem),
+    )
+)]
+async fn activate(
+    State(app): State<App>,
+    Path((model, version)): Path<(String, u32)>,
+) -> Result<axum::Json<ModelDescription>, ApiError> {
+    let (switched, name) = (app.clone(), model.clone());
+    run_to_completion(async move { switched.versions().activate(switched.predictor(), &name, version).await })
+        .await??;
+    get(State(app), Path(model)).await
+}
+
+/// Deletes a version that a job published.
+#[utoipa::path(
+    delete, path = "/v1/models/{model}/versions/{version}", tag = "models",
+    params(
+        ("model" = String, Path, description = "The model's name"),
+        ("version" = u32, Path, description = "The version"),
+    ),
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 404, description = "No such version; the answer lists the versions", body = Problem),
+        (status = 409, description = "It is active, or was not published by a job", body = Problem),
+    )
+)]
+async fn delete(State(app): State<App>, Path((model, version)): Path<(String, u32)>) -> Result<StatusCode, ApiError> {
+    run_to_completion(async move { app.versions().delete(app.predictor(), &model, version).await }).await??;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+impl From<VersionError> for ApiError {
+    fn from(error: VersionError) -> Self {
+        match error {
+            VersionError::Unknown { .. } => Self::NotFound(error.to_string()),
+            VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
+            VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
+            VersionError::Serving(serving) => serving.into(),
+            VersionError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
+            VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
+                Self::Internal(with_causes(&error))
+            }
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! Predictions as pictures, for people.
+
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+
+use crate::error_text::with_causes;
+use crate::evaluation::figures::montage::{MontageRow, Style, montage};
+use crate::frame::{Frame, FrameError, codec};
+use crate::server::http::problem::ApiError;
+
+/// How long an animation stays on its last frame, in frame periods.
+const REST_PERIODS: usize = 4;
+
+/// A picture that could not be made.
+#[derive(Debug, thiserror::Error)]
+#[error("could not make the picture")]
+pub(in crate::server) struct PictureError(#[from] FrameError);
+
+impl From<PictureError> for ApiError {
+    fn from(error: PictureError) -> Self {
+        match &error.0 {
+            FrameError::Size { .. } => {
+                Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
+            }
+            _ => Self::Internal(with_causes(&error)),
+        }
+    }
+}
+
+/// The response with a PNG picture.
+pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, PictureError> {
+    let bytes = picture.and_then(|picture| codec::encode_png(&picture))?;
+    Ok(([(header::CONTENT_TYPE, "image/png")], bytes).into_response())
+}
+
+/// The response with a GIF animation.
+pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, PictureError> {
+    Ok(([(header::CONTENT_TYPE, "image/gif")], bytes?).into_response())
+}
+
+/// The context, if it is known, and a row for each rollout; small and without labels if there are many.
+/// Errors: `Size` if there are too many.
+pub(super) fn rollout_sheet(seen: &[Frame], futures: &[Vec<Frame>]) -> Result<Frame, FrameError> {
+    let inputs = MontageRow::in_time("inputs", seen, 1 - seen.len() as i64);
+    let rows = futures
+        .iter()
+        .enumerate()
+        .map(|(index, frames)| MontageRow::in_time(&format!("candidate {index}"), frames, 1));
+    let mut rows: Vec<MontageRow> = Some(inputs)
+        .filter(|_| !seen.is_empty())
+        .into_iter()
+        .chain(rows)
+        .collect();
+    let large = montage("", &rows, &style(futures));
+    if !matches!(large, Err(FrameError::Size { .. })) {
+        return large;
+    }
+    for row in &mut rows {
+        row.label.clear();
+        row.cells.iter_mut().for_each(|(caption, _)| caption.clear());
+    }
+    montage("", &rows, &SMALL)
+}
+
+/// All rollouts side by side, from the last context frame on if it is known. Errors: `Size` if there are too many.
+pub(super) fn rollout_animation(seen: &[Frame], futures: &[Vec<Frame>], period_s: f64) -> Result<Vec<u8>, FrameError> {
+    let columns = (futures.len() as f64).sqrt().ceil().max(1.0) as usize;
+    let steps = futures.iter().map(Vec::len).max().unwrap_or(0);
+    let grid = |cells: Vec<(String, Frame)>| {
+        let rows = cells.chunks(columns).map(|cells| MontageRow {
+            label: String::new(),
+            cells: cells.to_vec(),
+        });
+        let rows: Vec<MontageRow> = rows.collect();
+        montage("", &rows, &style(futures)).or_else(|_| montage("", &rows, &SMALL))
+    };
+    let named = |(index, frame): (usize, &Frame)| (index.to_string(), frame.clone());
+    let first = seen
+        .last()
+        .map(|last| futures.iter().map(|_| last).enumerate().map(named).collect());
+    let later = (0..steps).map(|step| {
+        futures
+            .iter()
+            .filter_map(|future| future.get(step))
+            .enumerate()
+            .map(named)
+            .collect()
+    });
+    film(
+        first
+            .into_iter()
+            .chain(later)
+            .map(grid)
+            .collect::<Result<_, FrameError>>()?,
+        period_s,
+    )
+}
+
+const SMALL: Style = Style {
+    scale: 1,
+    grid_lines: 0,
+};
+
+fn style(futures: &[Vec<Frame>]) -> Style {
+    let width = futures.iter().flatten().next().map_or(1, Frame::width);
+    Style {
+        grid_lines: 0,
+        ..Style::for_frames_of(width)
+    }
+}
+
+/// The context, then the predicted frames, one frame period apart, as a GIF.
+/// Errors: `Size` if the frames are too large.
+pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> Result<Vec<u8>, FrameError> {
+    let rows = [
+        MontageRow::in_time("", seen, 1 - seen.len() as i64),
+        MontageRow::in_time("", predicted, 1),
+    ];
+    let picture = |cell: (String, Frame)| {
+        let style = Style {
+            grid_lines: 0,
+            ..Style::for_frames_of(cell.1.width())
+        };
+        let row = MontageRow {
+            label: String::new(),
+            cells: vec![cell],
+        };
+        montage("", &[row], &style)
+    };
+    let cells = rows.into_iter().flat_map(|row| row.cells);
+    film(cells.map(picture).collect::<Result<_, FrameError>>()?, period_s)
+}
+
+fn film(mut frames: Vec<Frame>, period_s: f64) -> Result<Vec<u8>, FrameError> {
+    let last = frames.last().cloned();
+    frames.extend(last.into_iter().flat_map(|last| vec![last; REST_PERIODS]));
+    codec::encode_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_animation_is_a_gif() {
+        let flat = |value| Frame::new(64, 64, vec![value; 4096]).unwrap();
+        assert!(animation(&[flat(1)], &[flat(2)], 0.2).unwrap().starts_with(b"GIF89a"));
+        let film = rollout_animation(&[], &vec![vec![flat(1), flat(2)]; 5], 0.2).unwrap();
+        assert!(film.starts_with(b"GIF89a"));
+    }
+
+    #[test]
+    fn many_rollouts_are_drawn_small_and_too_many_refused() {
+        let futures = |count| vec![vec![Frame::new(64, 64, vec![9; 4096]).unwrap(); 2]; count];
+        let (few, many) = (
+            rollout_sheet(&[], &futures(2)).unwrap(),
+            rollout_sheet(&[], &futures(40)).unwrap(),
+        );
+        assert!(few.width() > 2 * 192 && many.width() < 2 * 192);
+        assert!(matches!(
+            rollout_sheet(&[], &futures(400)),
+            Err(FrameError::Size { .. })
+        ));
+    }
+}

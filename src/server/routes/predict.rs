@@ -1,0 +1,284 @@
+//! One prediction for one request.
+
+use std::sync::Arc;
+
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::picture;
+use crate::error_text::with_causes;
+use crate::evaluation::figures::montage::prediction_sheet;
+use crate::frame::Frame;
+use crate::frame::fit::Fit;
+use crate::registry::Manifest;
+use crate::server::http::extract::{Path, ResponseFormat};
+use crate::server::http::multipart::{JsonOrForm, TooManyError, WithFrames, check_count};
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
+use crate::server::state::App;
+use crate::server::stream::protocol::Timing;
+use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
+use crate::types::{Action, RobotState, ValueError};
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new().routes(routes!(predict))
+}
+
+/// The context and the conditioning input of a prediction.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct PredictRequest {
+    /// The images of the context, oldest first; in a form, its parts `frames`.
+    #[serde(default)]
+    frames: Vec<ImageBytes>,
+    /// How the images are encoded, here and in the answer (`jpeg` is answered with `png`).
+    #[serde(default)]
+    format: ImageFormat,
+    /// How an image of another size is resized; without it, another size is an error.
+    #[serde(default)]
+    fit: Option<Fit>,
+    /// The action at each frame, oldest first. Without `future_actions`, the last one is repeated.
+    #[serde(default)]
+    actions: Vec<Vec<f32>>,
+    /// The robot's state at the last frame.
+    #[serde(default)]
+    state: Option<Vec<f32>>,
+    /// The robot's state at each frame, instead of `state`.
+    #[serde(default)]
+    states: Option<Vec<Vec<f32>>>,
+    /// The future actions, as many as the model's horizon. The first acts from the last frame on.
+    #[serde(default)]
+    future_actions: Option<Vec<Vec<f32>>>,
+}
+
+/// The same request as a form.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code, reason = "describes the form; `JsonOrForm` reads it")]
+struct PredictForm {
+    /// The image files of the context, oldest first.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    frames: Vec<ImageBytes>,
+    /// The other fields, as JSON.
+    request: Option<PredictRequest>,
+}
+
+/// The predicted frames.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct PredictResponse {
+    /// The model's name.
+    model: String,
+    /// The model's version.
+    version: u32,
+    /// t+1, t+2, ….
+    frames: Vec<ImageBytes>,
+    /// How they are encoded.
+    format: ImageFormat,
+    /// How long it took.
+    timing: Timing,
+}
+
+/// Why a prediction request failed.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum PredictError {
+    #[error(transparent)]
+    TooMany(#[from] TooManyError),
+    #[error("the rollouts would be {found} bytes of images; this server predicts at most {limit} in a request")]
+    TooLarge { found: u64, limit: usize },
+    #[error("candidates is empty; give at least one plan")]
+    NoCandidates,
+    #[error("the session has {have} of the {need} frames that a prediction takes; send more frames")]
+    Buffering { have: usize, need: usize },
+    #[error("{field}: {source}")]
+    Value { field: String, source: ValueError },
+    #[error("state and states are both given; give one")]
+    BothStates,
+    #[error("states holds {found} states; there are {frames} frames, and each has one")]
+    StateCount { found: usize, frames: usize },
+    #[error(transparent)]
+    Image(#[from] ImageError),
+    #[error(transparent)]
+    Input(#[from] InputError),
+    #[error(transparent)]
+    Serving(#[from] ServingError),
+}
+
+impl WithFrames for PredictRequest {
+    fn push_frame(&mut self, file: Vec<u8>) {
+        self.frames.push(ImageBytes(file));
+    }
+}
+
+/// Predicts the frames that follow a context. The body is JSON, or a form (`multipart/form-data`) with image files
+/// `frames` and the other fields as JSON in a part `request`. `Accept: image/png` gives a labelled contact sheet of the
+/// context and the prediction, `image/gif` an animation.
+#[utoipa::path(
+    post, path = "/v1/models/{model}/predict", tag = "models",
+    params(("model" = String, Path, description = "The model's name")),
+    request_body(content((PredictRequest = "application/json"), (PredictForm = "multipart/form-data"))),
+    responses(
+        (status = 200, description = "The prediction", content(
+            (PredictResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+        )),
+        (status = 400, description = "Not JSON", body = Problem),
+        (status = 406, description = "No media type in `Accept` is supported", body = Problem),
+        (status = 404, description = "No such model", body = Problem),
+        (status = 413, description = "A body or a list exceeds its limit", body = Problem),
+        (status = 415, description = "Content-Type is neither JSON nor a form", body = Problem),
+        (status = 422, description = "Does not fit the model", body = Problem),
+        (status = 503, description = "Too many predictions wait", body = Problem),
+    )
+)]
+async fn predict(
+    State(app): State<App>,
+    Path(model): Path<String>,
+    wanted: ResponseFormat,
+    JsonOrForm(request): JsonOrForm<PredictRequest>,
+) -> Result<Response, ApiError> {
+    let model = app.predictor().active(&model)?;
+    let _place = app.admission().enter()?;
+    let (manifest, format) = (Arc::clone(&model.manifest), request.format);
+    let max_frames = app.config().max_frames;
+    let decode = move || request.into_input(&manifest, max_frames);
+    let input = app.blocking().run(decode).await??;
+    let seen = input.frames.clone();
+    let prediction = app.predictor().predict_by(&model, input).await?;
+    let period_s = model.manifest.spec.frame_period_s;
+    let encode = move || answer(wanted, format, &seen, prediction, period_s);
+    app.blocking().run(encode).await?
+}
+
+impl PredictRequest {
+    fn into_input(self, manifest: &Manifest, max_frames: usize) -> Result<PredictionInput, PredictError> {
+        let (format, fit) = (self.format, self.fit);
+        let frames = decode_frames(self.frames, ImageInput { format, fit }, manifest, max_frames)?;
+        Ok(PredictionInput {
+            state: last_state(self.state, self.states, frames.len())?,
+            actions: actions("actions", self.actions)?,
+            future_actions: self
+                .future_actions
+                .map(|values| actions("future_actions", values))
+                .transpose()?,
+            frames,
+        })
+    }
+}
+
+/// The images of `frames` in a request as frames of the model's size.
+pub(super) fn decode_frames(
+    frames: Vec<ImageBytes>,
+    input: ImageInput,
+    manifest: &Manifest,
+    limit: usize,
+) -> Result<Vec<Frame>, PredictError> {
+    check_count("frames", frames.len(), limit)?;
+    let frame = |(index, image)| images::decode(&format!("frames[{index}]"), image, input, manifest);
+    Ok(frames
+        .into_iter()
+        .enumerate()
+        .map(frame)
+        .collect::<Result<_, ImageError>>()?)
+}
+
+/// The state at the last frame, from `state` or `states` of a request.
+pub(super) fn last_state(
+    state: Option<Vec<f32>>,
+    states: Option<Vec<Vec<f32>>>,
+    frames: usize,
+) -> Result<Option<RobotState>, PredictError> {
+    if let Some(states) = states.as_ref().filter(|states| states.len() != frames) {
+        return Err(PredictError::StateCount {
+            found: states.len(),
+            frames,
+        });
+    }
+    let state = match (state, states) {
+        (Some(_), Some(_)) => return Err(PredictError::BothStates),
+        (state, None) => state,
+        (None, Some(states)) => states.into_iter().next_back(),
+    };
+    state
+        .map(RobotState::try_from)
+        .transpose()
+        .map_err(|source| PredictError::Value {
+            field: "state".to_owned(),
+            source,
+        })
+}
+
+/// The actions in `field` of a request.
+pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, PredictError> {
+    let action = |(index, values)| {
+        Action::try_from(values).map_err(|source| PredictError::Value {
+            field: format!("{field}[{index}]"),
+            source,
+        })
+    };
+    values.into_iter().enumerate().map(action).collect()
+}
+
+impl From<ServingError> for ApiError {
+    fn from(error: ServingError) -> Self {
+        match error {
+            ServingError::UnknownModel { .. } => Self::NotFound(error.to_string()),
+            ServingError::Input(_) => Self::Unprocessable(error.to_string()),
+            ServingError::QueueFull { retry_after_s, .. } => Self::Unavailable {
+                detail: error.to_string(),
+                retry_after_s,
+            },
+            ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
+            ServingError::Panicked
+            | ServingError::Model { .. }
+            | ServingError::Frame { .. }
+            | ServingError::Tensor(_)
+            | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
+        }
+    }
+}
+
+impl From<PredictError> for ApiError {
+    fn from(error: PredictError) -> Self {
+        match error {
+            PredictError::TooMany(too_many) => too_many.into(),
+            PredictError::TooLarge { .. } => Self::TooLarge(error.to_string()),
+            PredictError::Image(image) => image.into(),
+            PredictError::Serving(serving) => serving.into(),
+            PredictError::Buffering { .. } => Self::Conflict(error.to_string()),
+            PredictError::Value { .. }
+            | PredictError::BothStates
+            | PredictError::StateCount { .. }
+            | PredictError::NoCandidates
+            | PredictError::Input(_) => Self::Unprocessable(error.to_string()),
+        }
+    }
+}
+
+fn answer(
+    wanted: ResponseFormat,
+    format: ImageFormat,
+    seen: &[Frame],
+    prediction: Prediction,
+    period_s: f64,
+) -> Result<Response, ApiError> {
+    let predicted = &prediction.frames;
+    match wanted {
+        ResponseFormat::Png => Ok(picture::png(prediction_sheet(seen, predicted, &[]))?),
+        ResponseFormat::Gif => Ok(picture::gif(picture::animation(seen, predicted, period_s))?),
+        ResponseFormat::Json => {
+            let format = format.answer();
+            Ok(axum::Json(PredictResponse {
+                model: prediction.model,
+                version: prediction.version,
+                frames: images::encode(predicted, format)?,
+                format,
+                timing: Timing {
+                    queue_us: prediction.queue_us,
+                    compute_us: prediction.compute_us,
+                },
+            })
+            .into_response())
+        }
+    }
+}

@@ -1,0 +1,87 @@
+//! A picture of what a model can do: a simulated trial, the prediction, and the true frames.
+
+use axum::extract::State;
+use axum::response::Response;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::picture;
+use crate::evaluation::figures::montage::prediction_sheet;
+use crate::frame::Frame;
+use crate::nn::{Conditioning, ModelSpec};
+use crate::registry::Manifest;
+use crate::server::http::extract::Path;
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::serving::PredictionInput;
+use crate::sim::{Scenario, SimError, World, WorldConfig};
+use crate::types::{Action, RobotState, Seed};
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new().routes(routes!(preview))
+}
+
+/// Frames before the context, so that the robots already move.
+const LEAD_IN_FRAMES: usize = 10;
+/// The trial in the picture: always the same, so that pictures of two models can be compared.
+const SEED: Seed = Seed(2020);
+const TRIAL: u64 = 1;
+
+/// A contact sheet of a simulated trial: the context, the predicted frames and the true frames.
+#[utoipa::path(
+    get, path = "/v1/models/{model}/preview.png", tag = "models",
+    params(("model" = String, Path, description = "The model's name")),
+    responses(
+        (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
+        (status = 404, description = "No such model", body = Problem),
+        (status = 422, description = "The simulator cannot make the frames that this model takes", body = Problem),
+        (status = 503, description = "Too many predictions wait", body = Problem),
+    )
+)]
+async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Response, ApiError> {
+    let manifest = app.predictor().model(&model)?;
+    let simulated = app.blocking().run(move || simulate(&manifest)).await?;
+    let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
+    let seen = input.frames.clone();
+    let predicted = app.predictor().predict(&model, input).await?.frames;
+    let draw = move || picture::png(prediction_sheet(&seen, &predicted, &truth));
+    Ok(app.blocking().run(draw).await??)
+}
+
+/// The model's input from the trial, and the true frames after it.
+fn simulate(manifest: &Manifest) -> Result<(PredictionInput, Vec<Frame>), SimError> {
+    let spec = &manifest.spec;
+    let config = WorldConfig {
+        frame_width_px: spec.frame_width_px,
+        frame_height_px: spec.frame_height_px,
+        frame_period_s: spec.frame_period_s,
+        ..WorldConfig::default()
+    };
+    let mut world = World::new(scenario(manifest), &config, SEED, TRIAL)?;
+    let (mut frames, mut actions, mut states) = (Vec::new(), Vec::<Action>::new(), Vec::<RobotState>::new());
+    let ModelSpec { context, horizon, .. } = *spec;
+    for _ in 0..LEAD_IN_FRAMES + context + horizon {
+        let (observation, action) = (world.observe(), world.policy_action());
+        world.step(&action)?;
+        frames.push(observation.frame);
+        states.push(observation.state);
+        actions.push(action);
+    }
+    let now = LEAD_IN_FRAMES + context - 1;
+    let input = PredictionInput {
+        frames: frames[LEAD_IN_FRAMES..=now].to_vec(),
+        actions: Vec::new(),
+        state: Some(states[now].clone()),
+        future_actions: Some(actions[now..now + horizon].to_vec()),
+    };
+    Ok((input, frames.split_off(now + 1)))
+}
+
+/// The scenario that the model was trained on, or one that fits its conditioning.
+fn scenario(manifest: &Manifest) -> Scenario {
+    let trained_on = manifest.dataset.scenario.as_ref().and_then(|name| name.parse().ok());
+    trained_on.unwrap_or(match manifest.spec.conditioning {
+        Conditioning::None => Scenario::StaticObserver,
+        _ => Scenario::MovingObserver,
+    })
+}

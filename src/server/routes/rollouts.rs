@@ -1,0 +1,243 @@
+//! Rollouts: predicted futures of one context under many plans.
+
+use std::sync::Arc;
+
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::picture;
+use super::predict::{self, PredictError};
+use super::sessions::AuthorizedSession;
+use crate::frame::Frame;
+use crate::frame::fit::Fit;
+use crate::registry::{LoadedModel, Manifest};
+use crate::server::config::ServerConfig;
+use crate::server::http::extract::{Json, Path, ResponseFormat};
+use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
+use crate::server::state::App;
+use crate::server::stream::protocol::Timing;
+use crate::serving::{ConditioningInput, Task, TaskOutput};
+use crate::types::RobotState;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(model_rollouts))
+        .routes(routes!(session_rollouts))
+}
+
+/// A context and the plans to compare.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct RolloutRequest {
+    /// The images of the context, oldest first; in a form, its parts `frames`.
+    #[serde(default)]
+    frames: Vec<ImageBytes>,
+    /// How the images are encoded, here and in the answer (`jpeg` is answered with `png`).
+    #[serde(default)]
+    format: ImageFormat,
+    /// How an image of another size is resized; without it, another size is an error.
+    #[serde(default)]
+    fit: Option<Fit>,
+    /// The robot's state at the last frame.
+    #[serde(default)]
+    state: Option<Vec<f32>>,
+    /// The robot's state at each frame, instead of `state`.
+    #[serde(default)]
+    states: Option<Vec<Vec<f32>>>,
+    /// Plans: sequences of future actions, each as long as the model's horizon. The first action acts from the last frame
+    /// on.
+    candidates: Vec<Vec<Vec<f32>>>,
+}
+
+/// Plans to compare from the last frame of a session.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+struct SessionRolloutRequest {
+    /// How the images of the answer are encoded.
+    #[serde(default)]
+    format: ImageFormat,
+    /// The robot's state. Default: its state at the session's last frame.
+    #[serde(default)]
+    state: Option<Vec<f32>>,
+    /// Plans: sequences of future actions, each as long as the model's horizon. The first action acts from the last frame
+    /// on.
+    candidates: Vec<Vec<Vec<f32>>>,
+}
+
+/// The rollouts.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct RolloutResponse {
+    /// The model's name.
+    model: String,
+    /// The model's version.
+    version: u32,
+    /// For each candidate, in order: t+1, t+2, ….
+    futures: Vec<Vec<ImageBytes>>,
+    /// How they are encoded.
+    format: ImageFormat,
+    /// How long it took.
+    timing: Timing,
+}
+
+impl WithFrames for RolloutRequest {
+    fn push_frame(&mut self, file: Vec<u8>) {
+        self.frames.push(ImageBytes(file));
+    }
+}
+
+/// Predicts one future for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
+/// `image/gif` an animation with all of them side by side.
+#[utoipa::path(
+    post, path = "/v1/models/{model}/rollouts", tag = "models", request_body = RolloutRequest,
+    params(("model" = String, Path, description = "The model's name")),
+    responses(
+        (status = 200, description = "The rollouts", content(
+            (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+        )),
+        (status = 400, description = "Not JSON", body = Problem),
+        (status = 404, description = "No such model", body = Problem),
+        (status = 406, description = "Too many for a picture, or no media type in `Accept` is supported", body = Problem),
+        (status = 413, description = "A body, a list or an answer exceeds its limit", body = Problem),
+        (status = 422, description = "Does not fit the model", body = Problem),
+        (status = 503, description = "Too many predictions wait", body = Problem),
+    )
+)]
+async fn model_rollouts(
+    State(app): State<App>,
+    Path(model): Path<String>,
+    wanted: ResponseFormat,
+    JsonOrForm(request): JsonOrForm<RolloutRequest>,
+) -> Result<Response, ApiError> {
+    let model = app.predictor().active(&model)?;
+    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
+    let decode = move || request.into_task(&manifest, &config);
+    let (seen, task) = app.blocking().run(decode).await??;
+    let computed = app.predictor().compute(&model, task, None).await?;
+    let encode = move || answer(wanted, format, &model, &seen, &computed);
+    app.blocking().run(encode).await?
+}
+
+/// Predicts one future for each of many plans from the session's last frame. The session does not change.
+#[utoipa::path(
+    post, path = "/v1/sessions/{id}/rollouts", tag = "sessions", request_body = SessionRolloutRequest,
+    params(
+        ("id" = String, Path, description = "The session's id"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
+    ),
+    responses(
+        (status = 200, description = "The rollouts", content(
+            (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+        )),
+        (status = 403, description = "Not the session's token", body = Problem),
+        (status = 404, description = "No such session", body = Problem),
+        (status = 409, description = "The session has not enough frames yet", body = Problem),
+        (status = 410, description = "It has expired", body = Problem),
+        (status = 413, description = "A body, a list or an answer exceeds its limit", body = Problem),
+        (status = 422, description = "Does not fit the model", body = Problem),
+        (status = 503, description = "Too many predictions wait", body = Problem),
+    )
+)]
+async fn session_rollouts(
+    State(app): State<App>,
+    AuthorizedSession(session): AuthorizedSession,
+    wanted: ResponseFormat,
+    Json(request): Json<SessionRolloutRequest>,
+) -> Result<Response, ApiError> {
+    let model = Arc::clone(session.model());
+    let (state, format) = (session.state().0, request.format);
+    let (have, need) = (state.frame_count(), model.manifest.spec.context);
+    if have < need {
+        return Err(PredictError::Buffering { have, need }.into());
+    }
+    let given = predict::last_state(request.state, None, 0)?;
+    let robot_state = given.or_else(|| state.robot_state().cloned());
+    let task = state.rollout_task(conditioning(
+        request.candidates,
+        robot_state,
+        &model.manifest,
+        app.config(),
+    )?);
+    let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
+    let encode = move || answer(wanted, format, &model, &[], &computed);
+    app.blocking().run(encode).await?
+}
+
+impl RolloutRequest {
+    fn into_task(self, manifest: &Manifest, config: &ServerConfig) -> Result<(Vec<Frame>, Task), PredictError> {
+        let (format, fit) = (self.format, self.fit);
+        let seen = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
+        let state = predict::last_state(self.state, self.states, seen.len())?;
+        let conditioning = conditioning(self.candidates, state, manifest, config)?;
+        let task = Task::rollout(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
+        Ok((seen, task))
+    }
+}
+
+/// The conditioning input of each plan.
+fn conditioning(
+    candidates: Vec<Vec<Vec<f32>>>,
+    state: Option<RobotState>,
+    manifest: &Manifest,
+    config: &ServerConfig,
+) -> Result<Vec<ConditioningInput>, PredictError> {
+    let spec = &manifest.spec;
+    check_count("candidates", candidates.len(), config.max_candidates)?;
+    if candidates.is_empty() {
+        return Err(PredictError::NoCandidates);
+    }
+    let found = candidates.len() as u64 * spec.horizon as u64 * spec.pixels() as u64;
+    if found > config.max_rollout_bytes as u64 {
+        return Err(PredictError::TooLarge {
+            found,
+            limit: config.max_rollout_bytes,
+        });
+    }
+    let candidates = candidates
+        .into_iter()
+        .enumerate()
+        .map(|(index, values)| predict::actions(&format!("candidates[{index}]"), values))
+        .collect::<Result<_, _>>()?;
+    Ok(ConditioningInput::candidates(candidates, state, &manifest.name, spec)?)
+}
+
+fn answer(
+    wanted: ResponseFormat,
+    format: ImageFormat,
+    model: &LoadedModel,
+    seen: &[Frame],
+    computed: &TaskOutput,
+) -> Result<Response, ApiError> {
+    let futures = &computed.predictions;
+    let encoded = |format| {
+        futures
+            .iter()
+            .map(|frames| images::encode(frames, format))
+            .collect::<Result<_, _>>()
+    };
+    match wanted {
+        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, futures))?),
+        ResponseFormat::Gif => {
+            let period_s = model.manifest.spec.frame_period_s;
+            Ok(picture::gif(picture::rollout_animation(seen, futures, period_s))?)
+        }
+        ResponseFormat::Json => {
+            let format = format.answer();
+            Ok(axum::Json(RolloutResponse {
+                model: model.manifest.name.clone(),
+                version: model.manifest.version,
+                futures: encoded(format)?,
+                format,
+                timing: Timing {
+                    queue_us: computed.queue_us,
+                    compute_us: computed.compute_us,
+                },
+            })
+            .into_response())
+        }
+    }
+}

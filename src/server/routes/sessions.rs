@@ -1,0 +1,166 @@
+//! Sessions: the state of a stream, which outlives its socket and can move to another server.
+
+mod bodies;
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::IntoResponse;
+use serde::Deserialize;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use self::bodies::{CreateSession, CreatedSession, ExportedState, SessionDescription, SessionList};
+use crate::server::http::extract::{Json, Path, Query};
+use crate::server::http::page::Page;
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::server::stream::protocol::StreamLimits;
+use crate::server::stream::session::Session;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(create, list))
+        .routes(routes!(get, delete))
+        .routes(routes!(state))
+}
+
+/// Opens a session, or continues one from its exported state.
+#[utoipa::path(
+    post, path = "/v1/sessions", tag = "sessions", request_body = CreateSession,
+    responses(
+        (status = 201, description = "Open; only this answer contains the token", body = CreatedSession),
+        (status = 400, description = "Not JSON", body = Problem),
+        (status = 404, description = "No such model", body = Problem),
+        (status = 409, description = "The state belongs to a version of the model that is not active here", body = Problem),
+        (status = 422, description = "A state that does not fit; the answer names the field", body = Problem),
+        (status = 503, description = "Too many sessions", body = Problem),
+    )
+)]
+async fn create(State(app): State<App>, Json(request): Json<CreateSession>) -> Result<impl IntoResponse, ApiError> {
+    let (model, state, settings) = request.resolve(&app)?;
+    let now = Instant::now();
+    let created = Session::new(model, state, settings, now);
+    let (session, token) = created.map_err(|error| ApiError::Internal(error.to_string()))?;
+    let session = app.sessions().insert(session, now)?;
+    let created = CreatedSession {
+        session: SessionDescription::of(&session, app.sessions().grace(), now),
+        token,
+        limits: StreamLimits::new(app.config(), true),
+    };
+    let location = format!("/v1/sessions/{}", created.session.id);
+    Ok((StatusCode::CREATED, [(header::LOCATION, location)], axum::Json(created)))
+}
+
+/// Lists the open sessions.
+#[utoipa::path(
+    get, path = "/v1/sessions", tag = "sessions", params(Page),
+    responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range", body = Problem))
+)]
+async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
+    let now = Instant::now();
+    let found = app.sessions().page(&page.after, page.limit()? + 1, now);
+    let (found, next) = page.of(found, |session| session.id())?;
+    let grace = app.sessions().grace();
+    let describe = |session: &Arc<Session>| SessionDescription::of(session, grace, now);
+    Ok(axum::Json(SessionList {
+        sessions: found.iter().map(describe).collect(),
+        next,
+    }))
+}
+
+/// Describes a session.
+#[utoipa::path(
+    get, path = "/v1/sessions/{id}", tag = "sessions",
+    params(("id" = String, Path, description = "The session's id")),
+    responses(
+        (status = 200, body = SessionDescription),
+        (status = 404, description = "No such session", body = Problem),
+        (status = 410, description = "It has expired", body = Problem),
+    )
+)]
+async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<SessionDescription>, ApiError> {
+    let now = Instant::now();
+    let session = app.sessions().get(&id, now)?;
+    Ok(axum::Json(SessionDescription::of(
+        &session,
+        app.sessions().grace(),
+        now,
+    )))
+}
+
+/// Deletes a session and ends its stream.
+#[utoipa::path(
+    delete, path = "/v1/sessions/{id}", tag = "sessions",
+    params(
+        ("id" = String, Path, description = "The session's id"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
+    ),
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 403, description = "Not the session's token", body = Problem),
+        (status = 404, description = "No such session", body = Problem),
+        (status = 410, description = "It has expired", body = Problem),
+    )
+)]
+async fn delete(State(app): State<App>, session: AuthorizedSession) -> StatusCode {
+    app.sessions().remove(&session.0);
+    StatusCode::NO_CONTENT
+}
+
+/// Exports the session state, for `POST /v1/sessions` on this or another server.
+#[utoipa::path(
+    get, path = "/v1/sessions/{id}/state", tag = "sessions",
+    params(
+        ("id" = String, Path, description = "The session's id"),
+        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
+    ),
+    responses(
+        (status = 200, body = ExportedState),
+        (status = 403, description = "Not the session's token", body = Problem),
+        (status = 404, description = "No such session", body = Problem),
+        (status = 410, description = "It has expired", body = Problem),
+    )
+)]
+async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
+    let (state, settings) = session.0.state();
+    let manifest = &session.0.model().manifest;
+    axum::Json(ExportedState {
+        model: manifest.name.clone(),
+        version: manifest.version,
+        weights_sha256: manifest.weights_sha256.clone(),
+        on_gap: settings.on_gap,
+        on_late: settings.on_late,
+        format: settings.format,
+        fit: settings.fit,
+        memory: state.memory(),
+    })
+}
+
+/// The token, if it is not in the header.
+#[derive(Debug, Deserialize)]
+struct TokenQuery {
+    #[serde(default)]
+    token: Option<String>,
+}
+
+/// The session in the path, if the request has its token.
+pub(super) struct AuthorizedSession(pub(super) Arc<Session>);
+
+impl axum::extract::FromRequestParts<App> for AuthorizedSession {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut axum::http::request::Parts, app: &App) -> Result<Self, ApiError> {
+        let Path(id) = Path::<String>::from_request_parts(parts, app).await?;
+        let Query(query) = Query::<TokenQuery>::from_request_parts(parts, app).await?;
+        let token = token_of(&parts.headers).or(query.token).unwrap_or_default();
+        Ok(Self(app.sessions().open(&id, &token, Instant::now())?))
+    }
+}
+
+fn token_of(headers: &HeaderMap) -> Option<String> {
+    let token = headers.get("x-session-token")?;
+    token.to_str().ok().map(str::to_owned)
+}

@@ -1,0 +1,117 @@
+//! Opens streams: of a session that outlives its stream, or of one that ends with it.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::extract::State;
+use axum::extract::ws::WebSocketUpgrade;
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
+use axum::response::Response;
+use tracing::{Instrument, Span};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::sessions::AuthorizedSession;
+use crate::server::http::extract::Path;
+use crate::server::http::problem::{ApiError, Problem};
+use crate::server::state::App;
+use crate::server::stream::connection::StreamConnection;
+use crate::server::stream::protocol::{Codec, SessionSettings};
+use crate::server::stream::session::Session;
+use crate::serving::SessionState;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(session_stream))
+        .routes(routes!(model_stream))
+}
+
+/// The read buffer of a socket, in bytes. It is zeroed before every read, and a stream keeps it while it is open. A longer
+/// message gets its own buffer.
+const READ_BYTES: usize = 16 << 10;
+
+type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
+
+/// Opens the stream of a session: a WebSocket that takes frames with action and state, and answers each with the predicted
+/// frames. Sub-protocols: `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` describes the messages. If the
+/// session has an open stream, the new stream replaces it.
+#[utoipa::path(
+    get, path = "/v1/sessions/{id}/stream", tag = "sessions",
+    params(
+        ("id" = String, Path, description = "The session's id"),
+        ("token" = Option<String>, Query, description = "The session's token; or as header `x-session-token`"),
+    ),
+    responses(
+        (status = 101, description = "The WebSocket is open"),
+        (status = 400, description = "The server speaks none of the requested sub-protocols", body = Problem),
+        (status = 403, description = "Not the session's token", body = Problem),
+        (status = 404, description = "No such session", body = Problem),
+        (status = 410, description = "It has expired", body = Problem),
+        (status = 426, description = "Not a WebSocket handshake", body = Problem),
+        (status = 503, description = "Too many streams", body = Problem),
+    )
+)]
+async fn session_stream(
+    State(app): State<App>,
+    session: AuthorizedSession,
+    upgrade: Upgrade,
+) -> Result<Response, ApiError> {
+    open(&app, session.0, true, upgrade)
+}
+
+/// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
+#[utoipa::path(
+    get, path = "/v1/models/{model}/stream", tag = "models",
+    params(("model" = String, Path, description = "The model's name")),
+    responses(
+        (status = 101, description = "The WebSocket is open"),
+        (status = 400, description = "The server speaks none of the requested sub-protocols", body = Problem),
+        (status = 404, description = "No such model", body = Problem),
+        (status = 426, description = "Not a WebSocket handshake", body = Problem),
+        (status = 503, description = "Too many streams", body = Problem),
+    )
+)]
+async fn model_stream(
+    State(app): State<App>,
+    Path(model): Path<String>,
+    upgrade: Upgrade,
+) -> Result<Response, ApiError> {
+    let model = app.predictor().active(&model)?;
+    let session = Session::new(
+        model,
+        SessionState::default(),
+        SessionSettings::default(),
+        Instant::now(),
+    );
+    let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
+    open(&app, Arc::new(session), false, upgrade)
+}
+
+fn open(app: &App, session: Arc<Session>, is_persistent: bool, upgrade: Upgrade) -> Result<Response, ApiError> {
+    let upgrade = upgrade.map_err(|_| ApiError::UpgradeRequired)?.protocols(Codec::NAMES);
+    let chosen = upgrade
+        .selected_protocol()
+        .and_then(|name| name.to_str().ok())
+        .map(Codec::of);
+    if chosen.is_none() && upgrade.requested_protocols().next().is_some() {
+        return Err(ApiError::Malformed(format!(
+            "the sub-protocols of this server are {}",
+            Codec::NAMES.join(" and ")
+        )));
+    }
+    let place = app.streams().enter()?;
+    let limit = app.config().max_body_bytes;
+    let upgrade = upgrade
+        .max_message_size(limit)
+        .max_frame_size(limit)
+        .read_buffer_size(READ_BYTES);
+    let services = app.stream_services();
+    Ok(upgrade.on_upgrade(move |socket| {
+        let connection = StreamConnection::new(services, &session, is_persistent, chosen.unwrap_or_default());
+        async move {
+            connection.run(socket).await;
+            drop(place);
+        }
+        .instrument(Span::current())
+    }))
+}

@@ -1,0 +1,57 @@
+//! The life of a server: it accepts connections, drains, and stops within a deadline.
+
+use std::time::{Duration, Instant};
+
+use tokio::net::TcpListener;
+use tokio::time::{timeout, timeout_at};
+use tracing::{info, warn};
+
+use super::http::connections::Connections;
+use super::http::listener::BoundedListener;
+use super::router::router;
+use super::routes::metrics;
+use super::state::App;
+
+/// How long [`serve`] may take past the deadline to report what did not end.
+const GRACE: Duration = Duration::from_millis(200);
+
+/// Answers on the listener until `shutdown` completes. Then it reports that it is not ready, but accepts requests for
+/// another `drain_ms`. After that it accepts no connections, answers the requests it has, closes every stream with code
+/// 1001, lets the running job write its checkpoint, and returns when all have ended or the deadline has passed.
+pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
+    let config = app.config();
+    let limit = Duration::from_millis(config.shutdown_deadline_ms);
+    let drain = Duration::from_millis(config.drain_ms);
+    let listener = BoundedListener::new(listener, config);
+    let mut connections = Connections::new(router(app.clone()), config, app.streams().stopping());
+    tokio::select! {
+        never = connections.accept(&listener) => match never {},
+        never = metrics::keep_folded() => match never {},
+        never = app.keys().keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
+        () = shutdown => {}
+    }
+    info!("stopping");
+    let deadline = Instant::now() + limit;
+    app.drain();
+    app.jobs().begin_stop();
+    // Even without time to drain, established connections are accepted: their clients wait for an answer.
+    let Err(_) = timeout(drain, connections.accept(&listener)).await;
+    drop(listener);
+    app.streams().stop();
+    if timeout_at(deadline.into(), connections.ended()).await.is_err() {
+        warn!("some requests were not answered within the deadline");
+    }
+    if timeout_at(deadline.into(), app.streams().ended()).await.is_err() {
+        warn!("some streams did not end within the deadline");
+    }
+    let ended = async {
+        let jobs_ended = app.jobs().finish_stop(deadline).await;
+        let predictor = app.predictor().clone();
+        jobs_ended && app.blocking().run(move || predictor.stop()).await.is_ok()
+    };
+    if timeout_at((deadline + GRACE).into(), ended).await == Ok(true) {
+        info!("stopped");
+    } else {
+        warn!("a computation did not end within the deadline");
+    }
+}

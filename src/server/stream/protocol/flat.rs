@@ -1,0 +1,132 @@
+//! A client's message while it is read: each field goes into its own type at once. What serde derives for the tagged enum
+//! would first store the whole message in a form that takes up to a hundred times its bytes.
+
+use serde::de::{Error as _, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+
+use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
+use crate::frame::fit::Fit;
+use crate::server::images::{ImageBytes, ImageFormat};
+
+/// The maximum number of items of a list in a message: more than any model takes.
+const MAX_ITEMS: usize = 4096;
+
+/// Every field that any message has.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct AnyMessage {
+    r#type: MessageKind,
+    seq: Option<u64>,
+    timestamp_us: Option<i64>,
+    image: Option<ImageBytes>,
+    format: Option<ImageFormat>,
+    action: Option<List<f64>>,
+    state: Option<List<f64>>,
+    plan: Option<List<List<f64>>>,
+    on_gap: Option<OnGap>,
+    on_late: Option<OnLate>,
+    fit: Option<Fit>,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum MessageKind {
+    Frame,
+    Configure,
+    Ping,
+    Close,
+}
+
+/// A list; the first item over the limit is an error.
+struct List<T>(Vec<T>);
+
+impl<'de, T: Deserialize<'de>> Deserialize<'de> for List<T> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_seq(ListVisitor(std::marker::PhantomData))
+    }
+}
+
+struct ListVisitor<T>(std::marker::PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>> Visitor<'de> for ListVisitor<T> {
+    type Value = List<T>;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("a list")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<List<T>, A::Error> {
+        let mut list = Vec::new();
+        while let Some(item) = items.next_element()? {
+            if list.len() == MAX_ITEMS {
+                return Err(A::Error::custom(format_args!(
+                    "the list has more than {MAX_ITEMS} items"
+                )));
+            }
+            list.push(item);
+        }
+        Ok(List(list))
+    }
+}
+
+impl TryFrom<AnyMessage> for ClientMessage {
+    type Error = String;
+
+    fn try_from(mut any: AnyMessage) -> Result<Self, String> {
+        let message = match any.r#type {
+            MessageKind::Frame => Self::Frame(FrameMessage {
+                seq: any.seq.take().ok_or_else(|| missing("seq"))?,
+                timestamp_us: any.timestamp_us.take().ok_or_else(|| missing("timestamp_us"))?,
+                image: any.image.take().ok_or_else(|| missing("image"))?,
+                format: any.format.take().unwrap_or_default(),
+                action: any.action.take().map(numbers),
+                state: any.state.take().map(numbers),
+                plan: any.plan.take().map(|plan| plan.0.into_iter().map(numbers).collect()),
+            }),
+            MessageKind::Configure => Self::Configure(ConfigureMessage {
+                on_gap: any.on_gap.take(),
+                on_late: any.on_late.take(),
+                format: any.format.take(),
+                fit: any.fit.take(),
+            }),
+            MessageKind::Ping => Self::Ping(PingMessage {
+                timestamp_us: any.timestamp_us.take().unwrap_or_default(),
+            }),
+            MessageKind::Close => Self::Close(CloseMessage {}),
+        };
+        any.unused().map_or(Ok(message), |field| {
+            Err(format!("unknown field `{field}`: a message of this type has none"))
+        })
+    }
+}
+
+impl AnyMessage {
+    /// A field that the message's type does not have.
+    fn unused(&self) -> Option<&'static str> {
+        let fields = [
+            ("seq", self.seq.is_some()),
+            ("timestamp_us", self.timestamp_us.is_some()),
+            ("image", self.image.is_some()),
+            ("format", self.format.is_some()),
+            ("action", self.action.is_some()),
+            ("state", self.state.is_some()),
+            ("plan", self.plan.is_some()),
+            ("on_gap", self.on_gap.is_some()),
+            ("on_late", self.on_late.is_some()),
+            ("fit", self.fit.is_some()),
+        ];
+        fields
+            .into_iter()
+            .find(|(_, is_unused)| *is_unused)
+            .map(|(name, _)| name)
+    }
+}
+
+fn missing(field: &str) -> String {
+    format!("missing field `{field}`")
+}
+
+/// A number too large for `f32` becomes infinite; the check of the field refuses it.
+fn numbers(list: List<f64>) -> Vec<f32> {
+    list.0.into_iter().map(|value| value as f32).collect()
+}

@@ -1,0 +1,226 @@
+//! A session and who owns it. A step begins under the lock, is computed outside it, and counts only if no other connection
+//! has taken over the session meanwhile.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+
+use super::protocol::{ConfigureMessage, ServerMessage, SessionSettings};
+use super::step::{FrameStep, PendingStep, SessionCore, StepError};
+use crate::registry::LoadedModel;
+use crate::server::blocking::BlockingWork;
+use crate::server::images::ImageFormat;
+use crate::server::token::{Token, TokenHash};
+use crate::serving::{Predictor, SessionState};
+
+/// Who may step a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::server) enum Owner {
+    /// The connection of that number, or nobody if it has ended.
+    Connection(u64),
+    /// Nobody: the session was deleted.
+    Deleted,
+}
+
+pub(in crate::server) struct Session {
+    pub(super) id: String,
+    pub(super) token_hash: TokenHash,
+    /// The session's number in the predictor.
+    key: u64,
+    model: Arc<LoadedModel>,
+    inner: Mutex<SessionInner>,
+    owner: watch::Sender<Owner>,
+}
+
+struct SessionInner {
+    core: SessionCore,
+    /// How many connections there have been.
+    connections: u64,
+    is_connected: bool,
+    /// When the session was last used.
+    used: Instant,
+}
+
+impl Session {
+    /// A session and its token's text. The session keeps only the token's hash. Errors: the system gave no random bytes.
+    pub(in crate::server) fn new(
+        model: Arc<LoadedModel>,
+        state: SessionState,
+        settings: SessionSettings,
+        now: Instant,
+    ) -> Result<(Self, String), getrandom::Error> {
+        let (id, token) = (Token::random()?, Token::random()?);
+        let session = Self {
+            key: id.key(),
+            id: id.id(),
+            token_hash: token.hash(),
+            model,
+            inner: Mutex::new(SessionInner {
+                core: SessionCore::new(state, settings),
+                connections: 0,
+                is_connected: false,
+                used: now,
+            }),
+            owner: watch::Sender::new(Owner::Connection(0)),
+        };
+        Ok((session, token.text()))
+    }
+
+    pub(in crate::server) fn id(&self) -> &str {
+        &self.id
+    }
+
+    pub(in crate::server) fn key(&self) -> u64 {
+        self.key
+    }
+
+    pub(in crate::server) fn model(&self) -> &Arc<LoadedModel> {
+        &self.model
+    }
+
+    pub(in crate::server) fn state(&self) -> (SessionState, SessionSettings) {
+        let inner = self.inner();
+        (inner.core.state.clone(), inner.core.settings)
+    }
+
+    pub(in crate::server) fn settings(&self) -> SessionSettings {
+        self.inner().core.settings
+    }
+
+    pub(in crate::server) fn next_seq(&self) -> u64 {
+        self.inner().core.state.next_seq()
+    }
+
+    pub(in crate::server) fn is_connected(&self) -> bool {
+        self.inner().is_connected
+    }
+
+    /// When the session expires unless it is used; `None` while a connection is open.
+    pub(in crate::server) fn left(&self, grace: Duration, now: Instant) -> Option<Duration> {
+        let inner = self.inner();
+        let unused = now.saturating_duration_since(inner.used);
+        (!inner.is_connected).then(|| grace.saturating_sub(unused))
+    }
+
+    pub(in crate::server) fn touch(&self, now: Instant) {
+        let mut inner = self.inner();
+        inner.used = inner.used.max(now);
+    }
+
+    pub(in crate::server) fn configure(&self, message: ConfigureMessage) -> ServerMessage {
+        let mut inner = self.inner();
+        let settings = &mut inner.core.settings;
+        settings.on_gap = message.on_gap.unwrap_or(settings.on_gap);
+        settings.on_late = message.on_late.unwrap_or(settings.on_late);
+        settings.format = message.format.map(ImageFormat::answer).or(settings.format);
+        settings.fit = message.fit.or(settings.fit);
+        ServerMessage::Configured(*settings)
+    }
+
+    /// Makes a new connection the owner, in place of the connection before.
+    pub(in crate::server) fn connect(self: &Arc<Self>) -> Ownership {
+        let mut inner = self.inner();
+        inner.connections += 1;
+        inner.is_connected = true;
+        let number = inner.connections;
+        let changed = self.owner.subscribe();
+        self.owner.send_if_modified(|owner| {
+            let exists = *owner != Owner::Deleted;
+            if exists {
+                *owner = Owner::Connection(number);
+            }
+            exists
+        });
+        drop(inner);
+        Ownership {
+            session: Arc::clone(self),
+            number,
+            changed,
+        }
+    }
+
+    /// Takes the session from its owner for good.
+    pub(in crate::server) fn delete(&self) {
+        self.owner.send_replace(Owner::Deleted);
+    }
+
+    fn inner(&self) -> MutexGuard<'_, SessionInner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A connection's right to step a session, until another connection takes over or this is dropped.
+pub(in crate::server) struct Ownership {
+    session: Arc<Session>,
+    number: u64,
+    changed: watch::Receiver<Owner>,
+}
+
+impl Drop for Ownership {
+    fn drop(&mut self) {
+        let mut inner = self.session.inner();
+        if inner.connections == self.number {
+            inner.is_connected = false;
+            inner.used = Instant::now();
+        }
+    }
+}
+
+impl Ownership {
+    pub(in crate::server) fn session(&self) -> &Arc<Session> {
+        &self.session
+    }
+
+    /// Waits until the session has another owner or is deleted.
+    pub(in crate::server) async fn lost(&self) -> Owner {
+        let mut changed = self.changed.clone();
+        let mine = Owner::Connection(self.number);
+        match changed.wait_for(|owner| *owner != mine).await {
+            Ok(owner) => *owner,
+            Err(_) => Owner::Deleted,
+        }
+    }
+
+    /// Answers a frame: from the cache if it was answered before, else by a step. Errors leave the session as it was.
+    pub(in crate::server) async fn step(
+        &self,
+        predictor: &Predictor,
+        blocking: &BlockingWork,
+        step: FrameStep,
+    ) -> Result<ServerMessage, StepError> {
+        let (key, model) = (self.session.key, &self.session.model);
+        let spec = model.model.spec();
+        let (format, pending) = {
+            let inner = self.inner()?;
+            let format = inner.core.settings.format.unwrap_or(step.format);
+            (format, inner.core.begin(&step, spec)?)
+        };
+        let answer = match pending {
+            PendingStep::Answered(answer) => answer,
+            PendingStep::New { task, skipped } => {
+                let computed = predictor.compute(model, task, Some(key)).await?;
+                self.inner()?.core.commit(step, computed, skipped, spec)
+            }
+            PendingStep::Again(task) => {
+                let computed = predictor.compute(model, task, Some(key)).await?;
+                self.inner()?.core.cache(step.timestamp_us, 0, computed)
+            }
+        };
+        let context = spec.context;
+        if answer.must_compress(format) {
+            return blocking.run(move || answer.message(format, context)).await?;
+        }
+        answer.message(format, context)
+    }
+
+    /// The session's state, if this is still its owner. Errors: `NotOwner`.
+    fn inner(&self) -> Result<MutexGuard<'_, SessionInner>, StepError> {
+        let inner = self.session.inner();
+        if *self.session.owner.borrow() == Owner::Connection(self.number) {
+            Ok(inner)
+        } else {
+            Err(StepError::NotOwner)
+        }
+    }
+}

@@ -1,0 +1,46 @@
+//! Random ids that nobody can guess, and secrets of which only the hash is kept.
+
+use sha2::{Digest as _, Sha256};
+
+/// 256 random bits.
+#[derive(Clone)]
+pub(in crate::server) struct Token([u8; 32]);
+
+/// SHA-256 of a token's text: what the server keeps.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(in crate::server) struct TokenHash([u8; 32]);
+
+impl Token {
+    /// Errors: the system gave no random bytes.
+    pub(in crate::server) fn random() -> Result<Self, getrandom::Error> {
+        let mut bytes = [0; 32];
+        getrandom::fill(&mut bytes)?;
+        Ok(Self(bytes))
+    }
+
+    pub(in crate::server) fn hash(&self) -> TokenHash {
+        TokenHash::of(&self.text())
+    }
+
+    /// All bits as a secret, hexadecimal.
+    pub(in crate::server) fn text(&self) -> String {
+        hex::encode(self.0)
+    }
+
+    /// 128 of the bits as an id, hexadecimal.
+    pub(in crate::server) fn id(&self) -> String {
+        hex::encode(&self.0[..16])
+    }
+
+    /// 64 of the bits as a number.
+    pub(in crate::server) fn key(&self) -> u64 {
+        self.0.iter().take(8).fold(0, |key, &byte| key << 8 | u64::from(byte))
+    }
+}
+
+impl TokenHash {
+    /// Hash of a token's text. Comparing hashes takes no time that depends on the token.
+    pub(in crate::server) fn of(text: &str) -> Self {
+        Self(Sha256::digest(text.as_bytes()).into())
+    }
+}

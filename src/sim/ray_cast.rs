@@ -1,0 +1,130 @@
+//! Solids for ray casting that parry does not have or computes more slowly: an upright cylinder in closed form, and a box at
+//! any position.
+
+use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
+use rapier3d::parry::shape::{Cuboid, FeatureId};
+use rapier3d::prelude::Vector;
+
+/// A cylinder around the z axis. parry's own cylinder lies along y and is computed by iteration.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct UprightCylinder {
+    pub(super) radius: f32,
+    pub(super) bottom: f32,
+    pub(super) top: f32,
+}
+
+/// The interval of ray time inside a solid, with the faces where it starts and ends: 0 = side, 1 = top, 2 = bottom.
+type Span = [(f32, u32); 2];
+
+impl UprightCylinder {
+    /// The interval of ray time inside the cylinder, or none if the ray misses it.
+    #[inline]
+    fn span(&self, ray: &Ray) -> Option<Span> {
+        let (o, d) = (ray.origin, ray.dir);
+        let outside = o.x * o.x + o.y * o.y - self.radius * self.radius;
+        let a = d.x * d.x + d.y * d.y;
+        let b = o.x * d.x + o.y * d.y;
+        let under_root = b * b - a * outside;
+        // Most rays return here: they miss the cylinder, or lead away from it.
+        if under_root < 0.0 || (outside > 0.0 && b >= 0.0) {
+            return None;
+        }
+        let (enter, exit) = if a == 0.0 {
+            (f32::NEG_INFINITY, f32::INFINITY)
+        } else {
+            let root = under_root.sqrt();
+            ((-b - root) / a, (-b + root) / a)
+        };
+        let slab = if d.z == 0.0 {
+            let within = (self.bottom..=self.top).contains(&o.z);
+            within.then_some([(f32::NEG_INFINITY, 1), (f32::INFINITY, 2)])?
+        } else {
+            let (bottom, top) = ((self.bottom - o.z) / d.z, (self.top - o.z) / d.z);
+            if d.z > 0.0 {
+                [(bottom, 2), (top, 1)]
+            } else {
+                [(top, 1), (bottom, 2)]
+            }
+        };
+        let first = if enter > slab[0].0 { (enter, 0) } else { slab[0] };
+        let last = if exit < slab[1].0 { (exit, 0) } else { slab[1] };
+        (first.0 <= last.0 && last.0 >= 0.0).then_some([first, last])
+    }
+}
+
+impl RayCast for UprightCylinder {
+    #[inline]
+    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
+        let [first, last] = self.span(ray)?;
+        let (time, face, outward) = match (first.0 >= 0.0, solid) {
+            (true, _) => (first.0, first.1, 1.0),
+            (false, true) => (0.0, first.1, 0.0),
+            (false, false) => (last.0, last.1, -1.0),
+        };
+        if time > max_time {
+            return None;
+        }
+        let normal = match face {
+            0 => {
+                let point = ray.origin + ray.dir * time;
+                Vector::new(point.x, point.y, 0.0) / self.radius
+            }
+            1 => Vector::Z,
+            _ => -Vector::Z,
+        };
+        Some(RayIntersection::new(time, normal * outward, FeatureId::Face(face)))
+    }
+}
+
+/// A box with its sides parallel to the axes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Block {
+    pub(super) center: [f32; 3],
+    pub(super) half: [f32; 3],
+}
+
+impl RayCast for Block {
+    #[inline]
+    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
+        let moved = ray.translate_by(-Vector::from_array(self.center));
+        Cuboid::new(Vector::from_array(self.half)).cast_local_ray_and_get_normal(&moved, max_time, solid)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rapier3d::parry::shape::Cylinder;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn an_upright_cylinder_is_hit_where_parrys_cylinder_is(
+            from in proptest::array::uniform3(-3.0f32..3.0),
+            to in proptest::array::uniform3(-0.6f32..0.6),
+        ) {
+            let (radius, half) = (0.5, 0.7);
+            let upright = UprightCylinder { radius, bottom: -half, top: half };
+            prop_assume!(from[0].hypot(from[1]) > 0.6 || from[2].abs() > 0.8);
+            let direction = Vector::from_array(to) - Vector::from_array(from);
+            let ray = Ray::new(Vector::from_array(from), direction);
+            // parry's cylinder lies along y: swap y and z.
+            let swap = |v: Vector| Vector::new(v.x, v.z, v.y);
+            let lying = Ray::new(swap(ray.origin), swap(direction));
+            let ours = upright.cast_local_ray(&ray, 10.0, true);
+            let theirs = Cylinder::new(half, radius).cast_local_ray(&lying, 10.0, true);
+            match (ours, theirs) {
+                (Some(ours), Some(theirs)) => prop_assert!((ours - theirs).abs() < 2e-3, "{ours} {theirs}"),
+                (None, None) => {}
+                // The ray touches only the edge, and misses one of the two.
+                (ours, theirs) => {
+                    let grown = UprightCylinder { radius: radius + 2e-3, bottom: -half - 2e-3, top: half + 2e-3 };
+                    let shrunk = UprightCylinder { radius: radius - 2e-3, bottom: -half + 2e-3, top: half - 2e-3 };
+                    let is_at_edge = grown.span(&ray).is_some() && shrunk.span(&ray).is_none();
+                    prop_assert!(is_at_edge, "{ours:?} {theirs:?}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,102 @@
+//! The reports of running jobs: a bounded log, and the loss curves of trainings.
+
+use serde::{Deserialize, Serialize};
+
+use super::database::{DatabaseRow, Tx};
+use super::{Store, StoreError};
+
+/// A point of a training's loss curves.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LossRow {
+    /// `pretrain` or `fit`.
+    pub stage: String,
+    /// Steps done in that stage.
+    pub step: i64,
+    /// On the step's training windows.
+    pub train: Option<f64>,
+    /// On the validation windows.
+    pub validation: Option<f64>,
+}
+
+/// A line of a job's log.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogRow {
+    /// The line's number in its job, from 1.
+    pub seq: i64,
+    /// When, in seconds since 1970.
+    pub time_s: f64,
+    /// What happened.
+    pub line: String,
+}
+
+/// What a running job writes to the store at one time.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct JobReport {
+    /// Its progress, as JSON.
+    pub progress: String,
+    /// New lines of its log: time in seconds since 1970, and text.
+    pub lines: Vec<(f64, String)>,
+    /// New points of its curves; they replace existing points of the same step.
+    pub losses: Vec<LossRow>,
+    /// How many lines of its log are kept.
+    pub max_lines: i64,
+    /// How many units of work are saved; a smaller number than before changes nothing.
+    pub checkpoint: i64,
+}
+
+impl Store {
+    /// The lines of a job's log after line number `after`, the oldest first. Errors: `Query`.
+    pub async fn job_log(&self, number: i64, after: i64, limit: i64) -> Result<Vec<LogRow>, StoreError> {
+        let sql = "SELECT * FROM job_logs WHERE job = $1 AND seq > $2 ORDER BY seq LIMIT $3";
+        let values = vec![number.into(), after.into(), limit.into()];
+        let rows = self.database.fetch(sql, values).await?;
+        let line = |row: &DatabaseRow| {
+            Ok(LogRow {
+                seq: row.get("seq")?,
+                time_s: row.get("time_s")?,
+                line: row.get("line")?,
+            })
+        };
+        rows.iter().map(line).collect()
+    }
+
+    /// The points of a job's loss curves, in the order of the training. Errors: `Query`.
+    pub async fn job_losses(&self, number: i64) -> Result<Vec<LossRow>, StoreError> {
+        let sql = "SELECT * FROM job_losses WHERE job = $1 ORDER BY stage DESC, step";
+        let rows = self.database.fetch(sql, vec![number.into()]).await?;
+        let point = |row: &DatabaseRow| {
+            Ok(LossRow {
+                stage: row.get("stage")?,
+                step: row.get("step")?,
+                train: row.get("train")?,
+                validation: row.get("validation")?,
+            })
+        };
+        rows.iter().map(point).collect()
+    }
+}
+
+/// Writes the report in the transaction that has checked the lease.
+pub(super) async fn write_report(tx: &mut Tx, number: i64, report: JobReport) -> Result<(), StoreError> {
+    for (time_s, line) in report.lines {
+        let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
+             SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";
+        tx.execute(sql, vec![number.into(), time_s.into(), line.into()]).await?;
+        let sql = "DELETE FROM job_logs WHERE job = $1 AND \
+             seq <= (SELECT MAX(seq) FROM job_logs WHERE job = $1) - $2";
+        tx.execute(sql, vec![number.into(), report.max_lines.into()]).await?;
+    }
+    for point in report.losses {
+        let sql = "INSERT INTO job_losses (job, stage, step, train, validation) VALUES ($1, $2, $3, $4, $5) \
+             ON CONFLICT (job, stage, step) DO UPDATE SET train = excluded.train, validation = excluded.validation";
+        let values = vec![
+            number.into(),
+            point.stage.into(),
+            point.step.into(),
+            point.train.into(),
+            point.validation.into(),
+        ];
+        tx.execute(sql, values).await?;
+    }
+    Ok(())
+}

@@ -1,0 +1,179 @@
+//! What limits a job: memory, attempts and time; and that its process is not the server's.
+#![cfg(target_os = "linux")]
+
+use foreframe::server::ServerConfig;
+use serde_json::{Value, json};
+
+use crate::process::RunningServer;
+use crate::service::{app, get, poll_until, post};
+
+const JOBS: &str = "/v1/jobs";
+
+fn collect(name: &str, trials: u64) -> Value {
+    json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials})
+}
+
+/// The process ids of a process's children.
+fn children(process: u32) -> Vec<u32> {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let lists = tasks.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("children")).ok());
+    let ids = lists.map(|list| {
+        list.split_whitespace()
+            .map(|id| id.parse().unwrap())
+            .collect::<Vec<u32>>()
+    });
+    ids.flatten().collect()
+}
+
+/// The niceness of a process's first thread: the 19th field of its status, the 17th after its name.
+fn niceness(process: u32) -> i64 {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
+    let (_, rest) = stat.rsplit_once(") ").unwrap();
+    rest.split(' ').nth(16).unwrap().parse().unwrap()
+}
+
+fn kill(process: u32) {
+    let killed = std::process::Command::new("kill")
+        .args(["-KILL", &process.to_string()])
+        .status();
+    assert!(killed.unwrap().success());
+}
+
+/// The child that works on the job's given attempt.
+fn child_of(served: &RunningServer, attempt: u64) -> u32 {
+    served.wait_for_job("job-1", |job| {
+        job["attempts"].as_u64() >= Some(attempt) && job["state"] == "running"
+    });
+    served.wait_for_job("job-1", |_| !children(served.program.id()).is_empty());
+    children(served.program.id())[0]
+}
+
+#[test]
+fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = RunningServer::start(dir.path(), &["--set", "job_memory_mb=4000", "--set", "job_threads=1"]);
+    // No shard is complete before the kill.
+    served.ask("POST", JOBS, &collect("seen", 1_000_000));
+    let first = child_of(&served, 1);
+    let limits = std::fs::read_to_string(format!("/proc/{first}/limits")).unwrap();
+    let low = (niceness(served.program.id()) + 10).min(19);
+    assert_eq!(niceness(first), low);
+    for attempt in 1..=3 {
+        let child = child_of(&served, attempt);
+        kill(child);
+        served.wait_while_alive(child);
+    }
+    let job = served.ended_job("job-1");
+    assert_eq!(
+        (&job["state"], &job["attempts"]),
+        (&json!("failed"), &json!(3)),
+        "{job}"
+    );
+    let error = job["error"].as_str().unwrap();
+    assert!(
+        error.starts_with("3 attempts in a row ended without progress") && error.contains("killed by signal 9"),
+        "{error}"
+    );
+    assert!(served.get("/readyz").starts_with("HTTP/1.1 200"));
+    let limit = limits.lines().find(|line| line.starts_with("Max data size")).unwrap();
+    assert!(limit.contains(&(4000u64 << 20).to_string()), "{limits}");
+    served.terminate();
+    served.wait_for_exit();
+}
+
+#[test]
+fn a_job_ends_with_the_server_that_is_killed() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = RunningServer::start(dir.path(), &[]);
+    served.ask("POST", JOBS, &collect("seen", 1_000_000));
+    let child = child_of(&served, 1);
+    drop(served);
+    let deadline = std::time::Instant::now() + crate::service::TIMEOUT;
+    while is_alive(child) {
+        assert!(std::time::Instant::now() < deadline);
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
+}
+
+fn is_alive(process: u32) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+    !stat.is_empty() && !stat.rsplit_once(") ").is_some_and(|(_, rest)| rest.starts_with('Z'))
+}
+
+impl RunningServer {
+    fn wait_while_alive(&self, process: u32) {
+        self.job_until_any("job-1", |_| !is_alive(process));
+    }
+
+    fn ended_job(&self, id: &str) -> Value {
+        self.job_until_any(id, |job| {
+            ["failed", "succeeded", "cancelled"].contains(&job["state"].as_str().unwrap())
+        })
+    }
+
+    /// As `job_until`, also of a job that has failed.
+    fn job_until_any(&self, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
+        let deadline = std::time::Instant::now() + crate::service::TIMEOUT;
+        loop {
+            let job = self.ask("GET", &format!("{JOBS}/{id}"), &Value::Null);
+            if has_come(&job) {
+                return job;
+            }
+            assert!(std::time::Instant::now() < deadline, "{job}");
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+    }
+}
+
+/// Waits until a job has ended, and returns it.
+async fn ended(app: &foreframe::server::App, id: &str) -> Value {
+    poll_until(async || {
+        let job = get(app, &format!("{JOBS}/{id}")).await.json();
+        ["failed", "succeeded", "cancelled"]
+            .contains(&job["state"].as_str().unwrap())
+            .then_some(job)
+    })
+    .await
+}
+
+#[tokio::test]
+async fn a_training_that_cannot_fit_is_refused_when_submitted() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        job_memory_mb: 4096,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    post(&app, JOBS, &collect("small", 12)).await;
+    assert_eq!(ended(&app, "job-1").await["state"], "succeeded");
+    let mut body = json!({"kind": "train", "name": "big", "preset": "paper", "dataset": "small", "settings": {
+        "data": {"windows": "all"}, "model": {"hidden": 2048, "features": 2048},
+        "pretrain": {"steps": 0, "start": "random"}, "fit": {"steps": 10, "batch_size": 4096},
+    }});
+    let detail = post(&app, JOBS, &body).await.detail(422);
+    assert!(
+        detail.starts_with("settings: the training needs at least ") && detail.contains("a job can use 4096 MiB"),
+        "{detail}"
+    );
+    body["settings"]["fit"]["batch_size"] = json!(2);
+    body["settings"]["model"] = json!({"hidden": 16, "features": 16});
+    assert_eq!(post(&app, JOBS, &body).await.status, 202);
+}
+
+#[tokio::test]
+async fn an_attempt_beyond_the_time_limit_fails() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        job_time_limit_s: 1,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    post(&app, JOBS, &collect("seen", 1_000_000)).await;
+    let job = ended(&app, "job-1").await;
+    assert_eq!(job["state"], "failed");
+    let error = job["error"].as_str().unwrap();
+    assert!(
+        error.contains("the time limit of 1 s (setting job_time_limit_s)"),
+        "{error}"
+    );
+}
