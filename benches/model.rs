@@ -2,9 +2,13 @@
 //! context, 5 predicted frames.
 #![allow(clippy::unwrap_used, missing_docs)]
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use criterion::{Criterion, criterion_group, criterion_main};
-use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe::frame::warp::CameraModel;
+use foreframe::nn::{
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters,
+};
+use foreframe::training::TrainConfig;
 use foreframe::training::optimizer::{Adam, AdamConfig, Gradients};
 use foreframe::types::Seed;
 
@@ -20,15 +24,49 @@ fn values(shape: (usize, usize, usize)) -> Tensor {
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
+/// The default model, and the flow network of the preset `moving-flow` with its inputs.
+fn specs() -> [(&'static str, ModelSpec); 2] {
+    let channel = |name: &str, unit: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 0.0,
+        std: 1.0,
+    };
+    let states = [
+        channel("x", "m"),
+        channel("y", "m"),
+        channel("heading_cos", ""),
+        channel("heading_sin", ""),
+        channel("linear", "m/s"),
+        channel("angular", "rad/s"),
+    ];
+    let flow = ModelSpec {
+        architecture: Architecture::Flow,
+        conditioning: Conditioning::StateAction,
+        actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
+        states: states.to_vec(),
+        flow: TrainConfig::preset("moving-flow").unwrap().model.flow,
+        camera: CameraModel::new(1.0, 0.2).ok(),
+        ..ModelSpec::default()
+    };
+    [("dense", ModelSpec::default()), ("flow", flow)]
+}
+
 fn prediction(c: &mut Criterion) {
-    let spec = ModelSpec::default();
-    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let model = Model::detached(spec.clone(), &parameters).unwrap();
-    for windows in [1, WINDOWS] {
-        let frames = values((windows, spec.context, spec.pixels()));
-        c.bench_function(&format!("prediction of {windows} windows"), |b| {
-            b.iter(|| model.predict_frames(&frames, &ConditioningTensors::none()).unwrap());
-        });
+    for (name, spec) in specs() {
+        let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+        let model = Model::detached(spec.clone(), &parameters).unwrap();
+        for windows in [1, WINDOWS] {
+            let frames = values((windows, spec.context, spec.pixels()));
+            let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap();
+            let conditioning = ConditioningTensors {
+                actions: Some(zeros(&[windows, spec.horizon, spec.actions.len()])),
+                state: Some(zeros(&[windows, spec.states.len()])),
+            };
+            c.bench_function(&format!("{name} prediction of {windows} windows"), |b| {
+                b.iter(|| model.predict_frames(&frames, &conditioning).unwrap());
+            });
+        }
     }
 }
 
@@ -68,7 +106,7 @@ fn training(c: &mut Criterion) {
             let predicted = frozen
                 .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
                 .unwrap();
-            let again = frozen.reconstruct(&seen).unwrap();
+            let again = frozen.reconstruct(&seen).unwrap().unwrap();
             let loss = Loss::Mse.between(&predicted, &ahead).unwrap();
             update(&(loss + Loss::Mse.between(&again, &seen).unwrap()).unwrap())
         });

@@ -7,28 +7,49 @@
 //!
 //! Reading order: [`spec`] (sizes) → [`parameters`] and [`init`] (weights) → [`dense`] → [`lstm_cell`] (equations 1–5)
 //! → [`lstm`] (sequences; `recurrence` and `gates` are its fast f32 implementation) → [`conditioned`] (actions and state)
-//! → [`autoencoder`] (the whole model) → [`loss`]. [`costs`] compares the model's cost with other networks.
+//! → [`autoencoder`] (the dense network) → [`loss`]. [`costs`] compares the model's cost with other networks.
+//!
+//! The second architecture is [`flow`]: `conv`, `modulation`, `sampling` and `compose` are its operations, `rays` and `room`
+//! its geometry, `motion` and `scene` compute the camera's motion and the look of the surroundings. [`model`] is the type
+//! that the rest of the program uses for both architectures.
 
 mod activation;
 pub mod autoencoder;
+mod compose;
 pub mod conditioned;
+mod conv;
 pub mod costs;
 pub mod dense;
+pub mod flow;
+mod flow_inputs;
+pub mod flow_spec;
 mod gates;
+#[cfg(test)]
+mod gradient_check;
 pub mod init;
 pub mod loss;
 pub mod lstm;
 pub mod lstm_cell;
+pub mod model;
+mod modulation;
+mod motion;
 pub mod parameters;
+mod rays;
 mod recurrence;
+mod room;
+mod sampling;
+mod scene;
 pub mod spec;
 pub(crate) mod tensors;
 
-pub use autoencoder::{Feedback, Model};
+pub use autoencoder::Feedback;
 pub use conditioned::ConditioningTensors;
+pub use flow::FlowPrediction;
+pub use flow_spec::FlowLayers;
 pub use loss::Loss;
+pub use model::Model;
 pub use parameters::Parameters;
-pub use spec::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
+pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, Reconstruction};
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]
@@ -68,6 +89,23 @@ pub enum NnError {
         /// Its standard deviation.
         std: f32,
     },
+    /// A side of the frames does not suit the flow network.
+    #[error(
+        "model specification: frames are {width}×{height} px; each side must be a multiple of {min} from {min} to {max}"
+    )]
+    FrameSides {
+        /// Width of a frame in pixels.
+        width: u32,
+        /// Height of a frame in pixels.
+        height: u32,
+        /// Smallest side; sides are multiples of it.
+        min: u32,
+        /// Largest side.
+        max: u32,
+    },
+    /// No camera has this field of view or tilt.
+    #[error("model specification: {0}")]
+    Camera(#[source] crate::frame::FrameError),
     /// The name of an enumeration value is unknown.
     #[error("unknown {kind} \"{name}\"; there are {known}")]
     UnknownName {
@@ -97,6 +135,14 @@ pub enum NnError {
         conditioning: Conditioning,
         /// The expected shape.
         expected: String,
+    },
+    /// The weights belong to another kind of network.
+    #[error("the weights are those of a \"{found}\" network; the model's architecture is \"{expected}\"")]
+    OtherArchitecture {
+        /// The architecture that the weights belong to.
+        found: Architecture,
+        /// The model's architecture.
+        expected: Architecture,
     },
     /// A tensor of the model is missing from the weights.
     #[error("tensor \"{name}\" is missing from the weights; the model needs it with shape {expected:?}")]

@@ -316,7 +316,7 @@ impl Predictor {
 /// A small model with random weights.
 #[cfg(test)]
 pub(crate) fn test_model() -> LoadedModel {
-    use crate::nn::{ChannelScale, Conditioning, Model, ModelSpec, Parameters};
+    use crate::nn::{ChannelScale, Conditioning, ModelSpec};
     let channel = |name: &str| ChannelScale {
         name: name.to_owned(),
         unit: String::new(),
@@ -335,6 +335,32 @@ pub(crate) fn test_model() -> LoadedModel {
         states: vec![channel("s")],
         ..ModelSpec::default()
     };
+    loaded(spec)
+}
+
+/// As [`test_model`], with the flow network, on frames of 8×4 px.
+#[cfg(test)]
+pub(crate) fn test_flow_model() -> LoadedModel {
+    use crate::nn::{Architecture, FlowLayers, ModelSpec};
+    loaded(ModelSpec {
+        architecture: Architecture::Flow,
+        frame_width_px: 8,
+        flow: Some(FlowLayers {
+            channels: 8,
+            stem_channels: 6,
+            enlarged_channels: 3,
+            fine_channels: 5,
+            scene_hidden: 8,
+            ..FlowLayers::default()
+        }),
+        ..test_model().model.spec().clone()
+    })
+}
+
+/// A model of that specification with fresh weights.
+#[cfg(test)]
+fn loaded(spec: crate::nn::ModelSpec) -> LoadedModel {
+    use crate::nn::{Model, Parameters};
     let parameters = Parameters::initialize(&spec, crate::types::Seed(1)).unwrap();
     let manifest = serde_json::json!({
         "name": "test", "version": 1, "spec": spec, "weights_sha256": "00",

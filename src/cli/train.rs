@@ -100,7 +100,7 @@ fn training_config(args: &TrainArgs) -> Result<TrainConfig, CliError> {
 }
 
 fn default_dataset(preset: &str) -> PathBuf {
-    PathBuf::from(if preset == "moving" {
+    PathBuf::from(if preset.starts_with("moving") {
         "moving-observer"
     } else {
         "static-observer"

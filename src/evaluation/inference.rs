@@ -33,7 +33,7 @@ pub struct Predicted {
     pub truth: Vec<f32>,
     /// The true frames to come through the frame encoder and decoder.
     pub codec: Vec<f32>,
-    /// The frames seen as the model reconstructs them.
+    /// The frames seen as the model reconstructs them; empty if it does not.
     pub reconstructed: Vec<f32>,
 }
 
@@ -86,17 +86,18 @@ pub fn predict_with_ceiling(
     })
 }
 
-/// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space.
+/// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space. Empty if it
+/// does not reconstruct.
 pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
     let (model, spec) = (&loaded.model, loaded.model.spec());
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
     let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
-    let features = model.encode_frames(&frames)?.reshape((batch, context, spec.features))?;
-    let features = model
-        .reconstruct(&features)?
-        .reshape((batch * context, spec.features))?;
-    values(&model.decode_frames(&features)?)
+    let features = model.encode_frames(&frames)?.reshape((batch, context, spec.code_len()))?;
+    let Some(features) = model.reconstruct(&features)? else {
+        return Ok(Vec::new());
+    };
+    values(&model.decode_frames(&features.reshape((batch * context, spec.code_len()))?)?)
 }
 
 fn values(tensor: &Tensor) -> Result<Vec<f32>, EvaluationError> {

@@ -17,7 +17,7 @@ pub(super) fn sigmoid(x: f32) -> f32 {
 
 /// e^x by 2^n · e^r, |r| ≤ ln 2 / 2, the polynomial of Cephes' `expf`. Arguments are clamped to ±87; NaN stays NaN.
 #[inline(always)]
-fn exp(x: f32) -> f32 {
+pub(super) fn exp(x: f32) -> f32 {
     /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
     const ROUND: f32 = 12_582_912.0;
     let x = x.clamp(-87.0, 87.0);

@@ -1,4 +1,4 @@
-//! The whole model: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
+//! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
 
 use candle_core::Tensor;
 
@@ -20,7 +20,7 @@ pub enum Feedback<'a> {
 /// The network: a frame codec, an LSTM encoder and two LSTM decoders. It holds only weights and no stream state, so many
 /// streams can share one model.
 #[derive(Clone, Debug)]
-pub struct Model {
+pub(super) struct DenseModel {
     spec: ModelSpec,
     frame_encoder: Dense,
     frame_decoder: Dense,
@@ -31,20 +31,10 @@ pub struct Model {
     reconstructor_output: Dense,
 }
 
-impl Model {
-    /// A model that shares its storage with `parameters`: it sees every update, and every tensor gets a gradient.
-    /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
-    pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
-        Self::with_frozen(spec, parameters, &[])
-    }
-
-    /// As [`Model::new`], without any gradients: for prediction.
-    pub fn detached(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
-        Self::with_frozen(spec, parameters, &[""])
-    }
-
-    /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
-    pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+impl DenseModel {
+    /// A network that shares its storage with `parameters`, without gradients for tensors whose name starts with one of the
+    /// `frozen` prefixes. Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
+    pub(super) fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
         spec.validate()?;
         let shapes = spec.tensor_shapes();
         let tensor = |name: String| {
@@ -88,20 +78,14 @@ impl Model {
         })
     }
 
-    /// The model's specification.
-    #[must_use]
-    pub fn spec(&self) -> &ModelSpec {
-        &self.spec
-    }
-
     /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`. Errors: `Shape`.
-    pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
         self.frame_encoder.forward(frames)
     }
 
     /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped. Errors: `Shape`.
-    pub fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", features, &[None, Some(self.spec.features)])?;
         self.frame_decoder.forward(features)
     }
@@ -109,7 +93,7 @@ impl Model {
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The
     /// predictor starts from the encoder's last state. Step k gets the features of frame k, the action that leads to frame
     /// k + 1, and the state; its output is added to the features. Errors: `Shape`, `Missing`.
-    pub fn predict(
+    pub(super) fn predict(
         &self,
         features: &Tensor,
         condition: &ConditioningTensors,
@@ -141,7 +125,7 @@ impl Model {
     /// Predicts the features `[N, horizon, F]` of N rollouts from B windows with `features` `[B, context, F]`. Rollout n
     /// starts from window `windows[n]` and uses row n of `condition`. Each window is encoded once, also if it has many
     /// rollouts. Errors: `Shape`, `Missing`, `Tensor` if a window index is out of range.
-    pub fn predict_futures(
+    pub(super) fn predict_futures(
         &self,
         features: &Tensor,
         windows: &[u32],
@@ -179,7 +163,7 @@ impl Model {
     /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
     /// the encoder's last state; its first input is zero, then it gets its own output. Approach 2 (stepwise): after each
     /// frame, the decoder gets the encoder's output at that frame. Errors: `Shape`.
-    pub fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
         let batch = self.check_windows(features)?;
         let (outputs, state) = self.encode(features)?;
         match self.spec.reconstruction {
@@ -198,18 +182,6 @@ impl Model {
                 Ok(flat.reshape(features.dims())?)
             }
         }
-    }
-
-    /// Predicts the frames `[B, horizon, P]` that follow `frames` `[B, context, P]`, both in the model's value range.
-    /// Errors: `Shape`, `Missing`.
-    pub fn predict_frames(&self, frames: &Tensor, condition: &ConditioningTensors) -> Result<Tensor, NnError> {
-        let (context, pixels) = (self.spec.context, self.spec.pixels());
-        let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
-        let features = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;
-        let features = features.reshape((batch, context, self.spec.features))?;
-        let predicted = self.predict(&features, condition, Feedback::Prediction)?;
-        let frames = self.decode_frames(&predicted.flatten(0, 1)?)?;
-        Ok(frames.reshape((batch, self.spec.horizon, pixels))?)
     }
 
     /// The encoder's outputs `[B, context, H]` and its last state.

@@ -45,6 +45,23 @@ impl ConditioningTensors {
     }
 }
 
+impl ConditioningTensors {
+    /// Actions `[B, horizon, A]` and state `[B, S]` as plain values in the channels' units, empty if the conditioning does
+    /// not include them. Errors: `Missing`, `Shape`.
+    pub(super) fn raw(&self, spec: &ModelSpec, batch: usize) -> Result<(Vec<f32>, Vec<f32>), NnError> {
+        let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
+        let actions = match spec.action_inputs() {
+            Some(count) => values(checked(spec, "actions", self.actions.as_ref(), &[batch, spec.horizon, count])?)?,
+            None => Vec::new(),
+        };
+        let state = match spec.state_inputs() {
+            Some(count) => values(checked(spec, "state", self.state.as_ref(), &[batch, count])?)?,
+            None => Vec::new(),
+        };
+        Ok((actions, state))
+    }
+}
+
 /// The tensor, if it is given and has the expected shape. Errors: `Missing`, `Shape`.
 fn checked<'a>(
     spec: &ModelSpec,

@@ -3,6 +3,7 @@
 //!
 //! - Dense weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
+//! - The flow network's weights: the dense range, or a share of it ([`flow_gain`]); its other tensors 0.
 //! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts almost no change.
 
 use candle_core::{Device, Tensor};
@@ -14,8 +15,12 @@ use crate::types::Seed;
 /// The initial tensor of this name and shape.
 pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, NnError> {
     let count = shape.iter().product();
-    let (_, part) = name.rsplit_once('.').unwrap_or(("", name));
+    let (layer, part) = name.rsplit_once('.').unwrap_or(("", name));
     let values = match (part, shape) {
+        ("weight", &[inputs, outputs]) if layer.starts_with("flow.") => {
+            uniform(count, flow_gain(layer) * (6.0 / (inputs + outputs) as f32).sqrt(), name, seed)
+        }
+        _ if layer.starts_with("flow.") => vec![0.0; count],
         ("bias", &[gates]) if is_lstm(name) => lstm_bias(gates),
         ("bias", _) => vec![0.0; count],
         ("weight", &[inputs, outputs]) => {
@@ -29,6 +34,17 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
         _ => vec![0.0; count],
     };
     Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
+}
+
+/// The share of the dense range for a layer of the flow network. At first, the residual blocks and corrections change
+/// nothing, and pixels hardly move.
+fn flow_gain(layer: &str) -> f32 {
+    match layer {
+        "flow.motion.output" | "flow.affine" => 0.0,
+        "flow.modulation.output" | "flow.head" => 0.1,
+        _ if layer.ends_with(".second") => 0.0,
+        _ => 1.0,
+    }
 }
 
 /// Whether the tensor belongs to an LSTM cell, not to a dense layer.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use candle_core::{DType, Tensor, Var};
 
-use super::{ModelSpec, NnError, init};
+use super::{Architecture, ModelSpec, NnError, init};
 use crate::types::Seed;
 
 /// The trained tensors of a model. Names are sorted, so every pass over them has one order.
@@ -23,10 +23,16 @@ impl Parameters {
         Ok(Self(tensors))
     }
 
-    /// Weights from stored tensors of any float type, converted to f32. Errors: `TensorMissing`, `TensorUnknown`, `TensorShape`,
+    /// Weights from stored tensors of any float type, converted to f32. Errors: `OtherArchitecture`, `TensorMissing`, `TensorUnknown`, `TensorShape`,
     /// `TensorNotFinite`, and those of [`ModelSpec::validate`].
     pub fn from_tensors(spec: &ModelSpec, mut tensors: BTreeMap<String, Tensor>) -> Result<Self, NnError> {
         spec.validate()?;
+        if let Some(found) = Architecture::of_tensors(&tensors).filter(|&found| found != spec.architecture) {
+            return Err(NnError::OtherArchitecture {
+                found,
+                expected: spec.architecture,
+            });
+        }
         let mut vars = BTreeMap::new();
         for (name, expected) in spec.tensor_shapes() {
             let Some(tensor) = tensors.remove(&name) else {

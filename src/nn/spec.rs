@@ -4,10 +4,14 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
+use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
-use super::NnError;
+use super::motion::StateChannels;
+use super::sampling::ImageSize;
+use super::{FlowLayers, NnError};
 use crate::frame::preprocess::Preprocess;
+use crate::frame::warp::CameraModel;
 use crate::types::Channel;
 
 /// Largest width and height of a model's frames, in pixels.
@@ -63,6 +67,38 @@ macro_rules! named_enum {
 pub(super) use named_enum;
 
 named_enum!(
+    /// The kind of network.
+    Architecture, "architecture", "\"dense\" and \"flow\"", {
+        /// The paper's: a dense codec and LSTMs.
+        Dense = "dense",
+        /// A convolutional network that moves the pixels of the last frame.
+        Flow = "flow",
+    }
+);
+
+impl Architecture {
+    /// The architecture that these tensors belong to, if their names show it.
+    pub(super) fn of_tensors(tensors: &BTreeMap<String, Tensor>) -> Option<Self> {
+        let has = |prefix: &str| tensors.keys().any(|name| name.starts_with(prefix));
+        match (has("flow."), has("frame_encoder.")) {
+            (true, false) => Some(Self::Flow),
+            (false, true) => Some(Self::Dense),
+            _ => None,
+        }
+    }
+
+    /// The architecture of specifications that name none.
+    pub(crate) fn dense() -> Self {
+        Self::Dense
+    }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_dense(architecture: &Architecture) -> bool {
+    *architecture == Architecture::Dense
+}
+
+named_enum!(
     /// The paper's two approaches to reconstruct the context frames.
     Reconstruction, "reconstruction", "\"sequence\" and \"stepwise\"", {
         /// Encodes the whole sequence, then decodes it (approach 1).
@@ -101,6 +137,14 @@ pub struct ChannelScale {
     pub std: f32,
 }
 
+impl ChannelScale {
+    /// The value scaled for the network: (value − mean) / std.
+    #[must_use]
+    pub fn scaled(&self, value: f32) -> f32 {
+        (value - self.mean) / self.std.max(MIN_CHANNEL_STD)
+    }
+}
+
 impl fmt::Display for ChannelScale {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         Channel::new(&self.name, &self.unit).fmt(f)
@@ -112,6 +156,9 @@ impl fmt::Display for ChannelScale {
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ModelSpec {
+    /// The kind of network.
+    #[serde(default = "Architecture::dense", skip_serializing_if = "is_dense")]
+    pub architecture: Architecture,
     /// Width of a frame in pixels.
     pub frame_width_px: u32,
     /// Height of a frame in pixels.
@@ -124,9 +171,9 @@ pub struct ModelSpec {
     pub context: usize,
     /// Number of predicted frames.
     pub horizon: usize,
-    /// Features of a frame, F.
+    /// Features of a frame, F; not used by the flow network.
     pub features: usize,
-    /// Hidden units of each LSTM, H.
+    /// Hidden units of each LSTM, H; not used by the flow network.
     pub hidden: usize,
     /// How the context frames are reconstructed.
     pub reconstruction: Reconstruction,
@@ -136,11 +183,18 @@ pub struct ModelSpec {
     pub actions: Vec<ChannelScale>,
     /// Components of a state in the training data; used only if `conditioning` includes the state.
     pub states: Vec<ChannelScale>,
+    /// Layer sizes of the flow network; absent for the dense network.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flow: Option<FlowLayers>,
+    /// The camera model, if it is known. Only the flow network uses it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<CameraModel>,
 }
 
 impl Default for ModelSpec {
     fn default() -> Self {
         Self {
+            architecture: Architecture::Dense,
             frame_width_px: 64,
             frame_height_px: 64,
             frame_period_s: 0.2,
@@ -153,12 +207,14 @@ impl Default for ModelSpec {
             conditioning: Conditioning::None,
             actions: Vec::new(),
             states: Vec::new(),
+            flow: None,
+            camera: None,
         }
     }
 }
 
 impl ModelSpec {
-    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`.
+    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`, `Camera`, `FrameSides`.
     pub fn validate(&self) -> Result<(), NnError> {
         let side = f64::from(MAX_MODEL_SIDE_PX);
         in_range("frame_width_px", f64::from(self.frame_width_px), 1.0, side)?;
@@ -178,6 +234,12 @@ impl ModelSpec {
         in_range("number of actions", self.actions.len() as f64, 0.0, MAX_CHANNELS as f64)?;
         in_range("number of states", self.states.len() as f64, 0.0, MAX_CHANNELS as f64)?;
         self.check_channels()?;
+        if let Some(camera) = &self.camera {
+            camera.validate().map_err(NnError::Camera)?;
+        }
+        if self.architecture == Architecture::Flow {
+            self.flow_layers().validate(self)?;
+        }
         in_range(
             "number of parameters",
             self.parameter_count() as f64,
@@ -219,6 +281,54 @@ impl ModelSpec {
         self.frame_width_px as usize * self.frame_height_px as usize
     }
 
+    /// Number of values that the model keeps of each frame: the features for the dense network, the pixels for the flow
+    /// network.
+    #[must_use]
+    pub fn code_len(&self) -> usize {
+        match self.architecture {
+            Architecture::Dense => self.features,
+            Architecture::Flow => self.pixels(),
+        }
+    }
+
+    /// Layer sizes of the flow network; the defaults if none are given.
+    #[must_use]
+    pub fn flow_layers(&self) -> FlowLayers {
+        self.flow.unwrap_or_default()
+    }
+
+    /// Height and width of a frame.
+    pub(super) fn image_size(&self) -> ImageSize {
+        ImageSize {
+            height: self.frame_height_px as usize,
+            width: self.frame_width_px as usize,
+        }
+    }
+
+    /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left
+    /// `[B, T, 3]`, in radians and metres. `None` if the model gets no state or the state has no pose.
+    pub fn measured_motion(&self, state: &Tensor, later: &Tensor) -> Result<Option<Tensor>, NnError> {
+        let channels = StateChannels::of(self);
+        if channels.pose.is_none() {
+            return Ok(None);
+        }
+        let (batch, time, count) = later.dims3()?;
+        let (now, later) = (state.flatten_all()?.to_vec1::<f32>()?, later.flatten_all()?.to_vec1::<f32>()?);
+        let windows = now.chunks_exact(count).zip(later.chunks_exact(time * count));
+        let motions: Vec<f32> = windows
+            .flat_map(|(now, later)| {
+                let now = channels.pose_in(now);
+                later.chunks_exact(count).flat_map(move |later| now.motion_to(channels.pose_in(later)))
+            })
+            .collect();
+        Ok(Some(Tensor::from_vec(motions, (batch, time, 3), &Device::Cpu)?))
+    }
+
+    /// The state scaled for the network.
+    pub(super) fn scaled_state(&self, state: &[f32]) -> Vec<f32> {
+        state.iter().zip(&self.states).map(|(value, channel)| channel.scaled(*value)).collect()
+    }
+
     /// Number of action components that the predictor gets; `None` if the conditioning does not include actions.
     #[must_use]
     pub fn action_inputs(&self) -> Option<usize> {
@@ -249,6 +359,9 @@ impl ModelSpec {
     /// Name and shape of every trained tensor. Gate order in `w_x`, `w_h` and `bias` is i, f, c, o.
     #[must_use]
     pub fn tensor_shapes(&self) -> BTreeMap<String, Vec<usize>> {
+        if self.architecture == Architecture::Flow {
+            return self.flow_layers().tensor_shapes(self);
+        }
         let (pixels, features, hidden) = (self.pixels(), self.features, self.hidden);
         let mut shapes = BTreeMap::new();
         let mut dense = |name: &str, inputs: usize, outputs: usize| {
@@ -290,8 +403,12 @@ impl ModelSpec {
     /// `(context · (P·F + L(F)) + horizon · (L(F+A+S) + H·F + F·P)) / horizon`, `L(D) = 4H·(D + H) + 3H`.
     ///
     /// A session keeps the features of earlier frames, so it computes less. The reconstructor is not used in a prediction.
+    /// For the flow network, the products of all layers with their weights are counted.
     #[must_use]
     pub fn multiply_adds_per_frame(&self) -> u64 {
+        if self.architecture == Architecture::Flow {
+            return self.flow_layers().multiply_adds_per_frame(self);
+        }
         let (context, horizon) = (self.context as u64, self.horizon.max(1) as u64);
         let (pixels, features, hidden) = (self.pixels() as u64, self.features as u64, self.hidden as u64);
         let lstm = |inputs: u64| 4 * hidden * (inputs + hidden) + 3 * hidden;
@@ -302,7 +419,7 @@ impl ModelSpec {
 }
 
 /// Errors: `OutOfRange` if the value is NaN or not in the range.
-fn in_range(field: &'static str, value: f64, min: f64, max: f64) -> Result<(), NnError> {
+pub(super) fn in_range(field: &'static str, value: f64, min: f64, max: f64) -> Result<(), NnError> {
     if (min..=max).contains(&value) {
         return Ok(());
     }

@@ -97,7 +97,7 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
                 .map_err(|source| model_error(loaded, source))
         })?;
     with_values(&features, |values| {
-        values.chunks_exact(spec.features).map(Features::from).collect()
+        values.chunks_exact(spec.code_len()).map(Features::from).collect()
     })
     .map_err(tensor_error)
 }
@@ -111,9 +111,9 @@ fn predict_windows(
     conditioning_inputs: &[&ConditioningInput],
 ) -> Result<Vec<Vec<Frame>>, ServingError> {
     let spec = loaded.model.spec();
-    let count = values.len() / (spec.context * spec.features);
+    let count = values.len() / (spec.context * spec.code_len());
     let features =
-        Tensor::from_vec(values, (count, spec.context, spec.features), &Device::Cpu).map_err(tensor_error)?;
+        Tensor::from_vec(values, (count, spec.context, spec.code_len()), &Device::Cpu).map_err(tensor_error)?;
     let predicted = loaded
         .model
         .predict_futures(&features, window_of, &condition(spec, conditioning_inputs)?)

@@ -197,14 +197,14 @@ const MEMORY_FIELDS: FieldNames = FieldNames {
 };
 
 fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), MemoryError> {
-    if features.len() != spec.features {
+    if features.len() != spec.code_len() {
         return Err(MemoryError::FeatureCount {
             index,
             found: features.len(),
-            expected: spec.features,
+            expected: spec.code_len(),
         });
     }
-    // Features are outputs of tanh; NaN is in no range.
+    // Features are outputs of tanh, or pixels for the flow network; NaN is in no range.
     match features
         .iter()
         .enumerate()
@@ -221,10 +221,10 @@ mod tests {
 
     use super::*;
     use crate::serving::compute;
-    use crate::serving::{PredictionInput, predict, test_model};
+    use crate::serving::{PredictionInput, predict, test_flow_model, test_model};
 
-    fn frame(seed: u8) -> Frame {
-        Frame::new(6, 4, (0..24).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
+    fn frame(seed: u8, width: u32) -> Frame {
+        Frame::new(width, 4, (0..4 * width as u8).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
     }
 
     fn action(value: f32) -> Action {
@@ -240,19 +240,25 @@ mod tests {
 
     #[test]
     fn steps_predict_the_same_as_whole_windows() {
-        let model = test_model();
+        for model in [test_model(), test_flow_model()] {
+            check_steps(&model);
+        }
+    }
+
+    fn check_steps(model: &crate::registry::LoadedModel) {
+        let width = model.model.spec().frame_width_px;
         let spec = model.model.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
-            let task = state.step(frame(seq), Some(conditioning(f32::from(seq))), spec);
-            let computed = compute::run(&model, &[&task]).unwrap().remove(0);
+            let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
+            let computed = compute::run(model, &[&task]).unwrap().remove(0);
             state.advance(
                 u64::from(seq),
                 computed.features[0].clone(),
                 conditioning(f32::from(seq)),
                 spec,
             );
-            seen.push(frame(seq));
+            seen.push(frame(seq, width));
             let Some(start) = seen.len().checked_sub(3) else {
                 assert!(computed.predictions.is_empty());
                 continue;
@@ -263,10 +269,10 @@ mod tests {
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
                 future_actions: None,
             };
-            assert_eq!(computed.predictions, predict(&model, &[&input]).unwrap());
+            assert_eq!(computed.predictions, predict(model, &[&input]).unwrap());
             let repeated = state.repeat_task(spec).unwrap();
             assert_eq!(
-                compute::run(&model, &[&repeated]).unwrap()[0].predictions,
+                compute::run(model, &[&repeated]).unwrap()[0].predictions,
                 computed.predictions
             );
         }

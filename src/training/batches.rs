@@ -32,6 +32,8 @@ pub(super) struct WindowBatch {
     pub(super) future: Option<Tensor>,
     /// The actions that lead to the future frames, and the state at the last context frame.
     pub(super) condition: ConditioningTensors,
+    /// The states at the targets `[B, horizon, S]`, where the data set has states.
+    pub(super) future_states: Option<Tensor>,
 }
 
 impl<'a> FrameSource<'a> {
@@ -102,7 +104,23 @@ impl<'a> FrameSource<'a> {
                 .transpose()?,
             targets: batched(self.targets(&future)?, horizon)?,
             condition: self.condition(windows, shape)?,
+            future_states: self.future_states(windows, shape)?,
         })
+    }
+
+    fn future_states(&self, windows: &[&Window], shape: WindowShape) -> Result<Option<Tensor>, TrainError> {
+        let states = self.dataset.info().state_channels.len();
+        if states == 0 {
+            return Ok(None);
+        }
+        let values: Vec<f32> = windows
+            .iter()
+            .map(|window| window.first_frame + shape.context)
+            .flat_map(|first| (first..first + shape.horizon).flat_map(|frame| self.dataset.state(frame)))
+            .copied()
+            .collect();
+        let shape = (windows.len(), shape.horizon, states);
+        Ok(Some(Tensor::from_vec(values, shape, &Device::Cpu)?))
     }
 
     fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {

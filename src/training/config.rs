@@ -6,8 +6,9 @@ use super::TrainError;
 use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
+use crate::frame::warp::CameraModel;
 use crate::nn::loss::Loss;
-use crate::nn::{ChannelScale, Conditioning, ModelSpec, Reconstruction};
+use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, Reconstruction};
 use crate::types::{Channel, Seed};
 
 /// Largest number of steps of one stage.
@@ -39,20 +40,44 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
+    /// The kind of network.
+    #[serde(default = "Architecture::dense")]
+    pub architecture: Architecture,
     /// Number of context frames.
     pub context: usize,
     /// Number of predicted frames.
     pub horizon: usize,
-    /// Features of a frame.
+    /// Features of a frame (dense network).
+    #[serde(default = "default_features")]
     pub features: usize,
-    /// Hidden units of each LSTM.
+    /// Hidden units of each LSTM (dense network).
+    #[serde(default = "default_hidden")]
     pub hidden: usize,
-    /// Which of the paper's two approaches reconstructs the context.
+    /// Which of the paper's two approaches reconstructs the context (dense network).
+    #[serde(default = "default_reconstruction")]
     pub reconstruction: Reconstruction,
     /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
     /// How frames are converted to the model's value range.
     pub preprocess: Preprocess,
+    /// Layer sizes of the flow network.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flow: Option<FlowLayers>,
+    /// The camera model; it replaces the data set's. Only the flow network uses it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<CameraModel>,
+}
+
+fn default_features() -> usize {
+    ModelSpec::default().features
+}
+
+fn default_hidden() -> usize {
+    ModelSpec::default().hidden
+}
+
+fn default_reconstruction() -> Reconstruction {
+    ModelSpec::default().reconstruction
 }
 
 /// Settings of the windows.
@@ -130,6 +155,13 @@ pub struct FitConfig {
     /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
     /// trained.
     pub reconstruction_weight: f64,
+    /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
+    #[serde(default)]
+    pub scene_weight: f64,
+    /// Weight of the motion loss (flow network): the difference between the predicted camera motion and the motion between
+    /// the measured poses, if the states have a pose.
+    #[serde(default)]
+    pub motion_weight: f64,
 }
 
 /// The target frames of the decoder, in both stages.
@@ -224,6 +256,8 @@ impl TrainConfig {
             ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
             ("fit.learning_rate", fit.learning_rate, 1.0),
             ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
+            ("fit.scene_weight", fit.scene_weight, 100.0),
+            ("fit.motion_weight", fit.motion_weight, 100.0),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
             ("run.clip_norm", run.clip_norm, 1e6),
         ];
@@ -266,7 +300,9 @@ impl TrainConfig {
         let (info, model) = (dataset.info(), &self.model);
         let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
         let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
+        let is_flow = model.architecture == Architecture::Flow;
         ModelSpec {
+            architecture: model.architecture,
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,
             frame_period_s: info.frame_period_s,
@@ -279,6 +315,8 @@ impl TrainConfig {
             conditioning: model.conditioning,
             actions,
             states,
+            flow: is_flow.then(|| model.flow.unwrap_or_default()),
+            camera: model.camera.or(info.camera).filter(|_| is_flow),
         }
     }
 }

@@ -2,14 +2,14 @@
 
 use candle_core::Tensor;
 
-use super::batches::Shuffle;
+use super::batches::{Shuffle, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
 use super::observer::TrainingStage;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan};
 use crate::dataset::Window;
 use crate::nn::loss::Loss;
-use crate::nn::{Feedback, Model, Parameters};
+use crate::nn::{Architecture, Feedback, Model, Parameters};
 
 /// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
@@ -40,7 +40,28 @@ impl<'a> SequenceObjective<'a> {
     fn features(&self, model: &Model, frames: &Tensor) -> Result<Tensor, TrainError> {
         let (batch, time, pixels) = frames.dims3()?;
         let features = model.encode_frames(&frames.reshape((batch * time, pixels))?)?;
-        Ok(features.reshape((batch, time, self.plan.spec.features))?)
+        Ok(features.reshape((batch, time, self.plan.spec.code_len()))?)
+    }
+
+    /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
+    fn flow_loss(&self, model: &Model, batch: &WindowBatch) -> Result<Tensor, TrainError> {
+        let fit = &self.config.fit;
+        let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition)? else {
+            return Err(TrainError::Config("only the flow network has this loss".to_owned()));
+        };
+        let mut loss = fit.loss.between(&predicted.frames, &batch.targets)?;
+        if fit.scene_weight > 0.0 {
+            let scene = fit.loss.between(&predicted.scene, &batch.targets)?;
+            loss = (loss + (scene * fit.scene_weight)?)?;
+        }
+        if fit.motion_weight > 0.0
+            && let (Some(state), Some(future)) = (&batch.condition.state, &batch.future_states)
+            && let Some(truth) = self.plan.spec.measured_motion(state, future)?
+        {
+            let motion = Loss::Mse.between(&predicted.motion, &truth)?;
+            loss = (loss + (motion * fit.motion_weight)?)?;
+        }
+        Ok(loss)
     }
 
     /// Decodes features `[B, T, F]` to frames `[B, T, P]`.
@@ -75,6 +96,9 @@ impl Objective for SequenceObjective<'_> {
             .windows(&windows, self.config.window_shape(), is_teacher_forced)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
+        if self.plan.spec.architecture == Architecture::Flow {
+            return self.flow_loss(&model, &batch);
+        }
         let inputs = self.features(&model, &batch.inputs)?;
         let true_features = batch
             .future
@@ -89,7 +113,10 @@ impl Objective for SequenceObjective<'_> {
         if fit.reconstruction_weight == 0.0 {
             return Ok(loss);
         }
-        let reconstructed = Self::frames(&model, &model.reconstruct(&inputs)?)?;
+        let Some(reconstructed) = model.reconstruct(&inputs)? else {
+            return Ok(loss);
+        };
+        let reconstructed = Self::frames(&model, &reconstructed)?;
         let reconstruction = fit.loss.between(&reconstructed, &batch.input_targets)?;
         Ok((loss + (reconstruction * fit.reconstruction_weight)?)?)
     }

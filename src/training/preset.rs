@@ -5,10 +5,12 @@ use super::config::TrainConfig;
 use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// Name and text of each preset.
-const PRESETS: [(&str, &str); 3] = [
+const PRESETS: [(&str, &str); 5] = [
     ("paper", include_str!("presets/paper.toml")),
     ("static", include_str!("presets/static.toml")),
     ("moving", include_str!("presets/moving.toml")),
+    ("static-flow", include_str!("presets/static-flow.toml")),
+    ("moving-flow", include_str!("presets/moving-flow.toml")),
 ];
 
 /// The command that lists all settings.
@@ -94,7 +96,7 @@ mod tests {
     #[test]
     fn the_error_for_an_unknown_preset_lists_the_presets() {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
-        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving");
+        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow");
     }
 
     #[test]

@@ -30,6 +30,7 @@ mod malformed_streams;
 mod metrics;
 mod nn_cell;
 mod nn_fixtures;
+mod nn_flow;
 mod nn_model;
 mod nn_optimizer;
 mod nn_spec;

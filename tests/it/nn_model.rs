@@ -15,7 +15,7 @@ fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, t
     let features = features.reshape((batch, spec.context, spec.features)).unwrap();
     let feedback = truth.map_or(Feedback::Prediction, Feedback::TeacherForcing);
     let predicted = model.predict(&features, condition, feedback).unwrap();
-    let again = model.reconstruct(&features).unwrap();
+    let again = model.reconstruct(&features).unwrap().unwrap();
     let predicted = model.decode_frames(&predicted.flatten(0, 1).unwrap()).unwrap();
     let again = model.decode_frames(&again.flatten(0, 1).unwrap()).unwrap();
     let ahead = values(predicted.dims(), 0.5).to_dtype(frames.dtype()).unwrap();

@@ -16,6 +16,31 @@ fn squares(episodes: usize) -> Dataset {
     moving_squares(episodes, 12, 0.2)
 }
 
+#[test]
+fn a_resumed_flow_training_ends_with_the_same_bits() {
+    let small = [
+        "name=square",
+        "data.windows=40",
+        "data.validation_windows=4",
+        "fit.steps=12",
+        "fit.batch_size=4",
+        "model.flow={ channels = 8, stem_channels = 6, enlarged_channels = 3, fine_channels = 5, scene_hidden = 8 }",
+        "run.validate_every_steps=5",
+        "run.checkpoint_every_steps=4",
+        "run.warmup_steps=3",
+    ];
+    let settings: Vec<String> = small.iter().map(|&setting| setting.to_owned()).collect();
+    let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    let (unbroken, broken) = (dir.path().join("unbroken"), dir.path().join("broken"));
+    train(&config, &dataset, &unbroken).unwrap();
+    for updates in [2, 5] {
+        train_until(&config, &dataset, &broken, updates).unwrap();
+    }
+    train(&config, &dataset, &broken).unwrap();
+    assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
+}
+
 fn small_config(extra: &[&str]) -> TrainConfig {
     let small = [
         "name=square",

@@ -1,0 +1,191 @@
+//! The flow network: shapes, costs, independence of the batch, and what it refuses.
+
+use candle_core::{Device, Tensor};
+use foreframe::frame::warp::CameraModel;
+use foreframe::nn::{
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, FlowLayers, Model, ModelSpec, NnError, Parameters,
+};
+use foreframe::types::Seed;
+
+use crate::nn_fixtures::{condition, largest_difference, values};
+
+const CAMERA: CameraModel = CameraModel {
+    horizontal_fov_rad: 1.0,
+    tilt_down_rad: 0.2,
+};
+
+fn channel(name: &str, unit: &str) -> ChannelScale {
+    ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 0.1,
+        std: 0.5,
+    }
+}
+
+/// A small network for frames of 12×8 px.
+fn small(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
+    ModelSpec {
+        architecture: Architecture::Flow,
+        frame_width_px: 12,
+        frame_height_px: 8,
+        context: 3,
+        horizon: 2,
+        conditioning,
+        actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
+        states: vec![
+            channel("x", "m"),
+            channel("y", "m"),
+            channel("heading_cos", ""),
+            channel("heading_sin", ""),
+            channel("angular", "rad/s"),
+        ],
+        flow: Some(FlowLayers {
+            channels: 8,
+            stem_channels: 6,
+            enlarged_channels: 3,
+            fine_channels: 5,
+            scene_hidden: 8,
+            ..FlowLayers::default()
+        }),
+        camera,
+        ..ModelSpec::default()
+    }
+}
+
+fn kinds() -> Vec<ModelSpec> {
+    let mut kinds = Vec::new();
+    for conditioning in [Conditioning::None, Conditioning::Action, Conditioning::StateAction] {
+        kinds.extend([None, Some(CAMERA)].map(|camera| small(conditioning, camera)));
+    }
+    kinds
+}
+
+fn frames(spec: &ModelSpec, batch: usize) -> Tensor {
+    values(&[batch, spec.context, spec.pixels()], 0.3)
+        .affine(0.5, 0.5)
+        .unwrap()
+}
+
+#[test]
+fn every_kind_predicts_frames_and_trains_every_tensor() {
+    for spec in kinds() {
+        let parameters = Parameters::initialize(&spec, Seed(2)).unwrap();
+        // Layers that start at zero hide the gradients of those before them.
+        for (index, (_, var)) in parameters.iter().enumerate() {
+            let noise = (values(var.dims(), index as f32) * 0.05).unwrap();
+            var.set(&(var.as_detached_tensor() + noise).unwrap()).unwrap();
+        }
+        let model = Model::new(spec.clone(), &parameters).unwrap();
+        let predicted = model
+            .predict_flow(&frames(&spec, 2), &condition(&spec, 2))
+            .unwrap()
+            .unwrap();
+        let shape = [2, spec.horizon, spec.pixels()];
+        assert_eq!(
+            (predicted.frames.dims(), predicted.scene.dims()),
+            (&shape[..], &shape[..])
+        );
+        let squares = predicted.frames.sqr().unwrap().sum_all().unwrap();
+        let loss = (squares + predicted.motion.sqr().unwrap().sum_all().unwrap()).unwrap();
+        let gradients = loss.backward().unwrap();
+        for (name, var) in parameters.iter() {
+            let gradient = gradients
+                .get(var.as_tensor())
+                .unwrap_or_else(|| panic!("{name} has no gradient"));
+            let most = gradient.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            assert!(most.is_finite() && most > 0.0, "{name}: {most}");
+        }
+    }
+}
+
+#[test]
+fn a_future_does_not_depend_on_those_beside_it() {
+    for spec in kinds() {
+        let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+        let windows: Vec<u32> = (0..40).map(|row| row % 2).collect();
+        let (seen, told) = (frames(&spec, 2), condition(&spec, windows.len()));
+        let together = model.predict_futures(&seen, &windows, &told).unwrap();
+        for row in [0, 17, 39] {
+            let row_of = |tensor: &Tensor| tensor.narrow(0, row, 1).unwrap();
+            let told = ConditioningTensors {
+                actions: told.actions.as_ref().map(row_of),
+                state: told.state.as_ref().map(row_of),
+            };
+            let window = seen.narrow(0, windows[row] as usize, 1).unwrap();
+            let alone = model.predict_futures(&window, &[0], &told).unwrap();
+            assert!(largest_difference(&alone, &row_of(&together)) < 1e-6);
+        }
+    }
+}
+
+#[test]
+fn an_untrained_network_turns_the_last_frame_with_the_camera() {
+    let spec = small(Conditioning::StateAction, Some(CAMERA));
+    let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let mut told = condition(&spec, 1);
+    told.actions = Some(Tensor::new(&[[[0.0f32, 0.5], [0.0, 0.5]]], &Device::Cpu).unwrap());
+    told.state = Some(Tensor::new(&[[0.1f32, 0.1, 1.0, 0.0, 0.5]], &Device::Cpu).unwrap());
+    let motion = model.predict_flow(&frames(&spec, 1), &told).unwrap().unwrap().motion;
+    let yaw: Vec<f32> = motion
+        .narrow(2, 0, 1)
+        .unwrap()
+        .flatten_all()
+        .unwrap()
+        .to_vec1()
+        .unwrap();
+    assert!((yaw[0] - 0.1).abs() < 1e-6 && (yaw[1] - 0.2).abs() < 1e-6, "{yaw:?}");
+}
+
+#[test]
+fn the_cost_is_that_of_its_layers() {
+    let spec = small(Conditioning::None, None);
+    let parameters = Parameters::initialize(&spec, Seed(2)).unwrap();
+    assert_eq!(parameters.count(), spec.parameter_count());
+    // Stem 24 places; halving, four encoder layers 6; per step: mix, two layers, enlarge at 6, fine and head at 24.
+    let once = 24 * 9 * 18 * 6 + 6 * 9 * 6 * 8 + 4 * 6 * 9 * 8 * 8;
+    let each = 6 * (8 + 32) * 8 + 2 * 6 * 9 * 8 * 8 + 6 * 8 * 12 + 24 * 9 * (3 + 5 + 12) * 5 + 24 * 9 * 5 * 32;
+    let modulation = 2 * 64 + 64 * 32;
+    assert_eq!(
+        spec.multiply_adds_per_frame(),
+        (once as u64).div_ceil(2) + each + modulation
+    );
+}
+
+#[test]
+fn what_does_not_suit_the_network_is_refused_in_one_sentence() {
+    let refused = |change: &dyn Fn(&mut ModelSpec)| {
+        let mut spec = small(Conditioning::None, None);
+        change(&mut spec);
+        spec.validate().unwrap_err().to_string()
+    };
+    assert_eq!(
+        refused(&|spec| spec.frame_width_px = 10),
+        "model specification: frames are 10×8 px; each side must be a multiple of 4 from 4 to 256"
+    );
+    let camera = CameraModel {
+        horizontal_fov_rad: 4.0,
+        ..CAMERA
+    };
+    assert!(refused(&|spec| spec.camera = Some(camera)).starts_with("model specification: the camera model has"));
+    let flow = small(Conditioning::None, None);
+    let dense = ModelSpec {
+        architecture: Architecture::Dense,
+        ..flow.clone()
+    };
+    let weights = Parameters::initialize(&flow, Seed(1)).unwrap().snapshot().unwrap();
+    let error = Parameters::from_tensors(&dense, weights).unwrap_err();
+    assert!(matches!(error, NnError::OtherArchitecture { .. }), "{error}");
+}
+
+#[test]
+fn a_dense_specification_is_written_as_before() {
+    let text = serde_json::to_string(&ModelSpec::default()).unwrap();
+    assert!(
+        !text.contains("architecture") && !text.contains("flow") && !text.contains("camera"),
+        "{text}"
+    );
+    let spec = small(Conditioning::StateAction, Some(CAMERA));
+    let back: ModelSpec = serde_json::from_str(&serde_json::to_string(&spec).unwrap()).unwrap();
+    assert_eq!(back, spec);
+}
