@@ -105,7 +105,9 @@ impl<'a> BaselineInput<'a> {
         Self {
             inputs,
             previous_action: dataset.action(last.saturating_sub(1).max(window.first_frame)),
-            actions: (last..last + shape.horizon).map(|frame| dataset.action(frame)).collect(),
+            actions: (last..last + shape.horizon)
+                .map(|frame| dataset.action(frame))
+                .collect(),
             state: dataset.state(last),
         }
     }
@@ -133,7 +135,9 @@ impl Baselines {
     pub fn fit(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Self, EvaluationError> {
         let ego_motion = match CameraTurn::of(dataset.info()) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
-            None => AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?).map(EgoMotion::Flow),
+            None => {
+                AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?).map(EgoMotion::Flow)
+            }
         };
         let windows = training_windows(dataset, splits, shape)?;
         let nearest = TrainingWindows::new(dataset, &evenly(&windows, nearest::MAX_WINDOWS), shape);
@@ -271,7 +275,11 @@ mod tests {
     const SIDE: usize = 16;
 
     /// A data set of one-channel recordings in which every frame is given by time.
-    fn recordings(side: usize, frame: impl Fn(usize, usize) -> Vec<f32>, action: impl Fn(usize, usize) -> f32) -> Dataset {
+    fn recordings(
+        side: usize,
+        frame: impl Fn(usize, usize) -> Vec<f32>,
+        action: impl Fn(usize, usize) -> f32,
+    ) -> Dataset {
         let (episodes, frames) = (20, 12);
         let data = (0..episodes).map(|episode| EpisodeData {
             timestamps_s: (0..frames).map(|time| time as f64 * 0.2).collect(),
@@ -341,7 +349,12 @@ mod tests {
     #[test]
     fn every_baseline_is_right_on_a_still_scene() {
         let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
-        for method in fitted(&dataset).0.methods().iter().filter(|method| method.is_baseline()) {
+        for method in fitted(&dataset)
+            .0
+            .methods()
+            .iter()
+            .filter(|method| method.is_baseline())
+        {
             let error = error_of(*method, &dataset);
             assert!(error < 1e-6, "{method:?} {error}");
         }
@@ -396,7 +409,10 @@ mod tests {
             (0..32 * 32).map(at).collect()
         };
         let dataset = recordings(32, frame, pan);
-        let (warped, copied) = (error_of(Method::EgoMotion, &dataset), error_of(Method::CopyLast, &dataset));
+        let (warped, copied) = (
+            error_of(Method::EgoMotion, &dataset),
+            error_of(Method::CopyLast, &dataset),
+        );
         assert!(warped < 0.3 * copied, "{warped} {copied}");
     }
 
@@ -410,7 +426,10 @@ mod tests {
                 .collect()
         };
         let dataset = recordings(SIDE, frame, |_, _| 0.0);
-        let (moved, copied) = (error_of(Method::MovingCutOut, &dataset), error_of(Method::CopyLast, &dataset));
+        let (moved, copied) = (
+            error_of(Method::MovingCutOut, &dataset),
+            error_of(Method::CopyLast, &dataset),
+        );
         assert!(moved < 0.1 * copied, "{moved} {copied}");
     }
 

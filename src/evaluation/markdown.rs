@@ -2,11 +2,11 @@
 
 use std::fmt::Write;
 
+use super::Purpose;
 use super::actions::ActionTable;
 use super::baselines::Method;
 use super::bootstrap::{CONFIDENCE, Interval};
 use super::metrics::{MethodScores, PSNR_CAP_DB, StepCurve};
-use super::Purpose;
 use super::plans::PlanOutcome;
 use super::report::{EvaluationReport, ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 
@@ -299,8 +299,14 @@ fn how(out: &mut String) -> std::fmt::Result {
         (Method::CopyLast, "the last input frame, repeated"),
         (Method::MeanOfInputs, "the mean of the input frames"),
         (Method::MeanTrainingFrame, "the mean frame of the training split"),
-        (Method::LinearExtrapolation, "the least-squares line through each pixel's inputs, continued"),
-        (Method::ConstantShift, "the last frame moved on by the shift between the last two inputs (phase correlation)"),
+        (
+            Method::LinearExtrapolation,
+            "the least-squares line through each pixel's inputs, continued",
+        ),
+        (
+            Method::ConstantShift,
+            "the last frame moved on by the shift between the last two inputs (phase correlation)",
+        ),
         (
             Method::EgoMotion,
             "the last frame warped by the commanded rotation of the camera, through the data set's camera model; without \
@@ -312,8 +318,14 @@ fn how(out: &mut String) -> std::fmt::Result {
              the background; the background is the temporal median of the training split, or of the inputs where the \
              camera looks elsewhere; the true mask is not used",
         ),
-        (Method::NearestWindow, "the future of the training window (one of at most 15,000) whose inputs have the least MSE"),
-        (Method::CodecOnly, "the true future frame through the model's frame encoder and decoder; this is no prediction"),
+        (
+            Method::NearestWindow,
+            "the future of the training window (one of at most 15,000) whose inputs have the least MSE",
+        ),
+        (
+            Method::CodecOnly,
+            "the true future frame through the model's frame encoder and decoder; this is no prediction",
+        ),
     ] {
         writeln!(out, "- {}: {how}.", method.label())?;
     }

@@ -124,11 +124,7 @@ fn hann(len: usize) -> Vec<f32> {
 }
 
 /// Discrete Fourier transform of rows, then columns, in one direction; not scaled.
-fn transform_2d(
-    values: &mut [Complex32],
-    columns: usize,
-    plan: fn(&mut FftPlanner<f32>, usize) -> Arc<dyn Fft<f32>>,
-) {
+fn transform_2d(values: &mut [Complex32], columns: usize, plan: fn(&mut FftPlanner<f32>, usize) -> Arc<dyn Fft<f32>>) {
     let rows = values.len() / columns;
     let mut planner = FftPlanner::new();
     plan(&mut planner, columns).process(values);

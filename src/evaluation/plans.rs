@@ -101,7 +101,11 @@ pub fn identify(
         let repeated: Vec<Window> = part.iter().flat_map(|&context| [context; PLANS]).collect();
         let predicted = inference::predict(loaded, dataset, &repeated, ActionSource::OfWindows(&plans.concat()))?;
         let predicted = predicted.par_chunks_exact(PLANS * spec.horizon * spec.pixels());
-        identified.par_extend(predicted.zip(&futures).map(|(predicted, futures)| share_identified(spec, predicted, futures)));
+        identified.par_extend(
+            predicted
+                .zip(&futures)
+                .map(|(predicted, futures)| share_identified(spec, predicted, futures)),
+        );
         watched.report(EvaluationStage::Plans, identified.len(), contexts.len())?;
     }
     let trial_of: Vec<usize> = contexts.iter().map(|context| context.episode).collect();
@@ -170,9 +174,13 @@ fn share_identified(spec: &ModelSpec, predicted: &[f32], futures: &[Vec<f32>]) -
         .map(|frames| spec.preprocess.inverse(frames))
         .collect();
     let is_own = |(plan, future): &(usize, &Vec<f32>)| {
-        let own = predicted.get(*plan).map_or(f64::INFINITY, |own| quality::mse(own, future));
+        let own = predicted
+            .get(*plan)
+            .map_or(f64::INFINITY, |own| quality::mse(own, future));
         let others = predicted.iter().enumerate().filter(|(other, _)| other != plan);
-        others.map(|(_, other)| quality::mse(other, future)).all(|other| own < other)
+        others
+            .map(|(_, other)| quality::mse(other, future))
+            .all(|other| own < other)
     };
     futures.iter().enumerate().filter(is_own).count() as f64 / futures.len().max(1) as f64
 }
@@ -196,7 +204,11 @@ mod tests {
         let futures = [vec![0.1, 0.1], vec![0.5, 0.5], vec![0.9, 0.9]];
         assert_eq!(share_identified(&spec, &[0.1, 0.2, 0.5, 0.4, 0.8, 0.9], &futures), 1.0);
         assert!((share_identified(&spec, &[0.5, 0.5, 0.1, 0.1, 0.9, 0.9], &futures) - 1.0 / 3.0).abs() < 1e-9);
-        assert_eq!(share_identified(&spec, &[0.5; 6], &futures), 0.0, "equal predictions identify nothing");
+        assert_eq!(
+            share_identified(&spec, &[0.5; 6], &futures),
+            0.0,
+            "equal predictions identify nothing"
+        );
     }
 
     #[test]

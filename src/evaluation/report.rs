@@ -6,12 +6,12 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
-use super::bootstrap::{Bootstrap, TrialSums};
 use super::baselines::Method;
+use super::bootstrap::{Bootstrap, TrialSums};
 use super::figures::FigureFile;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
-use super::skill::{Skill, skill};
 use super::plans::PlanOutcome;
+use super::skill::{Skill, skill};
 use super::{EvaluateConfig, Purpose, markdown};
 use crate::dataset::{Dataset, Window};
 use crate::registry::{DatasetStamp, LoadedModel, ProgramStamp};

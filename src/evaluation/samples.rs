@@ -52,11 +52,7 @@ fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Resul
     let seen = sample.first_frame..sample.first_frame + spec.context;
     Ok(SampleFigure {
         name: sample.rank.clone(),
-        note: format!(
-            "{} window by error: MSE {:.1}e-4",
-            sample.rank,
-            sample.mse * 1e4
-        ),
+        note: format!("{} window by error: MSE {:.1}e-4", sample.rank, sample.mse * 1e4),
         reconstructed: Vec::new(),
         predicted: frames(loaded, &predict(loaded, dataset, &window, ActionSource::Recorded)?)?,
         truth: camera_frames(dataset, seen.end..seen.end + spec.horizon)?,

@@ -145,7 +145,11 @@ mod tests {
 
     #[test]
     fn the_interval_holds_the_estimate() {
-        let skill = skill(&Method::ALL, &windows(|difficulty| 0.02 * difficulty * difficulty), &BOOTSTRAP);
+        let skill = skill(
+            &Method::ALL,
+            &windows(|difficulty| 0.02 * difficulty * difficulty),
+            &BOOTSTRAP,
+        );
         let interval = skill.mean_interval.unwrap();
         assert!(interval.low < skill.skill.mean && skill.skill.mean < interval.high);
         assert_eq!(skill.per_step_interval.len(), 2);

@@ -155,7 +155,11 @@ mod tests {
     fn a_turn_to_the_left_shows_what_was_further_left() {
         let grid = rotation_grid(CAMERA, 8, 6, 0.3);
         let (columns, inside) = (grid.iter().map(|point| point[0]), inside(8, 6, &grid));
-        assert!(columns.zip(0..).all(|(column, index)| column < (index % 8) as f32 + 0.5));
+        assert!(
+            columns
+                .zip(0..)
+                .all(|(column, index)| column < (index % 8) as f32 + 0.5)
+        );
         assert!(!inside[0] && inside[7]);
     }
 
@@ -173,10 +177,17 @@ mod tests {
 
     #[test]
     fn an_impossible_camera_is_refused_in_one_sentence() {
-        for (fov, tilt) in [(0.0, 0.2), (3.2, 0.2), (f32::NAN, 0.2), (1.0, -1.6), (1.0, f32::INFINITY)] {
+        for (fov, tilt) in [
+            (0.0, 0.2),
+            (3.2, 0.2),
+            (f32::NAN, 0.2),
+            (1.0, -1.6),
+            (1.0, f32::INFINITY),
+        ] {
             assert!(CameraModel::new(fov, tilt).is_err(), "{fov} {tilt}");
         }
-        let error = serde_json::from_str::<CameraModel>(r#"{"horizontal_fov_rad": 4, "tilt_down_rad": 0.2}"#).unwrap_err();
+        let error =
+            serde_json::from_str::<CameraModel>(r#"{"horizontal_fov_rad": 4, "tilt_down_rad": 0.2}"#).unwrap_err();
         assert_eq!(
             error.to_string(),
             "the camera model has a field of view of 4 rad and a tilt of 0.2 rad; the field of view must be above 0 and \

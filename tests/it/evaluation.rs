@@ -126,7 +126,11 @@ fn validation_scores_are_of_the_validation_split_alone() {
     assert_eq!(sets, ["validation"]);
     let splits = Splits::new(&dataset, Seed(7));
     let samples = &report.scores("validation").unwrap().samples;
-    assert!(samples.iter().all(|sample| splits.episodes(Split::Validation).contains(&sample.episode)));
+    assert!(
+        samples
+            .iter()
+            .all(|sample| splits.episodes(Split::Validation).contains(&sample.episode))
+    );
     assert!(report.to_markdown().contains("Publish test scores"));
 }
 
@@ -182,8 +186,16 @@ fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
     let report = evaluate(&model, &dataset, &config()).unwrap();
     for set in &report.sets {
         let scores = set.outcome.scores().unwrap();
-        let ego_motion = scores.methods.iter().find(|row| row.method == Method::EgoMotion).unwrap();
-        assert!(ego_motion.mse.mean < scores.methods[1].mse.mean, "{}: copying is worse", set.split);
+        let ego_motion = scores
+            .methods
+            .iter()
+            .find(|row| row.method == Method::EgoMotion)
+            .unwrap();
+        assert!(
+            ego_motion.mse.mean < scores.methods[1].mse.mean,
+            "{}: copying is worse",
+            set.split
+        );
         let Some(PlanOutcome::Measured(plans)) = &scores.plans else {
             panic!("plans of {}: {:?}", set.split, scores.plans)
         };

@@ -48,7 +48,10 @@ fn a_rotation_warp_shows_what_the_turned_camera_sees() {
             assert!(seen_twice(&after).len() > 64 * 48 / 3);
             let error = mse(&seen_twice(&warped), &seen_twice(&after));
             let unmoved = mse(&seen_twice(&before), &seen_twice(&after));
-            assert!(error < 5e-4 && error < 0.1 * unmoved, "{yaw_rad} {tilt_down_rad}: {error} {unmoved}");
+            assert!(
+                error < 5e-4 && error < 0.1 * unmoved,
+                "{yaw_rad} {tilt_down_rad}: {error} {unmoved}"
+            );
         }
     }
 }

@@ -166,9 +166,7 @@ impl AffineFlow {
                 }
                 let right = f64::from(warped[pixel + 1] - warped[pixel - 1]) / 2.0;
                 let down = f64::from(warped[pixel + self.width] - warped[pixel - self.width]) / 2.0;
-                let [x, y] = self
-                    .normalized([column as f32 + 0.5, row as f32 + 0.5])
-                    .map(f64::from);
+                let [x, y] = self.normalized([column as f32 + 0.5, row as f32 + 0.5]).map(f64::from);
                 let slope = [right, right * x, right * y, down, down * x, down * y];
                 let error = f64::from(target[pixel] - warped[pixel]);
                 for (i, sums) in own.iter_mut().enumerate() {
@@ -191,9 +189,16 @@ fn spread(dataset: &Dataset, pairs: &[Window]) -> (Vec<f64>, Vec<f64>) {
     let mean_of = |channel: usize, value: &dyn Fn(f64) -> f64| {
         actions().map(|action| value(f64::from(action[channel]))).sum::<f64>() / pairs.len().max(1) as f64
     };
-    let mean: Vec<f64> = channels.clone().map(|channel| mean_of(channel, &|value| value)).collect();
+    let mean: Vec<f64> = channels
+        .clone()
+        .map(|channel| mean_of(channel, &|value| value))
+        .collect();
     let scale = channels
-        .map(|channel| mean_of(channel, &|value| (value - mean[channel]).powi(2)).sqrt().max(1e-6))
+        .map(|channel| {
+            mean_of(channel, &|value| (value - mean[channel]).powi(2))
+                .sqrt()
+                .max(1e-6)
+        })
         .collect();
     (mean, scale)
 }

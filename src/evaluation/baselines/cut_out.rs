@@ -113,7 +113,11 @@ impl CutOut {
             slope[0] += time * centre[0];
             slope[1] += time * centre[1];
         }
-        if spread > 0.0 { slope.map(|sum| sum / spread) } else { [0.0, 0.0] }
+        if spread > 0.0 {
+            slope.map(|sum| sum / spread)
+        } else {
+            [0.0, 0.0]
+        }
     }
 
     /// The background with the object drawn where it has moved to.
@@ -258,7 +262,11 @@ mod tests {
         for (step, predicted) in cut_out.predict(&inputs, 3).iter().enumerate() {
             let truth = scene(2 + 2 * (4 + step), 3 + 4 + step);
             // The pixels around the object bring a little of the old background along.
-            let worst = predicted.iter().zip(&truth).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let worst = predicted
+                .iter()
+                .zip(&truth)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f32::max);
             assert!(worst < 0.1, "{worst}");
         }
     }

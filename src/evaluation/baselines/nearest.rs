@@ -93,7 +93,10 @@ fn shrunk(frame: &[f32], width: usize) -> Vec<f32> {
     let height = frame.len() / width;
     let block = |index: usize, side: usize| {
         let start = index * side / SMALL_SIDE;
-        start..((index + 1) * side / SMALL_SIDE).max(start + 1).min(side.max(start + 1))
+        start
+            ..((index + 1) * side / SMALL_SIDE)
+                .max(start + 1)
+                .min(side.max(start + 1))
     };
     let mut small = Vec::with_capacity(SMALL_SIDE * SMALL_SIDE);
     for row in 0..SMALL_SIDE {
@@ -148,7 +151,10 @@ mod tests {
     #[test]
     fn distances_are_sums_of_squares() {
         let one: Vec<f32> = (0..37).map(|i| i as f32).collect();
-        assert_eq!(squared_distance(&one, &vec![0.0; 37]), (0..37).map(|i| (i * i) as f32).sum::<f32>());
+        assert_eq!(
+            squared_distance(&one, &vec![0.0; 37]),
+            (0..37).map(|i| (i * i) as f32).sum::<f32>()
+        );
         assert_eq!(squared_byte_distance(&[0, 255, 3], &[255, 0, 1]), 2 * 255 * 255 + 4);
     }
 }

@@ -6,7 +6,10 @@ use crate::frame::{Frame, FrameError, codec};
 /// Frames as an endless GIF, enlarged to at least [`super::montage::CELL_WIDTH_PX`]. Errors: `Size` if a frame gets too
 /// large.
 pub fn enlarged_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
-    let frames = frames.iter().map(enlarged).collect::<Result<Vec<Frame>, FrameError>>()?;
+    let frames = frames
+        .iter()
+        .map(enlarged)
+        .collect::<Result<Vec<Frame>, FrameError>>()?;
     codec::encode_gif(&frames, delay_ms)
 }
 

@@ -88,7 +88,10 @@ pub fn enlarged(frame: &Frame) -> Result<Frame, FrameError> {
     }
     let mut pixels = Vec::with_capacity(width * height * scale * scale);
     for row in frame.pixels().chunks_exact(width) {
-        let wide: Vec<u8> = row.iter().flat_map(|&value| std::iter::repeat_n(value, scale)).collect();
+        let wide: Vec<u8> = row
+            .iter()
+            .flat_map(|&value| std::iter::repeat_n(value, scale))
+            .collect();
         for _ in 0..scale {
             pixels.extend_from_slice(&wide);
         }
@@ -112,7 +115,10 @@ pub(super) fn prediction_panel(
     let mut rows = wrapped("inputs", seen, 1 - seen.len() as i64);
     let truth = &truth[..truth.len().min(predicted.len())];
     for (part, first) in predicted.chunks(ROW_CELLS).zip((1..).step_by(ROW_CELLS)) {
-        let known = truth.chunks(ROW_CELLS).nth((first - 1) as usize / ROW_CELLS).unwrap_or_default();
+        let known = truth
+            .chunks(ROW_CELLS)
+            .nth((first - 1) as usize / ROW_CELLS)
+            .unwrap_or_default();
         if !known.is_empty() {
             rows.push(MontageRow::in_time("truth", known, first));
         }
@@ -143,9 +149,15 @@ fn error_row(predicted: &[Frame], truth: &[Frame]) -> Result<MontageRow, FrameEr
             .zip(truth.pixels())
             .map(|(&predicted, &truth)| predicted.abs_diff(truth))
             .collect();
-        let squares: f64 = differences.iter().map(|&value| (f64::from(value) / 255.0).powi(2)).sum();
+        let squares: f64 = differences
+            .iter()
+            .map(|&value| (f64::from(value) / 255.0).powi(2))
+            .sum();
         let mse = squares / differences.len().max(1) as f64;
-        let pixels = differences.iter().map(|value| value.saturating_mul(ERROR_GAIN)).collect();
+        let pixels = differences
+            .iter()
+            .map(|value| value.saturating_mul(ERROR_GAIN))
+            .collect();
         let frame = Frame::new(predicted.width(), predicted.height(), pixels)?;
         Ok((format!("MSE {:.1}e-4", mse * 1e4), frame))
     });
@@ -338,8 +350,14 @@ mod tests {
         let frame = Frame::new(3, 2, vec![1, 2, 3, 4, 5, 6]).unwrap();
         let large = enlarged(&frame).unwrap();
         assert_eq!((large.width(), large.height()), (258, 172));
-        assert_eq!((large.pixels()[85], large.pixels()[86], large.pixels()[258 * 86]), (1, 2, 4));
-        assert_eq!(enlarged(&Frame::new(300, 1, vec![0; 300]).unwrap()).unwrap().width(), 300);
+        assert_eq!(
+            (large.pixels()[85], large.pixels()[86], large.pixels()[258 * 86]),
+            (1, 2, 4)
+        );
+        assert_eq!(
+            enlarged(&Frame::new(300, 1, vec![0; 300]).unwrap()).unwrap().width(),
+            300
+        );
     }
 
     #[test]
