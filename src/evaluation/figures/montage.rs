@@ -159,10 +159,10 @@ fn error_row(predicted: &[Frame], truth: &[Frame]) -> Result<MontageRow, FrameEr
             .map(|value| value.saturating_mul(ERROR_GAIN))
             .collect();
         let frame = Frame::new(predicted.width(), predicted.height(), pixels)?;
-        Ok((format!("MSE {:.1}e-4", mse * 1e4), frame))
+        Ok((format!("{:.1}e-4", mse * 1e4), frame))
     });
     Ok(MontageRow {
-        label: format!("error, {ERROR_GAIN} times as bright"),
+        label: format!("error, {ERROR_GAIN} times as bright, with its MSE"),
         cells: cells.collect::<Result<_, FrameError>>()?,
     })
 }
