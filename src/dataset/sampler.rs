@@ -104,8 +104,11 @@ impl Splits {
             segments: Default::default(),
             max_step_s: GAP_PERIODS * median_period_s(dataset),
         };
-        let trials: Option<Vec<&TrialParameters>> =
-            dataset.episodes().iter().map(|episode| episode.trial.as_ref()).collect();
+        let trials: Option<Vec<&TrialParameters>> = dataset
+            .episodes()
+            .iter()
+            .map(|episode| episode.trial.as_ref())
+            .collect();
         match trials {
             Some(trials) => {
                 for (episode, trial) in dataset.episodes().iter().zip(trials) {

@@ -93,7 +93,9 @@ pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) 
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
     let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
-    let features = model.encode_frames(&frames)?.reshape((batch, context, spec.code_len()))?;
+    let features = model
+        .encode_frames(&frames)?
+        .reshape((batch, context, spec.code_len()))?;
     let Some(features) = model.reconstruct(&features)? else {
         return Ok(Vec::new());
     };

@@ -99,7 +99,11 @@ fn score_window(
         })
         .collect();
     let seen_here = place * spec.context * pixels..(place + 1) * spec.context * pixels;
-    let reconstructed = predicted.reconstructed.get(seen_here).unwrap_or_default().chunks_exact(pixels);
+    let reconstructed = predicted
+        .reconstructed
+        .get(seen_here)
+        .unwrap_or_default()
+        .chunks_exact(pixels);
     let own = predicted.frames[here.clone()].chunks_exact(pixels);
     let own_truth = predicted.truth[here.clone()].chunks_exact(pixels);
     WindowScores {

@@ -51,7 +51,12 @@ impl ConditioningTensors {
     pub(super) fn raw(&self, spec: &ModelSpec, batch: usize) -> Result<(Vec<f32>, Vec<f32>), NnError> {
         let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
         let actions = match spec.action_inputs() {
-            Some(count) => values(checked(spec, "actions", self.actions.as_ref(), &[batch, spec.horizon, count])?)?,
+            Some(count) => values(checked(
+                spec,
+                "actions",
+                self.actions.as_ref(),
+                &[batch, spec.horizon, count],
+            )?)?,
             None => Vec::new(),
         };
         let state = match spec.state_inputs() {

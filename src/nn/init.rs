@@ -17,9 +17,12 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
     let count = shape.iter().product();
     let (layer, part) = name.rsplit_once('.').unwrap_or(("", name));
     let values = match (part, shape) {
-        ("weight", &[inputs, outputs]) if layer.starts_with("flow.") => {
-            uniform(count, flow_gain(layer) * (6.0 / (inputs + outputs) as f32).sqrt(), name, seed)
-        }
+        ("weight", &[inputs, outputs]) if layer.starts_with("flow.") => uniform(
+            count,
+            flow_gain(layer) * (6.0 / (inputs + outputs) as f32).sqrt(),
+            name,
+            seed,
+        ),
         _ if layer.starts_with("flow.") => vec![0.0; count],
         ("bias", &[gates]) if is_lstm(name) => lstm_bias(gates),
         ("bias", _) => vec![0.0; count],

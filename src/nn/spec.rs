@@ -313,12 +313,17 @@ impl ModelSpec {
             return Ok(None);
         }
         let (batch, time, count) = later.dims3()?;
-        let (now, later) = (state.flatten_all()?.to_vec1::<f32>()?, later.flatten_all()?.to_vec1::<f32>()?);
+        let (now, later) = (
+            state.flatten_all()?.to_vec1::<f32>()?,
+            later.flatten_all()?.to_vec1::<f32>()?,
+        );
         let windows = now.chunks_exact(count).zip(later.chunks_exact(time * count));
         let motions: Vec<f32> = windows
             .flat_map(|(now, later)| {
                 let now = channels.pose_in(now);
-                later.chunks_exact(count).flat_map(move |later| now.motion_to(channels.pose_in(later)))
+                later
+                    .chunks_exact(count)
+                    .flat_map(move |later| now.motion_to(channels.pose_in(later)))
             })
             .collect();
         Ok(Some(Tensor::from_vec(motions, (batch, time, 3), &Device::Cpu)?))
@@ -326,7 +331,11 @@ impl ModelSpec {
 
     /// The state scaled for the network.
     pub(super) fn scaled_state(&self, state: &[f32]) -> Vec<f32> {
-        state.iter().zip(&self.states).map(|(value, channel)| channel.scaled(*value)).collect()
+        state
+            .iter()
+            .zip(&self.states)
+            .map(|(value, channel)| channel.scaled(*value))
+            .collect()
     }
 
     /// Number of action components that the predictor gets; `None` if the conditioning does not include actions.

@@ -96,7 +96,10 @@ mod tests {
     #[test]
     fn the_error_for_an_unknown_preset_lists_the_presets() {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
-        assert_eq!(error, "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow");
+        assert_eq!(
+            error,
+            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow"
+        );
     }
 
     #[test]
