@@ -158,7 +158,7 @@ impl SettingsLayer {
 
 #[expect(clippy::expect_used, reason = "keys, structures and TOML tables always give a table")]
 fn table(values: Option<Dict>) -> Dict {
-    values.expect("settings that are not a table are a bug")
+    values.expect("settings without a table is a bug")
 }
 
 /// A single TOML value.

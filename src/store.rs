@@ -28,6 +28,10 @@ const DATABASE_FILE: &str = "foreframe.db";
 const WRITE_CHECK_LIMIT: Duration = Duration::from_secs(2);
 /// How long a successful write check is valid.
 const WRITE_CHECK_INTERVAL: Duration = Duration::from_secs(1);
+/// The file that a write check writes.
+const WRITE_PROBE: &str = "write-check";
+/// Its size: more than what is left in blocks that a full file system has already given out.
+const PROBE_BYTES: usize = 16 << 10;
 /// The file in the data directory that says that API keys were created.
 const KEYS_MARKER: &str = "api-keys-created";
 
@@ -166,7 +170,7 @@ impl Store {
         })
     }
 
-    /// Checks that the database can be written, by a write at most once a second. Errors: `Query`.
+    /// Checks that the database and the data directory can be written, by a write at most once a second. Errors: `Query`, `Io`.
     pub async fn check_writable(&self) -> Result<(), StoreError> {
         let mut last = self.last_write_check.lock().await;
         if last.is_some_and(|last| last.elapsed() < WRITE_CHECK_INTERVAL) {
@@ -179,6 +183,13 @@ impl Store {
     }
 
     async fn write_nothing(&self) -> Result<(), StoreError> {
+        let probe = self.objects.data_dir().join(WRITE_PROBE);
+        let written = probe.clone();
+        let write = move || crate::files::write_atomically(&written, &[0; PROBE_BYTES]);
+        let written = tokio::task::spawn_blocking(write).await;
+        written
+            .unwrap_or_else(|panic| Err(std::io::Error::other(panic)))
+            .map_err(StoreError::io("write", &probe))?;
         let mut tx = self.database.begin().await?;
         tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
             .await?;

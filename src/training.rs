@@ -20,7 +20,7 @@ use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
 use self::checkpoint::{Checkpoint, RunFiles};
 #[cfg(test)]
-pub(crate) use self::checkpoint::{hash_entry, seal};
+pub(crate) use self::checkpoint::{seal, state_entry};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};

@@ -21,7 +21,7 @@ const LISTED_ITEMS: usize = 10;
 #[command(after_help = "Examples:
   foreframe import ~/mycar/data --name mycar --every 4
   foreframe import frames/ --name walk --rate 10
-  foreframe import frames/ --csv log.csv --action speed --action turn --unit speed=m/s --unit turn=rad/s
+  foreframe import frames/ --csv log.csv --action speed --action turn --unit turn=rad/s
   foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
 then
   foreframe inspect mycar

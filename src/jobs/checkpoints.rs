@@ -52,15 +52,15 @@ mod tests {
 
     use super::*;
     use crate::store::{Store, StoreConfig};
-    use crate::training::{hash_entry, seal};
+    use crate::training::{seal, state_entry};
 
     const RUN: &str = "runs/job-1";
 
     /// Writes a checkpoint of that stage and step into the run below a directory.
     fn write(root: &Path, stage: &str, step: usize) {
         let state = serde_json::json!({"stage": stage, "step": step}).to_string();
-        let (key, zeros) = hash_entry();
-        let header = serde_json::json!({"__metadata__": {"foreframe.training": state, key: zeros}}).to_string();
+        let (key, entry) = state_entry(&state);
+        let header = serde_json::json!({"__metadata__": {key: entry}}).to_string();
         let bytes = [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat();
         std::fs::create_dir_all(root.join(RUN)).unwrap();
         std::fs::write(root.join(RUN).join(CHECKPOINT_FILE), seal(bytes)).unwrap();

@@ -76,6 +76,12 @@ impl Model {
         Ok(Self { spec, network })
     }
 
+    /// The same network with a description that may not fit it, to test failures.
+    #[cfg(test)]
+    pub(crate) fn with_spec(self, spec: ModelSpec) -> Self {
+        Self { spec, ..self }
+    }
+
     /// The model's dimensions and meaning.
     #[must_use]
     pub fn spec(&self) -> &ModelSpec {

@@ -112,7 +112,7 @@ impl Modify for Examples {
     )]
     fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
         let mut examples: BTreeMap<String, PathExample> =
-            serde_json::from_str(EXAMPLES).expect("examples that are not JSON are a bug");
+            serde_json::from_str(EXAMPLES).expect("an example that is not JSON is a bug");
         for (path, item) in &mut contract.paths.paths {
             let example = examples.remove(path);
             let model = example.as_ref().and_then(|example| example.model.as_deref());

@@ -163,7 +163,9 @@ mod tests {
             ..model.model.spec().clone()
         };
         LoadedModel {
-            model: Model::detached(spec, &parameters).unwrap(),
+            model: Model::detached(model.model.spec().clone(), &parameters)
+                .unwrap()
+                .with_spec(spec),
             ..model
         }
     }

@@ -20,11 +20,10 @@ use crate::nn::{ModelSpec, Parameters};
 pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
 /// The checkpoint before it. A training resumes from this one if the latest is damaged.
 const PREVIOUS_FILE: &str = "checkpoint.previous.safetensors";
-/// The key of the file's SHA-256 in its metadata. The hash is computed with zeros in its own place.
-const HASH_KEY: &str = "foreframe.sha256";
 /// The length of a SHA-256 in hexadecimal digits.
 const HASH_LENGTH: usize = 64;
-/// Key of the training state in the file's metadata.
+/// Key of the training state in the file's metadata: the file's SHA-256, a space, and the state as JSON. The hash is computed
+/// with zeros in its own place. Both are in one entry, because the order of entries is random.
 const META_KEY: &str = "foreframe.training";
 /// Name of the file with the hash of the training data.
 const DATA_FILE: &str = "dataset.sha256";
@@ -162,7 +161,7 @@ impl CheckpointPosition {
             return None;
         }
         let (_, header) = SafeTensors::read_metadata(checkpoint).ok()?;
-        serde_json::from_str(header.metadata().as_ref()?.get(META_KEY)?).ok()
+        serde_json::from_str(state_text(header.metadata().as_ref()?.get(META_KEY)?)?).ok()
     }
 }
 
@@ -170,7 +169,7 @@ impl CheckpointPosition {
 fn hash_range(checkpoint: &[u8]) -> Option<std::ops::Range<usize>> {
     let length = u64::from_le_bytes(*checkpoint.first_chunk::<8>()?);
     let header = checkpoint.get(8..usize::try_from(length).ok()?.checked_add(8)?)?;
-    let key = format!("\"{HASH_KEY}\":\"");
+    let key = format!("\"{META_KEY}\":\"");
     let start = header.windows(key.len()).position(|part| part == key.as_bytes())? + 8 + key.len();
     let range = start..start + HASH_LENGTH;
     checkpoint.get(range.clone()).map(|_| range)
@@ -202,9 +201,14 @@ pub(crate) fn seal(mut checkpoint: Vec<u8>) -> Vec<u8> {
     checkpoint
 }
 
-/// The metadata entry that [`seal`] fills.
-pub(crate) fn hash_entry() -> (String, String) {
-    (HASH_KEY.to_owned(), "0".repeat(HASH_LENGTH))
+/// The metadata entry of a training state, with zeros for the hash that [`seal`] fills in.
+pub(crate) fn state_entry(state: &str) -> (String, String) {
+    (META_KEY.to_owned(), format!("{} {state}", "0".repeat(HASH_LENGTH)))
+}
+
+/// The JSON text in a [`state_entry`].
+fn state_text(entry: &str) -> Option<&str> {
+    entry.get(HASH_LENGTH + 1..)
 }
 
 /// A training state that was read from disk.
@@ -238,7 +242,7 @@ impl Checkpoint {
             .chain(prefixed(BEST, state.best.clone()))
             .chain(prefixed(OPTIMIZER, state.optimizer.export()?))
             .collect();
-        let metadata = HashMap::from([(META_KEY.to_owned(), text), hash_entry()]);
+        let metadata = HashMap::from([state_entry(&text)]);
         let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(error.to_string()))?;
         let previous = files.previous_checkpoint();
         // If the process is killed between the two, the previous one is the latest.
@@ -282,7 +286,7 @@ impl Checkpoint {
         let text = header
             .metadata()
             .as_ref()
-            .and_then(|metadata| metadata.get(META_KEY))
+            .and_then(|metadata| state_text(metadata.get(META_KEY)?))
             .ok_or_else(|| failed("it contains no training state".to_owned()))?;
         let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
         if meta.fingerprint != files.fingerprint() {
@@ -326,10 +330,7 @@ mod tests {
     #[test]
     fn one_flipped_bit_damages_a_checkpoint() {
         let tensor = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu).unwrap();
-        let metadata = HashMap::from([
-            (META_KEY.to_owned(), r#"{"stage":"fit","step":7}"#.to_owned()),
-            hash_entry(),
-        ]);
+        let metadata = HashMap::from([state_entry(r#"{"stage":"fit","step":7}"#)]);
         let bytes = seal(safetensors::serialize([("a", tensor)], Some(metadata)).unwrap());
         assert_eq!(CheckpointPosition::of(&bytes).map(|reached| reached.step), Some(7));
         for index in 0..bytes.len() {

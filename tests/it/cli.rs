@@ -67,7 +67,10 @@ fn usage_errors_exit_with_2_and_advice() {
             "collect --noise nan --out a",
             "noise_std is NaN; it must be a finite number from 0 to 1",
         ),
-        ("collect --trials 4 --frame-size 8", "trials: 3 there, 4 asked"),
+        (
+            "collect --trials 4 --frame-size 8",
+            "trials: 3 in the directory, 4 requested",
+        ),
         (
             "collect --out thesis",
             "thesis exists and is not a collection; use a directory that does not exist",

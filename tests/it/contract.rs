@@ -203,6 +203,7 @@ async fn every_example_of_the_contract_succeeds() {
     let app = App::open(config).await.unwrap();
     let contract = get(&app, "/openapi.json").await.json();
     let mut ids = BTreeMap::new();
+    let mut token: Option<String> = None;
     let mut bodies = 0;
     // The order of paths lets `/v1/sessions` create what `/v1/sessions/{id}/rollouts` needs.
     for (path, methods) in contract["paths"].as_object().unwrap() {
@@ -218,6 +219,10 @@ async fn every_example_of_the_contract_succeeds() {
         let resource = path.split('/').nth(2).unwrap();
         let id = ids.get(resource).map_or("", String::as_str);
         let address = path.replace("{model}", model).replace("{id}", id);
+        let address = match (resource, &token) {
+            ("sessions", Some(token)) => format!("{address}?token={token}"),
+            _ => address,
+        };
         let answer = post(&app, &address, &content["application/json"]["example"]).await;
         let text = String::from_utf8_lossy(&answer.body).into_owned();
         // A new session has no frames yet; the contract says so.
@@ -228,6 +233,7 @@ async fn every_example_of_the_contract_succeeds() {
             assert!(answer.status.is_success(), "{path}: {text}");
             if let Some(id) = answer.json()["id"].as_str() {
                 ids.insert(resource.to_owned(), id.to_owned());
+                token = token.or_else(|| answer.json()["token"].as_str().map(str::to_owned));
             }
         }
         bodies += 1;

@@ -228,7 +228,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
         delete(&app, "/v1/models/plain/versions/1")
             .await
             .detail(409)
-            .contains("was shipped")
+            .contains("was not published")
     );
     assert_eq!(delete(&app, "/v1/models/plain/versions/4").await.status, 204);
     assert!(!weights(4).exists());
@@ -273,7 +273,10 @@ async fn files_of_a_cancelled_collection_can_be_deleted() {
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
     becomes(&|job| job["state"] == "cancelled").await;
     let occupied = post(&app, JOBS, &collect(2)).await.detail(409);
-    assert!(occupied.contains("trials: 100000 there, 2 asked"), "{occupied}");
+    assert!(
+        occupied.contains("trials: 100000 in the directory, 2 requested"),
+        "{occupied}"
+    );
     assert_eq!(delete(&app, "/v1/datasets/d").await.status, 204);
     assert_eq!(std::fs::read_dir(dir.path().join("datasets")).unwrap().count(), 0);
     run_job(&app, &collect(2)).await;

@@ -86,7 +86,7 @@ async fn an_incomplete_body_is_answered_408() {
         let answer = setup
             .while_robot_streams(send_and_read(address, &[half.as_bytes()]))
             .await;
-        assert_problem(&answer, 408, "over 200 ms");
+        assert_problem(&answer, 408, "longer than 200 ms");
     }
     let gone = async { connect(address).await.write_all(length.as_bytes()).await.unwrap() };
     setup.while_robot_streams(gone).await;

@@ -149,7 +149,7 @@ fn a_non_finite_gradient_or_loss_changes_nothing() {
     let error = adam.update(&parameters, &gradients, RATE).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "the gradient of tensor \"frame_decoder.bias\" is not finite"
+        "the gradient of tensor \"frame_decoder.bias\" contains a value that is not a finite number"
     );
     assert_eq!((all_bits(&parameters), adam.steps()), (before, 0));
 }

@@ -251,7 +251,7 @@ fn the_configuration_is_printed_with_its_sources() {
         .unwrap();
     let printed = text(&printed.stdout);
     for line in [
-        "# Streams at a time; more are answered 503.",
+        "# Maximum number of streams; more are refused with 503.",
         "max_streams = 7  # foreframe.toml; 1 to 1000000",
         "max_batch = 9  # environment FOREFRAME_MAX_BATCH; 1 to 4096",
         "data_dir = \"here\"  # --data-dir",

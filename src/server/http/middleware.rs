@@ -41,8 +41,10 @@ impl RequestTrace {
 /// Makes ids for requests that have none: the start time of the server, and a count.
 struct RequestIds {
     started: u64,
-    next: AtomicU64,
 }
+
+/// The count is one per process: routers of the same process give different ids.
+static NEXT_ID: AtomicU64 = AtomicU64::new(1);
 
 impl RequestIds {
     fn new() -> Self {
@@ -50,7 +52,6 @@ impl RequestIds {
         Self {
             // A clock before 1970 gives the time 0: ids then are still unique within this process.
             started: since_1970.map_or(0, |time| time.as_secs()),
-            next: AtomicU64::new(1),
         }
     }
 
@@ -61,7 +62,7 @@ impl RequestIds {
         let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok());
         match given.filter(|id| (1..=MAX_ID_LEN).contains(&id.len()) && id.bytes().all(allowed)) {
             Some(id) => id.to_owned(),
-            None => format!("{:x}-{}", self.started, self.next.fetch_add(1, Ordering::Relaxed)),
+            None => format!("{:x}-{}", self.started, NEXT_ID.fetch_add(1, Ordering::Relaxed)),
         }
     }
 }

@@ -25,8 +25,7 @@ async fn livez() -> axum::Json<Health> {
     axum::Json(Health { status: "alive" })
 }
 
-/// Tells whether the server is ready: there is a model, every model has made its first prediction, the store can be
-/// written, and the server is not stopping.
+/// Tells whether the server is ready: every model has made its first prediction, the store can be written, and the server is not stopping.
 #[utoipa::path(
     get, path = "/readyz", tag = "health",
     responses((status = 200, body = Health), (status = 503, description = "Not ready", body = Problem))
@@ -34,9 +33,6 @@ async fn livez() -> axum::Json<Health> {
 async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> {
     if app.is_draining() {
         return Err(ApiError::unavailable("the server is stopping"));
-    }
-    if let Some(advice) = app.no_model_advice() {
-        return Err(ApiError::unavailable(advice));
     }
     if !app.predictor().is_ready() {
         return Err(ApiError::unavailable("the models are warming up"));
