@@ -6,7 +6,6 @@ use super::TrainError;
 use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
-use crate::frame::warp::CameraModel;
 use crate::nn::loss::Loss;
 use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, Reconstruction};
 use crate::types::{Channel, Seed};
@@ -63,9 +62,6 @@ pub struct ModelConfig {
     /// Layer sizes of the flow network.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flow: Option<FlowLayers>,
-    /// The camera model; it replaces the data set's. Only the flow network uses it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub camera: Option<CameraModel>,
 }
 
 fn default_features() -> usize {
@@ -316,7 +312,7 @@ impl TrainConfig {
             actions,
             states,
             flow: is_flow.then(|| model.flow.unwrap_or_default()),
-            camera: model.camera.or(info.camera).filter(|_| is_flow),
+            camera: info.camera.filter(|_| is_flow),
         }
     }
 }

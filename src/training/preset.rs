@@ -44,12 +44,23 @@ impl TrainConfig {
             .iter()
             .find(|(name, _)| *name == preset)
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
-        let defaults = SettingsLayer::toml(format!("preset {preset}"), text).map_err(config_error)?;
-        let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(config_error)?;
-        let config: Self = values.extract(expected).map_err(config_error)?;
+        let origin = format!("preset {preset}");
+        let written = SettingsLayer::toml(&origin, text).map_err(config_error)?;
+        let written: Self = extract(written, [])?;
+        // With the settings that the preset's text leaves out, so that they can be given too.
+        let defaults = SettingsLayer::serialized(origin, &written);
+        let config: Self = extract(defaults, layers)?;
         config.validate()?;
         Ok(config)
     }
+}
+
+fn extract(
+    defaults: SettingsLayer,
+    layers: impl IntoIterator<Item = SettingsLayer>,
+) -> Result<TrainConfig, TrainError> {
+    let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(config_error)?;
+    values.extract(expected).map_err(config_error)
 }
 
 /// What a setting must be, where its type does not say it well.
@@ -71,6 +82,15 @@ mod tests {
     fn every_preset_is_valid_and_named_as_its_file() {
         for name in TrainConfig::preset_names() {
             assert_eq!(TrainConfig::preset(name).unwrap().name, name);
+        }
+    }
+
+    #[test]
+    fn a_printed_configuration_is_accepted_again() {
+        for name in TrainConfig::preset_names() {
+            let config = TrainConfig::preset(name).unwrap();
+            let again = TrainConfig::layered(name, Some(&config.to_toml().unwrap()), &[]).unwrap();
+            assert_eq!(again, config);
         }
     }
 
