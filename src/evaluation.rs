@@ -30,12 +30,12 @@ pub use self::output::{prepare, write};
 pub use self::report::EvaluationReport;
 pub use self::samples::figure_inputs;
 
-use self::baselines::Baselines;
+use self::baselines::{Baselines, Method};
 use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, Window};
-use crate::nn::ModelSpec;
+use crate::nn::{Architecture, ModelSpec};
 use crate::registry::LoadedModel;
 use crate::types::Seed;
 
@@ -207,7 +207,12 @@ pub fn run(
             split_seed: split_seed.0,
         });
     }
-    let baselines = Baselines::fit(dataset, &splits, window_shape(loaded.model.spec()))?;
+    let spec = loaded.model.spec();
+    let mut baselines = Baselines::fit(dataset, &splits, window_shape(spec))?;
+    if spec.architecture == Architecture::Flow {
+        // Its codes are the frames themselves, so there is no codec to measure.
+        baselines = baselines.without(Method::CodecOnly);
+    }
     let mut sets = Vec::new();
     for &split in tests {
         let watched = EvaluationContext {

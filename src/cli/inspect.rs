@@ -7,7 +7,7 @@ use super::workspace::Workspace;
 use super::{CliError, print_line};
 use crate::dataset::{self, Dataset, DatasetInfo};
 use crate::error_text::{comma_separated, existing};
-use crate::nn::{ChannelScale, ModelSpec, costs};
+use crate::nn::{Architecture, ChannelScale, ModelSpec, costs};
 use crate::registry::{self, Manifest};
 
 /// Describe a model or a data set.
@@ -69,19 +69,7 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
         conditions(spec)
     ))?;
     print_line(format!("  predicts    the {} frames that follow", spec.horizon))?;
-    print_line(format!(
-        "  network     dense {} → LSTM {} → dense {}; conditioning {}, reconstruction {}, {}",
-        spec.features,
-        spec.hidden,
-        spec.features,
-        spec.conditioning,
-        spec.reconstruction,
-        if spec.preprocess.invert {
-            "inverted"
-        } else {
-            "not inverted"
-        },
-    ))?;
+    print_line(format!("  network     {}", network(spec)))?;
     print_costs(manifest)?;
     print_line(format!(
         "  trained on  {} windows of {} (content {})",
@@ -92,6 +80,30 @@ fn describe_model(dir: &Path, manifest: &Manifest) -> Result<(), CliError> {
     print_line(format!("  weights     SHA-256 {}", manifest.weights_sha256))?;
     let metrics = serde_json::to_string_pretty(&manifest.metrics).map_err(CliError::failed)?;
     print_line(format!("  metrics     {}", metrics.replace('\n', "\n              ")))
+}
+
+/// The architecture and its sizes.
+fn network(spec: &ModelSpec) -> String {
+    let inverted = if spec.preprocess.invert {
+        "inverted"
+    } else {
+        "not inverted"
+    };
+    let conditioning = spec.conditioning;
+    match spec.architecture {
+        Architecture::Dense => format!(
+            "dense {} → LSTM {} → dense {}; conditioning {conditioning}, reconstruction {}, {inverted}",
+            spec.features, spec.hidden, spec.features, spec.reconstruction
+        ),
+        Architecture::Flow => {
+            let layers = spec.flow_layers();
+            let camera = if spec.camera.is_some() { "known" } else { "unknown" };
+            format!(
+                "flow: {} channels, {} encoder and {} decoder blocks; conditioning {conditioning}, camera {camera}, {inverted}",
+                layers.channels, layers.encoder_blocks, layers.decoder_blocks
+            )
+        }
+    }
 }
 
 /// The model's cost and, for the same frames, that of the networks that the paper compares itself with.

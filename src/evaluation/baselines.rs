@@ -158,6 +158,13 @@ impl Baselines {
         })
     }
 
+    /// The same without one of the rows.
+    #[must_use]
+    pub fn without(mut self, method: Method) -> Self {
+        self.methods.retain(|&other| other != method);
+        self
+    }
+
     /// The rows of the tables: the model, the baselines that apply to this data set, the codec.
     #[must_use]
     pub fn methods(&self) -> &[Method] {

@@ -151,11 +151,13 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
             "There is no error on moving robots: the data set has no masks, or no robot is in view.\n"
         )?;
     }
-    writeln!(
-        out,
-        "The reconstruction of the frames seen has an MSE of {} ×10⁻⁴.\n",
-        in_mse_units(scores.reconstruction_mse.mean)
-    )?;
+    if !scores.reconstruction_mse.per_step.is_empty() {
+        writeln!(
+            out,
+            "The reconstruction of the frames seen has an MSE of {} ×10⁻⁴.\n",
+            in_mse_units(scores.reconstruction_mse.mean)
+        )?;
+    }
     writeln!(
         out,
         "In the model's own space (smoothed, and inverted if the model inverts) the MSE is {} ×10⁻⁴. Do not compare this \

@@ -240,7 +240,7 @@ pub struct SetScores {
     /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
     /// between models that preprocess differently.
     pub model_space_mse: StepCurve,
-    /// Mean squared error of the reconstruction of the frames seen, the oldest first.
+    /// Mean squared error of the reconstruction of the frames seen, the oldest first; empty if the model does not reconstruct.
     pub reconstruction_mse: StepCurve,
     /// Does the action matter? Absent for a model that takes none.
     pub actions: Option<ActionTable>,

@@ -1,6 +1,7 @@
 //! The memory of jobs: the default limit, and an estimate of what a training needs.
 
 use crate::dataset::DatasetInfo;
+use crate::nn::Architecture;
 use crate::training::TrainConfig;
 use crate::training::config::CodecStart;
 
@@ -50,6 +51,9 @@ fn cgroup_bytes() -> Option<u64> {
     limits.min()
 }
 
+/// Values that the flow network keeps for each pixel of a window's frames until the gradients are computed.
+const FLOW_PIXEL_VALUES: u64 = 60;
+
 /// The least memory that a training on a data set needs, in MiB. It leaves out what is hard to know, so a training that
 /// passes this check can still reach its limit.
 #[must_use]
@@ -58,12 +62,22 @@ pub(super) fn training_mb(config: &TrainConfig, dataset: &DatasetInfo) -> u64 {
     let (features, hidden) = (count(config.model.features), count(config.model.hidden));
     let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
     let frames = dataset.frame_count as u64;
-    let codec = 2 * pixels * features;
-    let network = 2 * 4 * hidden * (features + hidden) + hidden * features;
+    let (codec, network) = match config.model.architecture {
+        Architecture::Dense => (
+            2 * pixels * features,
+            2 * 4 * hidden * (features + hidden) + hidden * features,
+        ),
+        // Its weights are few beside its activations.
+        Architecture::Flow => (0, 0),
+    };
     let weights = VALUE * WEIGHT_COPIES * (codec + network);
     let window = count(config.model.context + config.model.horizon);
     let fit_frames = count(config.fit.batch_size) * window;
-    let fit = VALUE * fit_frames * (PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden);
+    let fit_values = match config.model.architecture {
+        Architecture::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
+        Architecture::Flow => FLOW_PIXEL_VALUES * pixels,
+    };
+    let fit = VALUE * fit_frames * fit_values;
     let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
     let principal = match config.pretrain.start {
         CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,
