@@ -60,9 +60,10 @@ async fn listen(config: Config) -> Result<(), CliError> {
         .map_err(CliError::failed)?
         .with_keys(keys);
     report_models(&app);
-    print_line(format!("Foreframe listens on http://{address}/ — Ctrl-C stops it"))?;
+    let shutdown = server::shutdown::requested();
+    print_line(format!("Foreframe listens on http://{address}/ — press Ctrl-C to stop"))?;
     let store = app.store().clone();
-    server::serve(listener, app, server::shutdown::requested()).await;
+    server::serve(listener, app, shutdown).await;
     // From now on the database file alone is complete.
     if let Err(error) = store.close().await {
         warn!(%error, "could not close the store");

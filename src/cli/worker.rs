@@ -9,7 +9,6 @@ use super::{CliError, print_line};
 use crate::config::Config;
 use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{Jobs, child};
-use crate::server;
 use crate::telemetry;
 use crate::versions::Versions;
 
@@ -43,8 +42,9 @@ async fn work(config: &Config) -> Result<(), CliError> {
     let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory_limit(server.job_memory_mb);
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
-    print_line("Foreframe runs jobs — Ctrl-C stops it")?;
-    server::shutdown::requested().await;
+    let shutdown = crate::server::shutdown::requested();
+    print_line("Foreframe runs jobs — press Ctrl-C to stop")?;
+    shutdown.await;
     info!("stopping");
     jobs.begin_stop();
     let deadline = Instant::now() + Duration::from_millis(server.shutdown_deadline_ms);

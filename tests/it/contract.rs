@@ -250,9 +250,10 @@ async fn without_a_model_the_server_says_what_to_do() {
         ..ServerConfig::default()
     };
     let app = App::open(config).await.unwrap();
-    let detail = get(&app, "/readyz").await.detail(503);
+    // Training jobs can run without a model, so the server is ready.
+    assert_eq!(get(&app, "/readyz").await.status, 200);
     let models = get(&app, "/v1/models").await.json();
-    assert_eq!(models["notice"], detail);
+    let detail = models["notice"].as_str().unwrap();
     assert!(
         detail.starts_with("no model found in ") && detail.contains("POST /v1/jobs"),
         "{detail}"

@@ -2,30 +2,42 @@
 
 use tracing::warn;
 
-/// Completes on Ctrl-C and, on Unix, on SIGTERM. If the program cannot listen for signals, it never completes.
+/// Listens for Ctrl-C and, on Unix, SIGTERM from this call on; the future completes on the first of them. If the program
+/// cannot listen for signals, it never completes. To be called within a tokio runtime.
+#[cfg(unix)]
+pub fn requested() -> impl Future<Output = ()> {
+    use tokio::signal::unix::{Signal, SignalKind, signal};
+    // Signals are caught from here on, and not only when the future is first polled.
+    let listen = |kind: SignalKind, name: &'static str| match signal(kind) {
+        Ok(signal) => Some(signal),
+        Err(error) => {
+            warn!(%error, signal = name, "could not listen for a signal");
+            None
+        }
+    };
+    let (interrupt, terminate) = (
+        listen(SignalKind::interrupt(), "SIGINT"),
+        listen(SignalKind::terminate(), "SIGTERM"),
+    );
+    async fn received(signal: Option<Signal>) {
+        match signal {
+            Some(mut signal) => drop(signal.recv().await),
+            None => std::future::pending().await,
+        }
+    }
+    async move {
+        tokio::select! {
+            () = received(interrupt) => {}
+            () = received(terminate) => {}
+        }
+    }
+}
+
+/// Completes on Ctrl-C. If the program cannot listen for it, it never completes.
+#[cfg(not(unix))]
 pub async fn requested() {
-    let interrupt = async {
-        if let Err(error) = tokio::signal::ctrl_c().await {
-            warn!(%error, "could not listen for Ctrl-C");
-            std::future::pending::<()>().await;
-        }
-    };
-    #[cfg(unix)]
-    let terminate = async {
-        match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
-            Ok(mut signal) => {
-                signal.recv().await;
-            }
-            Err(error) => {
-                warn!(%error, "could not listen for SIGTERM");
-                std::future::pending::<()>().await;
-            }
-        }
-    };
-    #[cfg(not(unix))]
-    let terminate = std::future::pending::<()>();
-    tokio::select! {
-        () = interrupt => {}
-        () = terminate => {}
+    if let Err(error) = tokio::signal::ctrl_c().await {
+        warn!(%error, "could not listen for Ctrl-C");
+        std::future::pending::<()>().await;
     }
 }
