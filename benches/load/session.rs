@@ -1,4 +1,4 @@
-//! Sessions and their WebSockets.
+//! Sessions and their streams.
 
 use std::io;
 use std::net::SocketAddr;

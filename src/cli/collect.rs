@@ -42,7 +42,7 @@ pub(super) struct CollectArgs {
     /// The seed of all random numbers: the same seed gives the same bytes
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// The directory of the data set [default: DATA_DIR/datasets/SCENARIO]
+    /// The directory of the data set [default: `DATA_DIR/datasets/SCENARIO`]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Threads that simulate [default: one for each core]
@@ -101,7 +101,7 @@ fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<Strin
     let presets: &[&str] = match args.scenario {
         Scenario::StaticObserver => &["paper", "static"],
         Scenario::MovingObserver => &["moving"],
-        _ => &["static"],
+        Scenario::Crowded => &["static"],
     };
     let is_large = info.frame_count > MAX_COUNTED_FRAMES;
     let dataset = (!is_large).then(|| Dataset::open(out)).transpose()?;

@@ -24,7 +24,7 @@ pub(super) struct EvaluateArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
-    /// The directory of a data set, or its name in DATA_DIR/datasets [default: the scenario that the model was trained on]
+    /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: the scenario that the model was trained on]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
     /// A new directory for report.md, report.json and the figures [default: reports/MODEL]

@@ -22,7 +22,7 @@ use crate::frame::{Frame, codec};
   foreframe export --dataset moving-observer --episode 3 --out look
   foreframe export --dataset static-observer --first 5 --count 10 --out part")]
 pub(super) struct ExportArgs {
-    /// The directory of a data set, or its name in DATA_DIR/datasets
+    /// The directory of a data set, or its name in `DATA_DIR/datasets`
     #[arg(long, value_name = "DATASET")]
     dataset: PathBuf,
     /// The episode's number, counted from 0

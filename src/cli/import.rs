@@ -15,7 +15,7 @@ const LISTED_ITEMS: usize = 10;
 /// Turn a recording into a data set.
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
-/// NumPy array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
+/// `NumPy` array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
 /// it, run the same command again: it continues.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
@@ -32,7 +32,7 @@ pub(super) struct ImportArgs {
     /// The data set's name [default: the source's name]
     #[arg(long)]
     name: Option<String>,
-    /// The data set's directory [default: DATA_DIR/datasets/NAME]
+    /// The data set's directory [default: `DATA_DIR/datasets/NAME`]
     #[arg(long, value_name = "DIR", conflicts_with = "name")]
     out: Option<PathBuf>,
     /// Width and height of the frames in pixels, as in 64x64

@@ -23,7 +23,7 @@ pub(super) struct TrainArgs {
     /// paper (1000 windows), static (all windows) or moving (also takes the robot's state and actions)
     #[arg(long, default_value = "paper")]
     preset: String,
-    /// The directory of a data set, or its name in DATA_DIR/datasets [default: static-observer; for moving, moving-observer]
+    /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving, moving-observer]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
     /// The directory of the run, for the configuration, the checkpoint and at the end the model [default: runs/NAME]

@@ -25,7 +25,7 @@ use crate::frame::fit::Fit;
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportConfig {
-    /// The recording: a folder of images, a Donkeycar tub, a NumPy file or a video.
+    /// The recording: a folder of images, a Donkeycar tub, a `NumPy` file or a video.
     pub source: PathBuf,
     /// The data set's directory.
     pub out: PathBuf,
@@ -222,7 +222,7 @@ pub fn import(
     }
     let recording = open(config)?;
     let plan = timing::plan(recording, options)?;
-    directory.write(plan, on_progress, cancelled)
+    directory.write(&plan, on_progress, cancelled)
 }
 
 /// Reads the records of a source, after finding out of which kind it is.

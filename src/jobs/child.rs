@@ -216,12 +216,12 @@ pub fn run() -> Result<(), String> {
         flag.store(true, Ordering::Release);
     });
     let report = JobReporter::to_writer(order.lease, |event, out| write_line(out, &ChildMessage::Report(event)));
-    let result = work(order, &report, &cancelled).unwrap_or_else(|reason| Err(JobFailure::Crashed(reason)));
+    let result = work(&order, &report, &cancelled).unwrap_or_else(|reason| Err(JobFailure::Crashed(reason)));
     write_line(&mut std::io::stdout(), &ChildMessage::Result(result)).map_err(|error| error.to_string())
 }
 
 fn work(
-    order: JobOrder,
+    order: &JobOrder,
     report: &JobReporter,
     cancelled: &AtomicBool,
 ) -> Result<Result<JobResult, JobFailure>, String> {

@@ -302,8 +302,9 @@ impl<'a> JobRun<'a> {
         };
         let (event, error, outcome) = match result {
             Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
-            Err(JobFailure::Cancelled) if self.cancel_requested => (JobTransition::Cancel, None, None),
-            Err(JobFailure::Crashed(_)) if self.cancel_requested => (JobTransition::Cancel, None, None),
+            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) if self.cancel_requested => {
+                (JobTransition::Cancel, None, None)
+            }
             Err(JobFailure::Cancelled | JobFailure::Crashed(_)) => (JobTransition::Release, None, None),
             Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
         };

@@ -81,6 +81,10 @@ impl Composition {
 
     /// The parts of a pixel from its head values, content and turning place.
     #[inline(always)]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the values of one pixel, in the innermost loop"
+    )]
     fn parts(&self, pixel: usize, head: &[f32], content: f32, places: &[f32], frame: &[f32]) -> PixelParts {
         let turned = [places[2 * pixel], places[2 * pixel + 1]];
         let room = match &self.room_places {

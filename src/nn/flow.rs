@@ -164,7 +164,7 @@ impl FlowModel {
         let contexts = rows.contexts(spec);
         let coarse = self.encode(spec, &contexts)?;
 
-        let motions = with_values(&motion, |values| motion_rows(values))?;
+        let motions = with_values(&motion, motion_rows)?;
         let poses = rows.future_poses(spec, &motions);
         let scene = self.scene.forward(spec, rows, &motion, &poses)?;
 
@@ -177,14 +177,14 @@ impl FlowModel {
         let features = scene.narrow(3, 0, SCENE_FEATURES)?.contiguous()?;
         let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
         let channels = self.layers.channels;
-        let mut state = self.per_place(&self.mix, &mixed, quarter)?;
+        let mut state = Self::per_place(&self.mix, &mixed, quarter)?;
         for (index, [first, second]) in self.refine.iter().enumerate() {
             let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
             let inner = first.forward(&modulated_silu(&state, &modulation(0)?)?)?;
             let inner = second.forward(&modulated_silu(&inner, &modulation(1)?)?)?;
             state = (state + inner)?;
         }
-        let enlarged = pixel_shuffle(&self.per_place(&self.enlarge, &silu(&state)?, quarter)?)?;
+        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(&state)?, quarter)?)?;
         let inputs = Tensor::cat(&[&enlarged, &moved, &scene], 3)?;
         let head = self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?;
 
@@ -235,7 +235,7 @@ impl FlowModel {
     }
 
     /// A dense layer at each place of `[M, h, w, …]`.
-    fn per_place(&self, layer: &Dense, x: &Tensor, size: ImageSize) -> Result<Tensor, NnError> {
+    fn per_place(layer: &Dense, x: &Tensor, size: ImageSize) -> Result<Tensor, NnError> {
         let (items, _, _, channels) = x.dims4()?;
         let flat = layer.forward(&x.reshape((items * size.pixels(), channels))?)?;
         let outputs = flat.dim(1)?;

@@ -152,7 +152,7 @@ impl FutureRows {
         for row in 0..self.count() {
             let same =
                 |&first: &usize| self.windows[first] == self.windows[row] && self.state(first) == self.state(row);
-            let known = firsts.last().filter(|first| same(first)).is_some();
+            let known = firsts.last().as_ref().is_some_and(|first| same(first));
             if !known {
                 firsts.push(row);
             }

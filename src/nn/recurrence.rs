@@ -160,7 +160,7 @@ impl Recurrence {
             with_values(&recurrent, |recurrent| {
                 if let Some(projected_features) = &projected_features {
                     with_values(projected_features, |projected_features| {
-                        advance([projection, recurrent, projected_features])
+                        advance([projection, recurrent, projected_features]);
                     })
                 } else {
                     advance([projection, recurrent, &[]]);

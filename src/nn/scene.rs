@@ -44,7 +44,7 @@ impl SceneKind {
                 let (x, y) = (&spec.states[x], &spec.states[y]);
                 Self::Room(RoomScale {
                     middle: [x.mean, y.mean],
-                    unit: ((x.std + y.std) / 2.0).max(super::spec::MIN_CHANNEL_STD),
+                    unit: f32::midpoint(x.std, y.std).max(super::spec::MIN_CHANNEL_STD),
                 })
             }
             _ if is_moving => Self::Places,
@@ -159,7 +159,7 @@ impl Scene {
             rays: Viewer::new(camera, half).rays(),
             poses: poses.to_vec(),
         };
-        self.shaped(&self.run(&views.describe(room)?)?, half)
+        Self::shaped(&self.run(&views.describe(room)?)?, half)
     }
 
     fn places_seen(&self, spec: &ModelSpec, states: &[&[f32]], motion: &Tensor) -> Result<Tensor, NnError> {
@@ -179,7 +179,7 @@ impl Scene {
             .unsqueeze(1)?
             .expand((items, half.pixels(), 3))?
             .reshape((items * half.pixels(), 3))?;
-        let seen = self.shaped(&self.run(&Tensor::cat(&[&known, &motion], 1)?)?, half)?;
+        let seen = Self::shaped(&self.run(&Tensor::cat(&[&known, &motion], 1)?)?, half)?;
         let Some(image) = &self.image else { return Ok(seen) };
         Ok(seen.broadcast_add(&image.reshape((1, half.height, half.width, SCENE_CHANNELS))?)?)
     }
@@ -206,7 +206,7 @@ impl Scene {
         Ok((values + MIDDLE_GRAY)?)
     }
 
-    fn shaped(&self, values: &Tensor, half: ImageSize) -> Result<Tensor, NnError> {
+    fn shaped(values: &Tensor, half: ImageSize) -> Result<Tensor, NnError> {
         Ok(values.reshape(((), half.height, half.width, SCENE_CHANNELS))?)
     }
 }

@@ -182,7 +182,7 @@ mod tests {
     #[tokio::test]
     async fn a_panic_fails_its_batch_and_the_thread_restarts() {
         let config = PredictorConfig {
-            deadline: Duration::from_secs(60),
+            deadline: Duration::from_mins(1),
             ..PredictorConfig::default()
         };
         let predictor = Predictor::start(vec![test_model()], config).unwrap();

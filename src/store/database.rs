@@ -342,7 +342,7 @@ pub(super) fn is_unavailable(error: &sqlx::Error) -> bool {
             // Connection exceptions, lack of resources, and operator intervention, for example a shutdown.
             None => error
                 .as_database_error()
-                .and_then(|error| error.code())
+                .and_then(sqlx::error::DatabaseError::code)
                 .is_some_and(|code| ["08", "53", "57"].iter().any(|class| code.starts_with(class))),
         },
         _ => false,

@@ -34,7 +34,7 @@ impl TrainConfig {
         let text = text.map(|text| SettingsLayer::toml("settings", text)).into_iter();
         let settings = settings.iter().map(|setting| SettingsLayer::assignment(setting));
         let layers: Result<Vec<_>, _> = text.chain(settings).collect();
-        Self::from_layers(preset, layers.map_err(config_error)?)
+        Self::from_layers(preset, layers.map_err(|error| config_error(&error))?)
     }
 
     /// A preset under layers of settings, later ones over earlier ones, checked.
@@ -45,7 +45,7 @@ impl TrainConfig {
             .find(|(name, _)| *name == preset)
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
         let origin = format!("preset {preset}");
-        let written = SettingsLayer::toml(&origin, text).map_err(config_error)?;
+        let written = SettingsLayer::toml(&origin, text).map_err(|error| config_error(&error))?;
         let written: Self = extract(written, [])?;
         // With the settings that the preset's text leaves out, so that they can be given too.
         let defaults = SettingsLayer::serialized(origin, &written);
@@ -59,8 +59,8 @@ fn extract(
     defaults: SettingsLayer,
     layers: impl IntoIterator<Item = SettingsLayer>,
 ) -> Result<TrainConfig, TrainError> {
-    let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(config_error)?;
-    values.extract(expected).map_err(config_error)
+    let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(|error| config_error(&error))?;
+    values.extract(expected).map_err(|error| config_error(&error))
 }
 
 /// What a setting must be, where its type does not say it well.
@@ -68,7 +68,7 @@ fn expected(key: &str) -> Option<String> {
     (key == "data.windows").then(|| "a whole number, 1 or more, or \"all\"".to_owned())
 }
 
-fn config_error(error: SettingsError) -> TrainError {
+fn config_error(error: &SettingsError) -> TrainError {
     TrainError::Config(error.to_string())
 }
 

@@ -39,7 +39,8 @@ fn folder(dir: &Path) -> PathBuf {
         let name = format!("{index}.png");
         fs::write(source.join(&name), codec::encode_png(&image(index as u8)).unwrap()).unwrap();
         let time_s = f64::from(index) * 0.1 + if index < 8 { 0.0 } else { 5.0 };
-        csv += &format!("{time_s},{name},{},{}\n", f64::from(index) / 10.0, index * 2);
+        let line = format!("{time_s},{name},{},{}\n", f64::from(index) / 10.0, index * 2);
+        csv.push_str(&line);
     }
     fs::write(source.join("log.csv"), csv).unwrap();
     source
@@ -70,7 +71,8 @@ fn tub(dir: &Path) -> PathBuf {
         .unwrap();
         let line = json!({"_index": index, "_session_id": "1", "_timestamp_ms": 1000 + 50 * index, "cam/image_array": name,
             "user/angle": f64::from(index) / 10.0, "user/throttle": 0.5, "user/mode": "user"});
-        catalog += &format!("{line}\n");
+        catalog.push_str(&line.to_string());
+        catalog.push('\n');
     }
     fs::write(source.join("catalog_0.catalog"), catalog).unwrap();
     source

@@ -54,7 +54,7 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
         .iter()
         .map(std::fs::DirEntry::path)
         .collect();
-    paths.sort_by(|one, other| natural_key(one).cmp(&natural_key(other)));
+    paths.sort_by_key(|one| natural_key(one));
     Ok(paths)
 }
 

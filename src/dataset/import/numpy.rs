@@ -1,4 +1,4 @@
-//! NumPy arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
+//! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
 //! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1.
 
 use std::fs::File;

@@ -41,7 +41,7 @@ pub(super) enum Images {
     Raw(RawImages),
 }
 
-/// Gray frames of one size in a file. A frame can lie in one piece or, for a NumPy array of another layout, at any stride.
+/// Gray frames of one size in a file. A frame can lie in one piece or, for a `NumPy` array of another layout, at any stride.
 pub(super) struct RawImages {
     pub(super) path: PathBuf,
     pub(super) file: Mutex<File>,

@@ -110,15 +110,15 @@ impl<'a> Directory<'a> {
     /// Writes the shards that are missing, then the tables. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
     pub(super) fn write(
         &self,
-        plan: ImportPlan,
+        plan: &ImportPlan,
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
         let shards = shards(&plan.episodes);
-        let info = description(self.config, &plan);
+        let info = description(self.config, plan);
         let mut writer = ShardWriter {
             out: &self.config.out,
-            plan: &plan,
+            plan,
             options: &self.config.options,
             info: &info,
             written: Vec::new(),
@@ -241,10 +241,6 @@ impl ShardWriter<'_> {
 
     /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
     /// are returned if the import was cancelled.
-    #[expect(
-        clippy::type_complexity,
-        reason = "episodes, if not cancelled, and what was left out"
-    )]
     fn encode(
         &self,
         episodes: Range<usize>,

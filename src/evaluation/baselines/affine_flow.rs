@@ -69,8 +69,11 @@ impl AffineFlow {
             for _ in 0..STEPS {
                 let equations = pairs
                     .par_iter()
-                    .map(|pair| flow.equations_of(dataset, pair, &smooth))
-                    .reduce(|| NormalEquations::new(AFFINE * regressors), NormalEquations::plus);
+                    .map(|pair| flow.equations_of(dataset, pair, smooth))
+                    .reduce(
+                        || NormalEquations::new(AFFINE * regressors),
+                        |sum, more| sum.plus(&more),
+                    );
                 for (parameter, step) in flow.parameters.iter_mut().zip(equations.solve()?) {
                     *parameter += step;
                 }
@@ -141,7 +144,7 @@ impl AffineFlow {
     }
 
     /// What a pair of frames says about the step from the present parameters.
-    fn equations_of(&self, dataset: &Dataset, pair: &Window, smooth: &Preprocess) -> NormalEquations {
+    fn equations_of(&self, dataset: &Dataset, pair: &Window, smooth: Preprocess) -> NormalEquations {
         let (before, after) = (pair.first_frame + 1, pair.first_frame + 2);
         let regressors = self.regressors(dataset.action(pair.first_frame), dataset.action(before));
         let mut equations = NormalEquations::new(self.parameters.len());
@@ -235,7 +238,7 @@ impl NormalEquations {
         }
     }
 
-    fn plus(mut self, other: Self) -> Self {
+    fn plus(mut self, other: &Self) -> Self {
         for (sum, value) in self.matrix.iter_mut().zip(&other.matrix) {
             *sum += value;
         }

@@ -152,7 +152,7 @@ mod tests {
     fn distances_are_sums_of_squares() {
         let one: Vec<f32> = (0..37).map(|i| i as f32).collect();
         assert_eq!(
-            squared_distance(&one, &vec![0.0; 37]),
+            squared_distance(&one, &[0.0; 37]),
             (0..37).map(|i| (i * i) as f32).sum::<f32>()
         );
         assert_eq!(squared_byte_distance(&[0, 255, 3], &[255, 0, 1]), 2 * 255 * 255 + 4);

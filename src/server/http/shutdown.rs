@@ -6,7 +6,7 @@ use tracing::warn;
 /// cannot listen for signals, it never completes. To be called within a tokio runtime.
 #[cfg(unix)]
 pub fn requested() -> impl Future<Output = ()> {
-    use tokio::signal::unix::{Signal, SignalKind, signal};
+    use tokio::signal::unix::{SignalKind, signal};
     // Signals are caught from here on, and not only when the future is first polled.
     let listen = |kind: SignalKind, name: &'static str| match signal(kind) {
         Ok(signal) => Some(signal),
@@ -19,17 +19,20 @@ pub fn requested() -> impl Future<Output = ()> {
         listen(SignalKind::interrupt(), "SIGINT"),
         listen(SignalKind::terminate(), "SIGTERM"),
     );
-    async fn received(signal: Option<Signal>) {
-        match signal {
-            Some(mut signal) => drop(signal.recv().await),
-            None => std::future::pending().await,
-        }
-    }
     async move {
         tokio::select! {
             () = received(interrupt) => {}
             () = received(terminate) => {}
         }
+    }
+}
+
+/// Completes when the signal arrives; never without a listener.
+#[cfg(unix)]
+async fn received(signal: Option<tokio::signal::unix::Signal>) {
+    match signal {
+        Some(mut signal) => drop(signal.recv().await),
+        None => std::future::pending().await,
     }
 }
 
