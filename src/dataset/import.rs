@@ -1,7 +1,7 @@
 //! Turns recordings of real robots into data sets.
 //!
-//! A source ([`images`], [`donkeycar`], [`numpy`], [`video`]) lists its records: time, action, state and where the image
-//! is. [`timing`] cuts them into episodes at one frame rate. [`writer`] reads the images, resizes them, and writes shards.
+//! A source (`images`, `donkeycar`, `numpy` or `video`) lists its records: time, action, state and where the image
+//! is. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
 //! Only one shard is in memory at a time.
 
 mod donkeycar;

@@ -3,7 +3,7 @@
 //!
 //! - Dense weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
-//! - The flow network's weights: the dense range, or a share of it ([`flow_gain`]); its other tensors 0.
+//! - The flow network's weights: the dense range, or a share of it (`flow_gain`); its other tensors 0.
 //! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts almost no change.
 
 use candle_core::{Device, Tensor};
