@@ -132,7 +132,11 @@ impl ChildExecutor {
         let failed = |error: &dyn std::error::Error| crashed("could not send its order to", error);
         let mut order = serde_json::to_vec(&self.order(spec, report.lease())).map_err(|error| failed(&error))?;
         order.push(b'\n');
-        stdin.write_all(&order).map_err(|error| failed(&error))?;
+        match stdin.write_all(&order) {
+            // The exit status of a child that ended before it read its order says why.
+            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => return Ok(None),
+            sent => sent.map_err(|error| failed(&error))?,
+        }
         let report = report.clone();
         let reader = std::thread::spawn(move || {
             let mut result = None;
