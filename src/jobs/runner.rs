@@ -83,7 +83,7 @@ pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: Thread
             .claim(&instance.id, shared.limits.lease.as_secs_f64())
             .await
         {
-            Ok(Some((row, lease))) => JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone()).await,
+            Ok(Some((row, lease))) => Box::pin(JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone())).await,
             Ok(None) => pause(&shared, &mut stop).await,
             Err(error) => {
                 warn!(%error, "could not claim a job");
@@ -176,7 +176,7 @@ impl<'a> JobRun<'a> {
             }
             result => self.check_attempts(result),
         };
-        self.end(&row.kind, result).await;
+        Box::pin(self.end(&row.kind, result)).await;
     }
 
     /// Runs the work on its own thread, and writes its report until the work returns.
