@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_host_is_an_address_or_a_name_and_the_port_may_be_left_out() {
+    fn a_host_is_an_address_or_a_name_with_or_without_port() {
         for (text, address) in [
             ("127.0.0.1:9000", "127.0.0.1:9000"),
             ("localhost:9000", "127.0.0.1:9000"),

@@ -21,13 +21,13 @@ pub(super) fn is_tub(source: &Path) -> bool {
 }
 
 /// What the manifest says.
-struct Manifest {
+struct TubManifest {
     inputs: Vec<(String, String)>,
     catalogs: Vec<String>,
     deleted: BTreeSet<u64>,
 }
 
-impl Manifest {
+impl TubManifest {
     fn read(tub: &Path) -> Result<Self, ImportError> {
         let path = tub.join(MANIFEST);
         let text = std::fs::read_to_string(&path).map_err(ImportError::io("read", &path))?;
@@ -113,7 +113,7 @@ fn texts(value: &Value) -> Option<Vec<String>> {
 
 /// Reads the records of a tub. Errors: `Option`, `Io`, `Record`.
 pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
-    let manifest = Manifest::read(tub)?;
+    let manifest = TubManifest::read(tub)?;
     let reader = Reader {
         tub,
         image: manifest.image(options)?,

@@ -31,7 +31,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
     };
     let file = File::open(path).map_err(ImportError::io("read", path))?;
     let header = Header::read(BufReader::new(&file), path)?;
-    let layout = Layout::of(&header, path)?;
+    let layout = ArrayLayout::of(&header, path)?;
     let frame_bytes = (layout.height * layout.width * header.pixel.bytes()) as u64;
     let needed = header.data_offset + (layout.sequences * layout.frames) as u64 * frame_bytes;
     let found = file.metadata().map_err(ImportError::io("read", path))?.len();
@@ -75,7 +75,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
 }
 
 /// Which sides of the array are sequences, time, rows and columns.
-struct Layout {
+struct ArrayLayout {
     sequences: usize,
     frames: usize,
     height: usize,
@@ -83,7 +83,7 @@ struct Layout {
     time_first: bool,
 }
 
-impl Layout {
+impl ArrayLayout {
     fn of(header: &Header, path: &Path) -> Result<Self, ImportError> {
         let (sequences, frames, height, width, time_first) = match *header.shape.as_slice() {
             [frames, height, width] => (1, frames, height, width, false),
@@ -225,7 +225,7 @@ mod tests {
                 data_offset: 10 + text.len() as u64
             }
         );
-        let layout = Layout::of(&header, Path::new("a.npy")).unwrap();
+        let layout = ArrayLayout::of(&header, Path::new("a.npy")).unwrap();
         assert_eq!((layout.sequences, layout.frames), (10000, 20));
         assert_eq!(layout.position(3, 2), 2 * 10000 + 3);
     }

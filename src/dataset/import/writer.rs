@@ -30,7 +30,7 @@ const SKIPPED: &str = "meta/skipped.json";
 
 /// What decides the bytes of the data set.
 #[derive(Serialize)]
-struct Arguments<'a> {
+struct ImportArguments<'a> {
     program_version: &'static str,
     source: &'a Path,
     options: &'a ImportOptions,
@@ -47,7 +47,7 @@ impl<'a> Directory<'a> {
     pub(super) fn claim(config: &'a ImportConfig) -> Result<Self, ImportError> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
-        let arguments = Arguments {
+        let arguments = ImportArguments {
             program_version: env!("CARGO_PKG_VERSION"),
             source: &config
                 .source
