@@ -26,10 +26,11 @@ use crate::serving::{self, PredictionInput};
 /// after N beside the prediction. Writes predicted-1.png and so on, contact-sheet.png and prediction.gif.
 #[derive(clap::Args)]
 #[command(
-    after_help = "The actions file is JSON with one entry for each image of the directory, in the same order:
+    after_help = "The actions file is JSON. Entry i belongs to image i; there may be more actions than images:
   {\"states\": [[…], …], \"actions\": [[…], …]}
-The action of a frame acts from that frame to the next one. So the file needs an action for frame N (the last frame, or that
-of --at) and for each frame to predict but the last, as planned by the robot. The model takes the state at frame N.
+The action of a frame acts from that frame to the next one. To predict 5 frames after frame N (the last frame,
+or that of --at), the file needs actions up to N + 4. So without --at, add the planned actions at the end. The model takes the
+state at frame N.
 
 Examples:
   foreframe predict --model paper --frames images --out predicted

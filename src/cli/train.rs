@@ -20,10 +20,12 @@ use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcom
   foreframe train --preset paper --print-config > mine.toml
   foreframe train --preset paper --config mine.toml")]
 pub(super) struct TrainArgs {
-    /// paper (1000 windows), static (all windows) or moving (also takes the robot's state and actions)
+    /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow or
+    /// moving-flow (flow network; moving-flow takes state and actions)
     #[arg(long, default_value = "paper")]
     preset: String,
-    /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving, moving-observer]
+    /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving
+    /// and moving-flow, moving-observer]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
     /// The directory of the run, for the configuration, the checkpoint and at the end the model [default: runs/NAME]
