@@ -6,8 +6,10 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
+use crate::dataset::is_finished;
 use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
+use crate::registry::is_valid_name;
 
 /// How many left-out items are printed.
 const LISTED_ITEMS: usize = 10;
@@ -81,10 +83,10 @@ fn size(text: &str) -> Result<(u32, u32), String> {
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
-    let out = args
-        .out
-        .clone()
-        .unwrap_or_else(|| workspace.datasets_dir().join(name(&args)));
+    let out = match &args.out {
+        Some(out) => out.clone(),
+        None => workspace.datasets_dir().join(name(&args)?),
+    };
     let config = ImportConfig {
         source: args.source,
         out: out.clone(),
@@ -103,6 +105,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             skip_bad: args.skip_bad,
         },
     };
+    let was_complete = is_finished(&out);
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));
     progress.label("importing");
     let imported = import(
@@ -113,6 +116,9 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     progress.finish();
     let imported = imported?;
     let info = &imported.info;
+    if was_complete {
+        print_line("already imported before, and not read again; delete the directory to import the source anew")?;
+    }
     print_line(format!(
         "{}: {} episodes, {} frames of {}×{} px, {:.4} s apart, content {}",
         out.display(),
@@ -138,14 +144,23 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     print_line(format!("next: foreframe train --dataset {}", out.display()))
 }
 
-/// The data set's name: the one given, or the source's.
-fn name(args: &ImportArgs) -> String {
-    args.name.clone().unwrap_or_else(|| {
-        let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
-        source
-            .file_stem()
-            .map_or_else(|| "recording".to_owned(), |name| name.to_string_lossy().into_owned())
-    })
+/// The data set's name: the one given, or one made of the source's. Errors: `Usage` if the given name is not valid.
+fn name(args: &ImportArgs) -> Result<String, CliError> {
+    if let Some(name) = &args.name {
+        return if is_valid_name(name) {
+            Ok(name.clone())
+        } else {
+            Err(CliError::Usage(format!(
+                "--name is {name:?}; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -"
+            )))
+        };
+    }
+    let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
+    let stem = source.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
+    let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
+    let name: String = stem.chars().map(allowed).take(64).collect();
+    let name = name.trim_matches('-');
+    Ok(if name.is_empty() { "recording" } else { name }.to_owned())
 }
 
 impl From<ImportError> for CliError {

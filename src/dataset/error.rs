@@ -245,7 +245,7 @@ pub enum DatasetError {
     },
     /// The collection is not complete.
     #[error(
-        "the data set in {path} is unfinished; run `foreframe collect` with the same arguments to resume it: {arguments}",
+        "the data set in {path} is unfinished; run the same `foreframe collect` or `foreframe import` again to resume it: {arguments}",
         path = path.display()
     )]
     Unfinished {

@@ -313,7 +313,7 @@ fn a_failed_write_leaves_no_data_set() {
     assert!(!dir.path().join("data/datasets/static-observer/meta/info.json").exists());
     let (code, text) = run(dir.path(), "inspect static-observer");
     assert!(
-        code == 2 && text.contains("is unfinished; run `foreframe collect` with the same arguments"),
+        code == 2 && text.contains("is unfinished; run the same `foreframe collect`"),
         "{text}"
     );
 }

@@ -212,7 +212,9 @@ fn opening_an_unfinished_data_set_explains_how_to_resume() {
     let out = directory.path().join("set");
     run_until(&config(&out), 4).unwrap_err();
     let message = Dataset::open(&out).unwrap_err().to_string();
-    assert!(message.contains("is unfinished; run `foreframe collect` with the same arguments to resume it"));
+    assert!(
+        message.contains("is unfinished; run the same `foreframe collect` or `foreframe import` again to resume it")
+    );
     assert!(message.contains("\"trials\":11"), "{message}");
 }
 

@@ -246,3 +246,15 @@ fn a_used_directory_and_other_options_are_refused() {
     let error = run(&dir.path().join("none"), &dir.path().join("c"), small()).unwrap_err();
     assert!(foreframe::error_text::with_causes(&error).contains("none"), "{error}");
 }
+
+#[test]
+fn a_failed_import_can_be_repeated_with_other_options() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (folder(dir.path()), dir.path().join("out"));
+    let wrong = ImportOptions {
+        actions: vec!["turn".to_owned()],
+        ..small()
+    };
+    assert!(run(&source, &out, wrong).is_err());
+    assert_eq!(run(&source, &out, small()).unwrap().info.episode_count, 2);
+}

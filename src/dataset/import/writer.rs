@@ -63,7 +63,13 @@ impl<'a> Directory<'a> {
         };
         match fs::read_to_string(&path) {
             Ok(found) if found == text => {}
-            Ok(_) => return Err(occupied("an import with another source or other options")),
+            // An import that failed before its first shard leaves nothing that is worth keeping.
+            Ok(_) if !out.join("data").exists() => write_atomically(&path, text.as_bytes())?,
+            Ok(_) => {
+                return Err(occupied(
+                    "an import with another source or other options; delete it to import again",
+                ));
+            }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
                 let is_unused = !out.exists() || fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_none());
                 if !is_unused {
