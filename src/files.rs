@@ -1,5 +1,7 @@
-//! Writes files so that a reader sees either the complete file or none, deletes directories, and computes hashes.
+//! Writes files so that a reader sees either the complete file or none, deletes directories, computes
+//! hashes, and orders file names.
 
+use std::cmp::Ordering;
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::File;
@@ -143,6 +145,38 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     })
 }
 
+/// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.
+pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
+    let (mut left, mut right) = (a, b);
+    loop {
+        let (one, other) = (next_part(&mut left), next_part(&mut right));
+        let order = match (one, other) {
+            ("", "") => return a.cmp(b),
+            (one, other) if is_number(one) && is_number(other) => {
+                let (one, other) = (one.trim_start_matches('0'), other.trim_start_matches('0'));
+                one.len().cmp(&other.len()).then_with(|| one.cmp(other))
+            }
+            (one, other) => one.cmp(other),
+        };
+        if order != Ordering::Equal {
+            return order;
+        }
+    }
+}
+
+fn is_number(part: &str) -> bool {
+    part.starts_with(|c: char| c.is_ascii_digit())
+}
+
+/// Cuts off the first run of digits, or of other characters.
+fn next_part<'a>(text: &mut &'a str) -> &'a str {
+    let starts_with_digit = is_number(text);
+    let end = text.find(|c: char| c.is_ascii_digit() != starts_with_digit);
+    let (part, rest) = text.split_at(end.unwrap_or(text.len()));
+    *text = rest;
+    part
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -212,5 +246,29 @@ mod tests {
         make(&new, SystemTime::now());
         remove_stale_partials(dir.path());
         assert!(path.exists() && new.exists() && !old.exists());
+    }
+
+    #[test]
+    fn numbers_in_file_names_are_compared_as_numbers() {
+        let mut names = [
+            "10.png",
+            "2.png",
+            "frame-9.png",
+            "frame-010.png",
+            "1.png",
+            "frame-1b.png",
+        ];
+        names.sort_by(|a, b| natural_order(a, b));
+        assert_eq!(
+            names,
+            [
+                "1.png",
+                "2.png",
+                "10.png",
+                "frame-1b.png",
+                "frame-9.png",
+                "frame-010.png"
+            ]
+        );
     }
 }

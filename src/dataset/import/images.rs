@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::recording::{Images, Record, Recording};
 use super::{ImportError, ImportOptions, extension};
+use crate::files::natural_order;
 use crate::types::Channel;
 
 /// Names of the column with the image's file, if none is given.
@@ -54,27 +55,9 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
         .iter()
         .map(std::fs::DirEntry::path)
         .collect();
-    paths.sort_by_key(|one| natural_key(one));
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    paths.sort_by(|a, b| natural_order(&name(a), &name(b)));
     Ok(paths)
-}
-
-/// A key that sorts `2.png` before `10.png`: digits compare as numbers.
-fn natural_key(path: &Path) -> Vec<(u64, String)> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let mut parts = Vec::new();
-    let mut rest = name.as_str();
-    while !rest.is_empty() {
-        let text_end = rest.find(|c: char| c.is_ascii_digit()).unwrap_or(rest.len());
-        let (text, digits) = rest.split_at(text_end);
-        let digit_end = digits.find(|c: char| !c.is_ascii_digit()).unwrap_or(digits.len());
-        let (number, after) = digits.split_at(digit_end);
-        parts.push((0, text.to_owned()));
-        if !number.is_empty() {
-            parts.push((number.parse().unwrap_or(u64::MAX), String::new()));
-        }
-        rest = after;
-    }
-    parts
 }
 
 fn name_of(path: &Path) -> String {
@@ -325,13 +308,6 @@ pub(super) fn inside(folder: &Path, name: &str, place: &str) -> Result<PathBuf, 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_with_numbers_sort_by_value() {
-        let mut names = ["10.png", "2.png", "a1b10.png", "a1b9.png"].map(PathBuf::from);
-        names.sort_by_key(|path| natural_key(path));
-        assert_eq!(names, ["2.png", "10.png", "a1b9.png", "a1b10.png"].map(PathBuf::from));
-    }
 
     #[test]
     fn units_are_read_from_the_header() {
