@@ -39,6 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         dataset: &dataset,
         run_dir: &out.join("run"),
         command: "examples/train.rs",
+        start: None,
     };
     let mut report = |event: TrainingEvent| {
         if let TrainingEvent::Validated { stage, step, loss, .. } = event {

@@ -40,6 +40,7 @@ mod room;
 mod sampling;
 mod scene;
 pub mod spec;
+pub mod ssim_loss;
 pub(crate) mod tensors;
 
 pub use autoencoder::Feedback;

@@ -7,7 +7,7 @@ pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
-pub use self::loader::{LoadedModel, load, load_as};
+pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::error_text::existing;
 use crate::files::{sha256_hex, write_atomically};

@@ -2,6 +2,7 @@
 //! on windows. Both use the loop in `stage`. With `checkpoint`, a training can be stopped at any step and resumed; the
 //! result has the same bits as an uninterrupted training.
 
+mod augment;
 mod batches;
 mod checkpoint;
 pub mod config;
@@ -16,6 +17,7 @@ mod stage;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use self::augment::Augmentation;
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition};
 use self::checkpoint::{Checkpoint, RunFiles};
@@ -30,10 +32,13 @@ use crate::dataset::{Dataset, DatasetError, Window};
 use crate::files::write_atomically;
 use crate::frame::FrameError;
 use crate::nn::{ModelSpec, NnError, Parameters};
-use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError};
+use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError, StoredWeights};
 
 /// Largest number of frames from which the principal components are computed.
 const MAX_PRINCIPAL_FRAMES: usize = 8192;
+
+/// The entry of a manifest's training settings that names the model whose weights the training started from.
+const START_KEY: &str = "from";
 
 /// Why a training could not start or stopped.
 #[derive(Debug, thiserror::Error)]
@@ -89,6 +94,16 @@ pub enum TrainError {
         what: String,
         /// The step of the last checkpoint.
         checkpoint_step: usize,
+    },
+    /// The weights to start from belong to another network.
+    #[error(
+        "the training cannot start from the model {model:?}: {source}; it needs the same frame size, layers and numbers of channels"
+    )]
+    OtherNetwork {
+        /// The model.
+        model: String,
+        /// The first difference.
+        source: NnError,
     },
     /// A file of the run could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
@@ -160,6 +175,8 @@ pub struct Training<'a> {
     pub run_dir: &'a Path,
     /// The command line, for the manifest.
     pub command: &'a str,
+    /// The model whose weights it starts from (fine-tuning); `None` for new weights.
+    pub start: Option<&'a StoredWeights>,
 }
 
 /// Starts a training, or resumes the run in `run_dir`, until it is complete or cancelled. A resumed run ends with the same
@@ -182,7 +199,7 @@ pub fn run(
     }
     let mut state = match Checkpoint::load_latest(&files, (&plan.spec, &config.run), observer)? {
         Some(checkpoint) => checkpoint.into_state(),
-        None => match initial_parameters(&plan, config, cancelled)? {
+        None => match initial_parameters(&plan, training, cancelled)? {
             Some(parameters) => TrainState::new(parameters, &config.run)?,
             None => {
                 return Ok(TrainingOutcome::Interrupted {
@@ -238,9 +255,13 @@ pub fn run(
 /// The weights to start from; `None` if cancelled.
 fn initial_parameters(
     plan: &TrainingPlan<'_>,
-    config: &TrainConfig,
+    training: &Training<'_>,
     cancelled: &AtomicBool,
 ) -> Result<Option<Parameters>, TrainError> {
+    let config = training.config;
+    if let Some(start) = training.start {
+        return start_parameters(plan, start).map(Some);
+    }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if config.pretrain.start == CodecStart::Principal {
         let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
@@ -253,6 +274,15 @@ fn initial_parameters(
         }
     }
     Ok(Some(parameters))
+}
+
+/// The weights of another model. Errors: `OtherNetwork` if they do not fit this training's network.
+fn start_parameters(plan: &TrainingPlan<'_>, start: &StoredWeights) -> Result<Parameters, TrainError> {
+    let tensors = start.parameters.snapshot()?;
+    Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
+        model: start.manifest.name.clone(),
+        source,
+    })
 }
 
 fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
@@ -298,8 +328,9 @@ impl<'a> TrainingPlan<'a> {
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
         spec.validate()?;
+        let augmentation = Augmentation::new(&config.data, dataset.info(), config.seed)?;
         Ok(Self {
-            source: FrameSource::new(dataset, spec.preprocess, config.fit.target),
+            source: FrameSource::new(dataset, spec.preprocess, config.fit.target, augmentation),
             spec,
             train,
             validation,
@@ -308,7 +339,14 @@ impl<'a> TrainingPlan<'a> {
 
     fn manifest(&self, training: &Training<'_>, state: &TrainState) -> Result<Manifest, TrainError> {
         let (config, info) = (training.config, training.dataset.info());
-        let settings = serde_json::to_value(config).map_err(|error| TrainError::Config(error.to_string()))?;
+        let mut settings = serde_json::to_value(config).map_err(|error| TrainError::Config(error.to_string()))?;
+        if let Some(start) = training.start {
+            settings[START_KEY] = serde_json::json!({
+                "model": start.manifest.name,
+                "version": start.manifest.version,
+                "weights_sha256": start.manifest.weights_sha256,
+            });
+        }
         Ok(Manifest {
             name: config.name.clone(),
             version: 1,

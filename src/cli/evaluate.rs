@@ -6,7 +6,7 @@ use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, print_line, progress::ProgressLine};
-use crate::evaluation::{self, EvaluateConfig, Purpose};
+use crate::evaluation::{self, EvaluateConfig, EvaluationReport, Purpose};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
@@ -46,6 +46,9 @@ pub(super) struct EvaluateArgs {
     /// The seed of the resamples and of the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Fail if the skill on any set is lower than this; the report is written anyway
+    #[arg(long, value_name = "SKILL", allow_negative_numbers = true)]
+    min_skill: Option<f64>,
     /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
     record: bool,
@@ -110,7 +113,22 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     for (split, score) in report.headline().as_object().into_iter().flatten() {
         print_line(format!("{split}: {score}"))?;
     }
-    print_line(out.join("report.md").display())
+    print_line(out.join("report.md").display())?;
+    args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
+}
+
+/// Errors: `Failed` with the first set whose skill is lower.
+fn require_skill(report: &EvaluationReport, least: f64) -> Result<(), CliError> {
+    for set in &report.sets {
+        let found = set.outcome.scores().map(|scores| scores.skill.skill.mean);
+        if let Some(found) = found.filter(|&found| found < least) {
+            return Err(CliError::Failed(format!(
+                "the skill on {} is {found:.3}; --min-skill asks for {least} or more",
+                set.split
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// The scenario that the model was trained on: the default name of its data set.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, interrupt, print_line, progress::ProgressLine};
+use crate::registry::StoredWeights;
 use crate::settings::SettingsLayer;
 use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
@@ -18,12 +19,17 @@ use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcom
   foreframe train --preset paper --dataset static-observer
   foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
   foreframe train --preset paper --print-config > mine.toml
-  foreframe train --preset paper --config mine.toml")]
+  foreframe train --preset paper --config mine.toml
+  foreframe train --from moving-flow --dataset mine --set name=mine --set fit.steps=300")]
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow or
     /// moving-flow (flow network; moving-flow takes state and actions)
-    #[arg(long, default_value = "paper")]
+    #[arg(long, default_value = "paper", conflicts_with = "from")]
     preset: String,
+    /// Start from the weights and settings of this model: its directory, name or NAME@VERSION. A few hundred steps are often
+    /// enough, as with --set fit.steps=300
+    #[arg(long, value_name = "MODEL")]
+    from: Option<String>,
     /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving
     /// and moving-flow, moving-observer]
     #[arg(long, value_name = "DATASET")]
@@ -45,12 +51,20 @@ pub(super) struct TrainArgs {
 }
 
 pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
-    let config = training_config(args)?;
+    let workspace = Workspace::new(args.directories.start()?);
+    let start = args
+        .from
+        .as_ref()
+        .map(|model| workspace.load_weights(model))
+        .transpose()?;
+    let config = training_config(args, start.as_ref())?;
     if args.print_config {
         return print_line(config.to_toml()?.trim_end());
     }
-    let workspace = Workspace::new(args.directories.start()?);
-    let dataset = args.dataset.clone().unwrap_or_else(|| default_dataset(&args.preset));
+    let dataset = args
+        .dataset
+        .clone()
+        .unwrap_or_else(|| default_dataset(args, start.as_ref()));
     let (dataset_dir, dataset) = workspace.open_dataset(&dataset)?;
     let run_dir = args
         .out
@@ -62,6 +76,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         dataset: &dataset,
         run_dir: &run_dir,
         command: &command,
+        start: start.as_ref(),
     };
     let cancelled = interrupt::flag()?;
     let progress = ProgressLine::new("steps");
@@ -89,8 +104,8 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     }
 }
 
-/// The preset under the file of settings and the single settings.
-fn training_config(args: &TrainArgs) -> Result<TrainConfig, CliError> {
+/// The preset, or the settings of the model to start from, under the file of settings and the single settings.
+fn training_config(args: &TrainArgs, start: Option<&StoredWeights>) -> Result<TrainConfig, CliError> {
     let mut layers = Vec::new();
     if let Some(path) = &args.config {
         layers.push(SettingsLayer::file(path)?);
@@ -98,11 +113,17 @@ fn training_config(args: &TrainArgs) -> Result<TrainConfig, CliError> {
     for setting in &args.settings {
         layers.push(SettingsLayer::assignment(setting)?);
     }
-    Ok(TrainConfig::from_layers(&args.preset, layers)?)
+    Ok(match start {
+        Some(start) => TrainConfig::of_model(&start.manifest, layers)?,
+        None => TrainConfig::from_layers(&args.preset, layers)?,
+    })
 }
 
-fn default_dataset(preset: &str) -> PathBuf {
-    PathBuf::from(if preset.starts_with("moving") {
+fn default_dataset(args: &TrainArgs, start: Option<&StoredWeights>) -> PathBuf {
+    if let Some(start) = start {
+        return PathBuf::from(&start.manifest.dataset.name);
+    }
+    PathBuf::from(if args.preset.starts_with("moving") {
         "moving-observer"
     } else {
         "static-observer"

@@ -9,7 +9,7 @@ use super::settings::open_store;
 use crate::config::Config;
 use crate::dataset::{self, Dataset};
 use crate::jobs::{self, JobError};
-use crate::registry::{self, LoadedModel, RegistryError};
+use crate::registry::{self, LoadedModel, RegistryError, StoredWeights};
 use crate::server::ServerConfig;
 use crate::versions::{VersionError, Versions};
 
@@ -49,6 +49,14 @@ impl Workspace {
             });
         }
         Ok(dataset::find(&self.datasets_dir(), dataset)?)
+    }
+
+    /// The weights of a model, found as by [`Workspace::load_model`].
+    pub(super) fn load_weights(&self, model: &str) -> Result<StoredWeights, CliError> {
+        let (dir, loaded) = self.load_model(model)?;
+        let mut weights = registry::load_weights(&dir)?;
+        weights.manifest.name.clone_from(&loaded.manifest.name);
+        Ok(weights)
     }
 
     /// Loads a model by its directory, its name or NAME@VERSION. A name alone is the version that a server would serve.

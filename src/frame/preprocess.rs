@@ -133,6 +133,32 @@ pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -
     result
 }
 
+/// The adjoint of [`convolve_separable`]: the gradient of what it was given, from the gradient of its result.
+pub(super) fn convolve_separable_adjoint(gradient: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
+    let height = gradient.len() / width;
+    let radius = kernel.len() / 2;
+    let mut rows = vec![0.0; gradient.len()];
+    for (y, gradient) in gradient.chunks_exact(width).enumerate() {
+        for (tap, weight) in kernel.iter().enumerate() {
+            let from = (y + tap).saturating_sub(radius).min(height - 1) * width;
+            add_scaled(&mut rows[from..from + width], gradient, *weight);
+        }
+    }
+    let mut result = Vec::with_capacity(gradient.len());
+    let mut padded = vec![0.0; width + 2 * radius];
+    for row in rows.chunks_exact(width) {
+        padded.fill(0.0);
+        for (tap, weight) in kernel.iter().enumerate() {
+            add_scaled(&mut padded[tap..tap + width], row, *weight);
+        }
+        // The edge pixel was read wherever the kernel reached beyond the image.
+        padded[radius] += padded[..radius].iter().sum::<f32>();
+        padded[radius + width - 1] += padded[radius + width..].iter().sum::<f32>();
+        result.extend_from_slice(&padded[radius..radius + width]);
+    }
+    result
+}
+
 fn add_scaled(out: &mut [f32], values: &[f32], weight: f32) {
     for (out, value) in out.iter_mut().zip(values) {
         *out += weight * value;

@@ -1,6 +1,6 @@
 //! Measures of the similarity of two images. All functions take intensities 0…1, row by row, of equal length.
 
-use super::preprocess::{convolve_separable, gaussian_kernel};
+use super::preprocess::{convolve_separable, convolve_separable_adjoint, gaussian_kernel};
 
 /// The window of Wang et al. 2004: 11 taps, sigma 1.5.
 const SSIM_RADIUS_PX: usize = 5;
@@ -26,25 +26,93 @@ pub fn psnr_db(mse: f64) -> f64 {
 /// repeated.
 #[must_use]
 pub fn ssim(a: &[f32], b: &[f32], width: usize) -> f64 {
-    let kernel = gaussian_kernel(SSIM_SIGMA_PX, SSIM_RADIUS_PX);
-    let local_mean = |values: &[f32]| convolve_separable(values, width, &kernel);
-    let product = |p: &[f32], q: &[f32]| p.iter().zip(q).map(|(p, q)| p * q).collect::<Vec<f32>>();
-    let (mean_a, mean_b) = (local_mean(a), local_mean(b));
-    let (aa, bb, ab) = (
-        local_mean(&product(a, a)),
-        local_mean(&product(b, b)),
-        local_mean(&product(a, b)),
-    );
-    let sum: f64 = (0..a.len())
-        .map(|i| {
-            let (ma, mb) = (mean_a[i], mean_b[i]);
-            let (va, vb, cov) = (aa[i] - ma * ma, bb[i] - mb * mb, ab[i] - ma * mb);
-            let numerator = (2.0 * ma * mb + SSIM_C1) * (2.0 * cov + SSIM_C2);
-            let denominator = (ma * ma + mb * mb + SSIM_C1) * (va + vb + SSIM_C2);
-            f64::from(numerator / denominator)
-        })
-        .sum();
-    sum / a.len().max(1) as f64
+    SsimTerms::new(a, b, width).sum() / a.len().max(1) as f64
+}
+
+/// What the structural similarity of two images is made of at each pixel.
+pub(crate) struct SsimTerms<'a> {
+    images: [&'a [f32]; 2],
+    width: usize,
+    kernel: Vec<f32>,
+    means: [Vec<f32>; 2],
+    /// Local means of the squares of both images, and of their product.
+    products: [Vec<f32>; 3],
+}
+
+impl<'a> SsimTerms<'a> {
+    pub(crate) fn new(a: &'a [f32], b: &'a [f32], width: usize) -> Self {
+        let kernel = gaussian_kernel(SSIM_SIGMA_PX, SSIM_RADIUS_PX);
+        let local_mean = |values: &[f32]| convolve_separable(values, width, &kernel);
+        let product = |p: &[f32], q: &[f32]| p.iter().zip(q).map(|(p, q)| p * q).collect::<Vec<f32>>();
+        let means = [local_mean(a), local_mean(b)];
+        let products = [(a, a), (b, b), (a, b)].map(|(p, q)| local_mean(&product(p, q)));
+        Self {
+            images: [a, b],
+            width,
+            kernel,
+            means,
+            products,
+        }
+    }
+
+    /// The similarity at a pixel is `luminance · structure / (energy · variance)`.
+    fn factors(&self, pixel: usize) -> SsimFactors {
+        let [ma, mb] = [self.means[0][pixel], self.means[1][pixel]];
+        let [aa, bb, ab] = [0, 1, 2].map(|part: usize| self.products[part][pixel]);
+        SsimFactors {
+            means: [ma, mb],
+            luminance: 2.0 * ma * mb + SSIM_C1,
+            structure: 2.0 * (ab - ma * mb) + SSIM_C2,
+            energy: ma * ma + mb * mb + SSIM_C1,
+            variance: (aa - ma * ma) + (bb - mb * mb) + SSIM_C2,
+        }
+    }
+
+    /// The sum over all pixels.
+    pub(crate) fn sum(&self) -> f64 {
+        (0..self.images[0].len())
+            .map(|pixel| f64::from(self.factors(pixel).similarity()))
+            .sum()
+    }
+
+    /// The gradient of [`SsimTerms::sum`] with respect to the first image.
+    pub(crate) fn gradient(&self) -> Vec<f32> {
+        let pixels = self.images[0].len();
+        // With respect to the local mean, the local mean of the square, and that of the product.
+        let (mut mean, mut square, mut product) = (Vec::with_capacity(pixels), vec![0.0; pixels], vec![0.0; pixels]);
+        for pixel in 0..pixels {
+            let factors = self.factors(pixel);
+            let [ma, mb] = factors.means;
+            let denominator = factors.energy * factors.variance;
+            let similarity = factors.similarity();
+            product[pixel] = 2.0 * factors.luminance / denominator;
+            square[pixel] = -similarity / factors.variance;
+            mean.push(
+                2.0 * mb * (factors.structure - factors.luminance) / denominator
+                    - 2.0 * ma * similarity * (1.0 / factors.energy - 1.0 / factors.variance),
+            );
+        }
+        let adjoint = |values: &[f32]| convolve_separable_adjoint(values, self.width, &self.kernel);
+        let [mean, square, product] = [&mean, &square, &product].map(|values| adjoint(values));
+        let [a, b] = self.images;
+        (0..pixels)
+            .map(|pixel| mean[pixel] + 2.0 * a[pixel] * square[pixel] + b[pixel] * product[pixel])
+            .collect()
+    }
+}
+
+struct SsimFactors {
+    means: [f32; 2],
+    luminance: f32,
+    structure: f32,
+    energy: f32,
+    variance: f32,
+}
+
+impl SsimFactors {
+    fn similarity(&self) -> f32 {
+        self.luminance * self.structure / (self.energy * self.variance)
+    }
 }
 
 #[cfg(test)]
@@ -72,5 +140,30 @@ mod tests {
         let (a, b) = (vec![0.2; 256], vec![0.6; 256]);
         let expected = (2.0 * 0.12 + 1e-4) / (0.04 + 0.36 + 1e-4);
         assert!((ssim(&a, &b, 16) - expected).abs() < 1e-3);
+    }
+
+    #[test]
+    fn the_gradient_of_ssim_matches_finite_differences() {
+        let (width, pixels) = (14, 14 * 12);
+        let wave = |step: f32, phase: f32| {
+            (0..pixels)
+                .map(|i| 0.5 + 0.4 * (i as f32 * step + phase).sin())
+                .collect()
+        };
+        let (a, b): (Vec<f32>, Vec<f32>) = (wave(0.37, 0.0), wave(0.41, 0.8));
+        let gradient = SsimTerms::new(&a, &b, width).gradient();
+        for pixel in [0, 5, 13, 40, 77, 167] {
+            let at = |change: f32| {
+                let mut moved = a.clone();
+                moved[pixel] += change;
+                SsimTerms::new(&moved, &b, width).sum()
+            };
+            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
+            assert!(
+                (slope - f64::from(gradient[pixel])).abs() < 5e-3 * slope.abs().max(0.2),
+                "{pixel}: {slope} {}",
+                gradient[pixel]
+            );
+        }
     }
 }

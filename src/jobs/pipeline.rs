@@ -162,6 +162,7 @@ impl Pipeline {
             dataset: &dataset,
             run_dir: &run_dir,
             command: &command(spec),
+            start: None,
         };
         let mut reporter = TrainingReporter {
             report,

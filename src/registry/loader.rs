@@ -24,8 +24,30 @@ pub struct LoadedModel {
     pub model: Model,
 }
 
+/// A model's verified weights, from which a training can start.
+#[derive(Clone, Debug)]
+pub struct StoredWeights {
+    /// The model's description.
+    pub manifest: Manifest,
+    /// All tensors, as f32.
+    pub parameters: Parameters,
+}
+
 /// Reads, verifies and builds the model in a directory. Errors: `Io`, `Manifest`, `Hash`, `Safetensors`, `Weights`.
 pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
+    let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
+    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
+        path: model_dir.join(WEIGHTS_FILE),
+        source,
+    })?;
+    Ok(LoadedModel {
+        manifest: Arc::new(manifest),
+        model,
+    })
+}
+
+/// Reads and verifies the weights in a directory. Errors: as [`load`].
+pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let manifest = manifest::read(model_dir)?;
     let path = model_dir.join(WEIGHTS_FILE);
     let read_failed = |source| RegistryError::Io {
@@ -53,16 +75,9 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
             path: path.clone(),
             source,
         })?;
-    let wrong_weights = |source| RegistryError::Weights {
-        path: path.clone(),
-        source,
-    };
-    let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect()).map_err(wrong_weights)?;
-    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(wrong_weights)?;
-    Ok(LoadedModel {
-        manifest: Arc::new(manifest),
-        model,
-    })
+    let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect())
+        .map_err(|source| RegistryError::Weights { path, source })?;
+    Ok(StoredWeights { manifest, parameters })
 }
 
 /// As [`load`], under another name than the manifest's. Errors: as [`load`].

@@ -5,6 +5,7 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 use super::TrainError;
+use super::augment::{ACTION, Augmentation, STATE, WindowChange};
 use super::config::Target;
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
@@ -18,6 +19,24 @@ pub(super) struct FrameSource<'a> {
     dataset: &'a Dataset,
     preprocess: Preprocess,
     target: Preprocess,
+    augmentation: Augmentation,
+}
+
+/// A window of a batch, and how it is changed.
+#[derive(Clone, Copy)]
+pub(super) struct DrawnWindow<'a> {
+    pub(super) window: &'a Window,
+    pub(super) change: WindowChange,
+}
+
+impl<'a> DrawnWindow<'a> {
+    /// The window as it was recorded.
+    pub(super) fn unchanged(window: &'a Window) -> Self {
+        Self {
+            window,
+            change: WindowChange::NONE,
+        }
+    }
 }
 
 /// One batch of windows.
@@ -37,7 +56,12 @@ pub(super) struct WindowBatch {
 }
 
 impl<'a> FrameSource<'a> {
-    pub(super) fn new(dataset: &'a Dataset, preprocess: Preprocess, target: Target) -> Self {
+    pub(super) fn new(
+        dataset: &'a Dataset,
+        preprocess: Preprocess,
+        target: Target,
+        augmentation: Augmentation,
+    ) -> Self {
         let target = match target {
             Target::Sharp => Preprocess {
                 blur_sigma_px: 0.0,
@@ -49,30 +73,37 @@ impl<'a> FrameSource<'a> {
             dataset,
             preprocess,
             target,
+            augmentation,
         }
+    }
+
+    /// The augmentation of training windows.
+    pub(super) fn augmentation(&self) -> &Augmentation {
+        &self.augmentation
     }
 
     /// The frames as inputs of the encoder, `[N, P]`.
     pub(super) fn inputs(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.preprocessed(self.preprocess, frames)
+        self.preprocessed(self.preprocess, &unchanged(frames))
     }
 
     /// The frames as targets of the decoder, `[N, P]`.
     pub(super) fn targets(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
-        self.preprocessed(self.target, frames)
+        self.preprocessed(self.target, &unchanged(frames))
     }
 
-    fn preprocessed(&self, preprocess: Preprocess, frames: &[usize]) -> Result<Tensor, TrainError> {
+    fn preprocessed(&self, preprocess: Preprocess, frames: &[(usize, WindowChange)]) -> Result<Tensor, TrainError> {
         let info = self.dataset.info();
         let pixels = info.frame_pixels();
         let mut values = vec![0.0; frames.len() * pixels];
         values
             .par_chunks_exact_mut(pixels)
             .zip(frames)
-            .try_for_each(|(out, &frame)| {
+            .try_for_each(|(out, &(frame, change))| {
                 let pixels = self.dataset.pixels(frame).to_vec();
                 let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels)?;
                 out.copy_from_slice(&preprocess.forward(&frame));
+                change.apply(out, info.frame_width_px as usize, preprocess.invert);
                 Ok::<(), TrainError>(())
             })?;
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
@@ -81,63 +112,79 @@ impl<'a> FrameSource<'a> {
     /// One batch of windows. `future` is made only if `with_future`.
     pub(super) fn windows(
         &self,
-        windows: &[&Window],
+        windows: &[DrawnWindow<'_>],
         shape: WindowShape,
         with_future: bool,
     ) -> Result<WindowBatch, TrainError> {
         let (context, horizon) = (shape.context, shape.horizon);
-        let span = |from: usize, length: usize| -> Vec<usize> {
-            windows
-                .iter()
-                .flat_map(|w| w.first_frame + from..w.first_frame + from + length)
-                .collect()
+        let span = |from: usize, length: usize| -> Vec<(usize, WindowChange)> {
+            let frames = |drawn: &DrawnWindow| {
+                let (first, change) = (drawn.window.first_frame + from, drawn.change);
+                (first..first + length).map(move |frame| (frame, change))
+            };
+            windows.iter().flat_map(frames).collect()
         };
+        let inputs = |frames: &[(usize, WindowChange)]| self.preprocessed(self.preprocess, frames);
+        let targets = |frames: &[(usize, WindowChange)]| self.preprocessed(self.target, frames);
         let (past, future) = (span(0, context), span(context, horizon));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         Ok(WindowBatch {
-            inputs: batched(self.inputs(&past)?, context)?,
-            input_targets: batched(self.targets(&past)?, context)?,
+            inputs: batched(inputs(&past)?, context)?,
+            input_targets: batched(targets(&past)?, context)?,
             future: with_future
-                .then(|| self.inputs(&future))
+                .then(|| inputs(&future))
                 .transpose()?
                 .map(|f| batched(f, horizon))
                 .transpose()?,
-            targets: batched(self.targets(&future)?, horizon)?,
+            targets: batched(targets(&future)?, horizon)?,
             condition: self.condition(windows, shape)?,
             future_states: self.future_states(windows, shape)?,
         })
     }
 
-    fn future_states(&self, windows: &[&Window], shape: WindowShape) -> Result<Option<Tensor>, TrainError> {
+    fn future_states(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<Option<Tensor>, TrainError> {
         let states = self.dataset.info().state_channels.len();
         if states == 0 {
             return Ok(None);
         }
-        let values: Vec<f32> = windows
-            .iter()
-            .map(|window| window.first_frame + shape.context)
-            .flat_map(|first| (first..first + shape.horizon).flat_map(|frame| self.dataset.state(frame)))
-            .copied()
-            .collect();
+        let mut values = Vec::with_capacity(windows.len() * shape.horizon * states);
+        for drawn in windows {
+            let first = drawn.window.first_frame + shape.context;
+            for frame in first..first + shape.horizon {
+                self.push(&mut values, STATE, (frame, drawn.change));
+            }
+        }
         let shape = (windows.len(), shape.horizon, states);
         Ok(Some(Tensor::from_vec(values, shape, &Device::Cpu)?))
     }
 
-    fn condition(&self, windows: &[&Window], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {
+    /// Appends a frame's action or state as it is in the changed window.
+    fn push(&self, values: &mut Vec<f32>, kind: usize, (frame, change): (usize, WindowChange)) {
+        let from = values.len();
+        values.extend_from_slice(if kind == ACTION {
+            self.dataset.action(frame)
+        } else {
+            self.dataset.state(frame)
+        });
+        if change.is_mirrored {
+            self.augmentation.turn_signs(kind, &mut values[from..]);
+        }
+    }
+
+    fn condition(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {
         let (actions, states) = (
             self.dataset.info().action_channels.len(),
             self.dataset.info().state_channels.len(),
         );
-        let last_inputs = || windows.iter().map(|window| window.first_frame + shape.context - 1);
-        // An action acts from its frame to the next one, so the action of the last input leads to the first target.
-        let future: Vec<f32> = last_inputs()
-            .flat_map(|last| (last..last + shape.horizon).flat_map(|frame| self.dataset.action(frame)))
-            .copied()
-            .collect();
-        let present: Vec<f32> = last_inputs()
-            .flat_map(|last| self.dataset.state(last))
-            .copied()
-            .collect();
+        let (mut future, mut present) = (Vec::new(), Vec::new());
+        for drawn in windows {
+            // An action acts from its frame to the next one, so the action of the last input leads to the first target.
+            let last = drawn.window.first_frame + shape.context - 1;
+            for frame in last..last + shape.horizon {
+                self.push(&mut future, ACTION, (frame, drawn.change));
+            }
+            self.push(&mut present, STATE, (last, drawn.change));
+        }
         let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
         Ok(ConditioningTensors {
             actions: (actions > 0)
@@ -148,6 +195,10 @@ impl<'a> FrameSource<'a> {
                 .transpose()?,
         })
     }
+}
+
+fn unchanged(frames: &[usize]) -> Vec<(usize, WindowChange)> {
+    frames.iter().map(|&frame| (frame, WindowChange::NONE)).collect()
 }
 
 /// Draws positions `0..count`, each once per epoch. The order depends only on the seed and the number of the draw, so that a

@@ -86,6 +86,12 @@ pub struct DataConfig {
     pub validation_windows: usize,
     /// The seed of the split into training, validation and test parts.
     pub split_seed: Seed,
+    /// Whether half of the training windows are mirrored left to right.
+    #[serde(default)]
+    pub mirror: Mirror,
+    /// Each training window is made brighter or darker by up to this share, 0 to 0.9.
+    #[serde(default)]
+    pub brightness: f32,
 }
 
 /// A number of windows, or all windows.
@@ -104,6 +110,31 @@ pub enum WindowBudget {
 pub enum All {
     /// `"all"`
     All,
+}
+
+/// Whether training windows are mirrored: `"off"`, or the channels of actions and states whose sign changes in a mirror, as
+/// in `["steering"]`; the list may be empty.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Mirror {
+    /// They are not.
+    Off(Off),
+    /// Half of them are, with the sign of these channels changed.
+    Channels(Vec<String>),
+}
+
+/// The word `off`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Off {
+    /// `"off"`
+    Off,
+}
+
+impl Default for Mirror {
+    fn default() -> Self {
+        Self::Off(Off::Off)
+    }
 }
 
 /// Settings of pre-training (stage 1).
@@ -151,6 +182,9 @@ pub struct FitConfig {
     /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
     /// trained.
     pub reconstruction_weight: f64,
+    /// Weight of the similarity loss (flow network): 1 minus the structural similarity of the predicted frames.
+    #[serde(default)]
+    pub ssim_weight: f64,
     /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
     #[serde(default)]
     pub scene_weight: f64,
@@ -252,8 +286,10 @@ impl TrainConfig {
             ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
             ("fit.learning_rate", fit.learning_rate, 1.0),
             ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
+            ("fit.ssim_weight", fit.ssim_weight, 100.0),
             ("fit.scene_weight", fit.scene_weight, 100.0),
             ("fit.motion_weight", fit.motion_weight, 100.0),
+            ("data.brightness", f64::from(self.data.brightness), 0.9),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
             ("run.clip_norm", run.clip_norm, 1e6),
         ];

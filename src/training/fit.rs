@@ -2,13 +2,13 @@
 
 use candle_core::Tensor;
 
-use super::batches::{Shuffle, WindowBatch};
+use super::batches::{DrawnWindow, Shuffle, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
 use super::observer::TrainingStage;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan};
-use crate::dataset::Window;
 use crate::nn::loss::Loss;
+use crate::nn::ssim_loss::ssim_loss;
 use crate::nn::{Architecture, Feedback, Model, Parameters};
 
 /// Prefix of the names of the codec's tensors.
@@ -50,6 +50,11 @@ impl<'a> SequenceObjective<'a> {
             return Err(TrainError::Config("only the flow network has this loss".to_owned()));
         };
         let mut loss = fit.loss.between(&predicted.frames, &batch.targets)?;
+        if fit.ssim_weight > 0.0 {
+            let width = self.plan.spec.frame_width_px as usize;
+            let similarity = ssim_loss(&predicted.frames, &batch.targets, width)?;
+            loss = (loss + (similarity * fit.ssim_weight)?)?;
+        }
         if fit.scene_weight > 0.0 {
             let scene = fit.loss.between(&predicted.scene, &batch.targets)?;
             loss = (loss + (scene * fit.scene_weight)?)?;
@@ -87,8 +92,12 @@ impl Objective for SequenceObjective<'_> {
 
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
         let fit = &self.config.fit;
-        let drawn = part.of(self.shuffle.batch(step, fit.batch_size));
-        let windows: Vec<&Window> = drawn.into_iter().map(|position| &self.plan.train[position]).collect();
+        let drawn = self.shuffle.batch(step, fit.batch_size).into_iter().enumerate();
+        let windows = drawn.map(|(place, position)| DrawnWindow {
+            window: &self.plan.train[position],
+            change: self.plan.source.augmentation().draw(step, place),
+        });
+        let windows = part.of(windows.collect());
         let is_teacher_forced = fit.feedback == TrainingFeedback::TeacherForcing;
         let batch = self
             .plan
@@ -123,7 +132,7 @@ impl Objective for SequenceObjective<'_> {
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
         let model = Model::new(self.plan.spec.clone(), parameters)?;
-        let windows: Vec<&Window> = self.plan.validation.iter().collect();
+        let windows: Vec<DrawnWindow> = self.plan.validation.iter().map(DrawnWindow::unchanged).collect();
         let mut sum = 0.0;
         for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
             let batch = self.plan.source.windows(chunk, self.config.window_shape(), false)?;

@@ -1,7 +1,8 @@
 //! The presets, and how a file and single settings change them.
 
-use super::TrainError;
 use super::config::TrainConfig;
+use super::{START_KEY, TrainError};
+use crate::registry::Manifest;
 use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// Name and text of each preset.
@@ -46,6 +47,30 @@ impl TrainConfig {
             .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
         let origin = format!("preset {preset}");
         let written = SettingsLayer::toml(&origin, text).map_err(|error| config_error(&error))?;
+        Self::over(written, origin, layers)
+    }
+
+    /// The settings with which a model was trained, without its pre-training, under layers of settings, checked.
+    /// Errors: `Config` with the field that is wrong.
+    pub fn of_model(manifest: &Manifest, layers: impl IntoIterator<Item = SettingsLayer>) -> Result<Self, TrainError> {
+        let origin = format!("model {}", manifest.name);
+        let mut settings = manifest.training.clone();
+        if let Some(settings) = settings.as_object_mut() {
+            settings.remove(START_KEY);
+        }
+        // Its codec has been trained already.
+        if let Some(steps) = settings.pointer_mut("/pretrain/steps") {
+            *steps = 0.into();
+        }
+        let written = SettingsLayer::serialized(&origin, &settings);
+        Self::over(written, origin, layers)
+    }
+
+    fn over(
+        written: SettingsLayer,
+        origin: String,
+        layers: impl IntoIterator<Item = SettingsLayer>,
+    ) -> Result<Self, TrainError> {
         let written: Self = extract(written, [])?;
         // With the settings that the preset's text leaves out, so that they can be given too.
         let defaults = SettingsLayer::serialized(origin, &written);
@@ -65,7 +90,12 @@ fn extract(
 
 /// What a setting must be, where its type does not say it well.
 fn expected(key: &str) -> Option<String> {
-    (key == "data.windows").then(|| "a whole number, 1 or more, or \"all\"".to_owned())
+    let expected = match key {
+        "data.windows" => "a whole number, 1 or more, or \"all\"",
+        "data.mirror" => "\"off\", or a list of the channels whose sign changes, as in [\"steering\"]",
+        _ => return None,
+    };
+    Some(expected.to_owned())
 }
 
 fn config_error(error: &SettingsError) -> TrainError {

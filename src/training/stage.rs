@@ -43,7 +43,7 @@ pub(super) struct BatchPart {
 
 impl BatchPart {
     /// This part of the batch's items.
-    pub(super) fn of(self, items: Vec<usize>) -> Vec<usize> {
+    pub(super) fn of<T>(self, items: Vec<T>) -> Vec<T> {
         let size = items.len() / self.count;
         items.into_iter().skip(self.index * size).take(size).collect()
     }

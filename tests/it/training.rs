@@ -5,7 +5,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
-use foreframe::registry;
+use foreframe::registry::{self, StoredWeights};
+use foreframe::settings::SettingsLayer;
 use foreframe::sim::{Scenario, TrialParameters, WorldConfig};
 use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
 use foreframe::types::Seed;
@@ -79,6 +80,7 @@ fn train_until(
         dataset,
         run_dir: dir,
         command: "test",
+        start: None,
     };
     let mut observer = |event: TrainingEvent| {
         if let TrainingEvent::Step { .. } = event {
@@ -146,6 +148,7 @@ fn training_lowers_the_loss_and_publishes_a_model() {
         dataset: &dataset,
         run_dir: dir.path(),
         command: "test",
+        start: None,
     };
     let mut observer = |event: TrainingEvent| {
         if let TrainingEvent::Step { loss, .. } = event {
@@ -166,6 +169,100 @@ fn training_lowers_the_loss_and_publishes_a_model() {
     let loaded = registry::load(&model_dir).unwrap();
     assert_eq!(loaded.manifest.weights_sha256, manifest.weights_sha256);
     assert_eq!(loaded.manifest.spec.actions[0].name, "speed");
+}
+
+/// The validation loss of the first step, from new weights or from those of a model.
+fn first_loss(config: &TrainConfig, dataset: &Dataset, start: Option<&StoredWeights>) -> Result<f64, TrainError> {
+    let dir = tempfile::tempdir().unwrap();
+    let training = Training {
+        config,
+        dataset,
+        run_dir: dir.path(),
+        command: "test",
+        start,
+    };
+    let mut first = None;
+    let mut observer = |event: TrainingEvent| {
+        if let TrainingEvent::Step { loss, .. } = event {
+            first.get_or_insert(loss);
+        }
+    };
+    run(&training, &mut observer, &AtomicBool::new(false))?;
+    Ok(first.unwrap())
+}
+
+#[test]
+fn a_training_can_start_from_a_model() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train(&small_config(&["fit.steps=200"]), &dataset, dir.path()).unwrap();
+    let start = registry::load_weights(&dir.path().join("model")).unwrap();
+    let layers = ["fit.steps=2", "seed=7"].map(|setting| SettingsLayer::assignment(setting).unwrap());
+    let config = TrainConfig::of_model(&start.manifest, layers).unwrap();
+    assert_eq!((config.pretrain.steps, config.fit.steps), (0, 2));
+    let (tuned, new) = (
+        first_loss(&config, &dataset, Some(&start)).unwrap(),
+        first_loss(&config, &dataset, None).unwrap(),
+    );
+    assert!(tuned < 0.7 * new, "{tuned} {new}");
+}
+
+#[test]
+fn a_fine_tuned_model_names_its_origin_and_can_be_tuned_again() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train(&small_config(&[]), &dataset, &dir.path().join("first")).unwrap();
+    let mut start = registry::load_weights(&dir.path().join("first/model")).unwrap();
+    for name in ["second", "third"] {
+        let config =
+            TrainConfig::of_model(&start.manifest, [SettingsLayer::assignment("fit.steps=3").unwrap()]).unwrap();
+        let run_dir = dir.path().join(name);
+        let training = Training {
+            config: &config,
+            dataset: &dataset,
+            run_dir: &run_dir,
+            command: "test",
+            start: Some(&start),
+        };
+        run(&training, &mut |_: TrainingEvent| (), &AtomicBool::new(false)).unwrap();
+        let tuned = registry::load_weights(&run_dir.join("model")).unwrap();
+        let origin = &tuned.manifest.training["from"]["weights_sha256"];
+        assert_eq!(origin.as_str(), Some(start.manifest.weights_sha256.as_str()));
+        start = tuned;
+    }
+}
+
+#[test]
+fn weights_of_another_network_are_refused() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train(&small_config(&[]), &dataset, dir.path()).unwrap();
+    let start = registry::load_weights(&dir.path().join("model")).unwrap();
+    let error = first_loss(&small_config(&["model.hidden=16"]), &dataset, Some(&start)).unwrap_err();
+    let message = error.to_string();
+    assert!(
+        message.starts_with("the training cannot start from the model \"square\": "),
+        "{message}"
+    );
+    assert!(
+        message.ends_with("it needs the same frame size, layers and numbers of channels"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_mirror_needs_channels_that_exist() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train(
+        &small_config(&["data.mirror=[\"speed\"]", "data.brightness=0.2"]),
+        &dataset,
+        dir.path(),
+    )
+    .unwrap();
+    let other = tempfile::tempdir().unwrap();
+    let error = train(&small_config(&["data.mirror=[\"sped\"]"]), &dataset, other.path()).unwrap_err();
+    let message = error.to_string();
+    assert!(
+        message.starts_with("data.mirror names \"sped\", which is no channel of this data set; there are: speed"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -1,0 +1,148 @@
+//! Changes of training windows that a robot could have seen as well: mirrored, brighter, darker.
+
+use rand::Rng;
+
+use super::TrainError;
+use super::config::{DataConfig, Mirror};
+use crate::dataset::DatasetInfo;
+use crate::types::{Channel, Seed};
+
+/// The kinds of channels.
+pub(super) const ACTION: usize = 0;
+pub(super) const STATE: usize = 1;
+
+/// How training windows are changed; drawn anew for each window of each step.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Augmentation {
+    /// Channels of actions and of states whose sign changes in a mirror; `None` if windows are not mirrored.
+    mirror: Option<[Vec<usize>; 2]>,
+    /// The largest relative change of brightness.
+    brightness: f32,
+    seed: Seed,
+}
+
+/// The change of one window.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct WindowChange {
+    pub(super) is_mirrored: bool,
+    /// Factor of all intensities.
+    pub(super) gain: f32,
+}
+
+impl WindowChange {
+    /// No change.
+    pub(super) const NONE: Self = Self {
+        is_mirrored: false,
+        gain: 1.0,
+    };
+
+    /// Changes a frame's intensities, 0 to 1, row by row; `inverted` ones if the model inverts.
+    pub(super) fn apply(self, values: &mut [f32], width: usize, is_inverted: bool) {
+        if self.is_mirrored {
+            values.chunks_exact_mut(width).for_each(<[f32]>::reverse);
+        }
+        if self.gain == 1.0 {
+            return;
+        }
+        for value in values {
+            let intensity = if is_inverted { 1.0 - *value } else { *value };
+            let changed = (intensity * self.gain).clamp(0.0, 1.0);
+            *value = if is_inverted { 1.0 - changed } else { changed };
+        }
+    }
+}
+
+impl Augmentation {
+    /// As the settings say. Errors: `Config` for a channel that the data set does not have.
+    pub(super) fn new(config: &DataConfig, info: &DatasetInfo, seed: Seed) -> Result<Self, TrainError> {
+        Ok(Self {
+            mirror: match &config.mirror {
+                Mirror::Off(_) => None,
+                Mirror::Channels(names) => Some(signed_channels(names, info)?),
+            },
+            brightness: config.brightness,
+            seed: seed.derive("augment", 0),
+        })
+    }
+
+    /// The change of the window at this position of this step's batch.
+    pub(super) fn draw(&self, step: usize, position: usize) -> WindowChange {
+        if self.mirror.is_none() && self.brightness == 0.0 {
+            return WindowChange::NONE;
+        }
+        let mut rng = self
+            .seed
+            .derive("step", step as u64)
+            .derive("window", position as u64)
+            .rng();
+        WindowChange {
+            is_mirrored: rng.random::<bool>() && self.mirror.is_some(),
+            gain: 1.0 + self.brightness * rng.random_range(-1.0f32..=1.0),
+        }
+    }
+
+    /// Changes the sign of the channels of an action or a state, as a mirror does.
+    pub(super) fn turn_signs(&self, kind: usize, values: &mut [f32]) {
+        let channels = self.mirror.iter().flat_map(|channels| &channels[kind]);
+        for &channel in channels {
+            values[channel] = -values[channel];
+        }
+    }
+}
+
+fn signed_channels(names: &[String], info: &DatasetInfo) -> Result<[Vec<usize>; 2], TrainError> {
+    let kinds = [&info.action_channels, &info.state_channels];
+    let known = || -> Vec<&str> {
+        kinds
+            .iter()
+            .flat_map(|kind| kind.iter())
+            .map(|channel| channel.name.as_str())
+            .collect()
+    };
+    if let Some(name) = names.iter().find(|name| !known().contains(&name.as_str())) {
+        return Err(TrainError::Config(format!(
+            "data.mirror names {name:?}, which is no channel of this data set; there are: {}",
+            known().join(", ")
+        )));
+    }
+    let positions = |channels: &[Channel]| {
+        let is_named = |channel: &Channel| names.contains(&channel.name);
+        channels
+            .iter()
+            .enumerate()
+            .filter(|(_, channel)| is_named(channel))
+            .map(|(index, _)| index)
+            .collect()
+    };
+    Ok(kinds.map(|channels| positions(channels)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mirrored_frame_is_reversed_row_by_row() {
+        let mut values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+        let change = WindowChange {
+            is_mirrored: true,
+            gain: 1.0,
+        };
+        change.apply(&mut values, 3, false);
+        assert_eq!(values, [0.3, 0.2, 0.1, 0.6, 0.5, 0.4]);
+    }
+
+    #[test]
+    fn brightness_changes_the_camera_s_intensities() {
+        let change = WindowChange {
+            is_mirrored: false,
+            gain: 2.0,
+        };
+        let mut plain = [0.25, 0.75];
+        change.apply(&mut plain, 2, false);
+        assert_eq!(plain, [0.5, 1.0]);
+        let mut inverted = [0.75, 0.25];
+        change.apply(&mut inverted, 2, true);
+        assert_eq!(inverted, [0.5, 0.0]);
+    }
+}
