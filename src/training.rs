@@ -12,6 +12,7 @@ pub mod optimizer;
 mod preset;
 mod pretrain;
 mod principal_components;
+mod random_codec;
 mod stage;
 
 use std::path::{Path, PathBuf};
@@ -31,10 +32,10 @@ use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
 use crate::files::write_atomically;
 use crate::frame::FrameError;
-use crate::nn::{ModelSpec, NnError, Parameters};
+use crate::nn::{Architecture, ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError, StoredWeights};
 
-/// Largest number of frames from which the principal components are computed.
+/// Largest number of frames from which the codec's initial weights are computed.
 const MAX_PRINCIPAL_FRAMES: usize = 8192;
 
 /// The entry of a manifest's training settings that names the model whose weights the training started from.
@@ -263,14 +264,20 @@ fn initial_parameters(
         return start_parameters(plan, start).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
-    if config.pretrain.start == CodecStart::Principal {
-        let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
-        let stride = frames.len().div_ceil(MAX_PRINCIPAL_FRAMES).max(1);
-        let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
-        let (inputs, targets) = (plan.source.inputs(&frames)?, plan.source.targets(&frames)?);
-        let seed = config.seed.derive("principal", 0);
-        if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
-            return Ok(None);
+    if plan.spec.architecture == Architecture::Flow {
+        return Ok(Some(parameters));
+    }
+    let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
+    let stride = frames.len().div_ceil(MAX_PRINCIPAL_FRAMES).max(1);
+    let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
+    let (inputs, targets) = (plan.source.inputs(&frames)?, plan.source.targets(&frames)?);
+    match config.pretrain.start {
+        CodecStart::Random => random_codec::centre(&parameters, &inputs, &targets)?,
+        CodecStart::Principal => {
+            let seed = config.seed.derive("principal", 0);
+            if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
+                return Ok(None);
+            }
         }
     }
     Ok(Some(parameters))

@@ -157,7 +157,7 @@ pub struct PretrainConfig {
 pub enum CodecStart {
     /// The principal components of the training frames.
     Principal,
-    /// Random weights.
+    /// Random weights, with biases that centre the features.
     Random,
 }
 
