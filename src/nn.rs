@@ -50,7 +50,7 @@ pub use flow_spec::FlowLayers;
 pub use loss::Loss;
 pub use model::Model;
 pub use parameters::Parameters;
-pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, Reconstruction};
+pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, PredictorOutput, Reconstruction};
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]

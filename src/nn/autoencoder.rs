@@ -6,7 +6,7 @@ use super::conditioned::ConditioningTensors;
 use super::dense::{Activation, Dense};
 use super::lstm::{Decoder, unroll};
 use super::lstm_cell::{LstmState, PeepholeCell};
-use super::{ModelSpec, NnError, Parameters, Reconstruction};
+use super::{ModelSpec, NnError, Parameters, PredictorOutput, Reconstruction};
 
 /// What the predictor gets as the previous frame in each step.
 #[derive(Clone, Copy, Debug)]
@@ -92,7 +92,7 @@ impl DenseModel {
 
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The
     /// predictor starts from the encoder's last state. Step k gets the features of frame k, the action that leads to frame
-    /// k + 1, and the state; its output is added to the features. Errors: `Shape`, `Missing`.
+    /// k + 1, and the state; its output is added to the features unless the specification says `absolute`. Errors: `Shape`, `Missing`.
     pub(super) fn predict(
         &self,
         features: &Tensor,
@@ -119,7 +119,11 @@ impl DenseModel {
         };
         let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
         let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
-        Ok((previous + changes.reshape(target.dims())?)?)
+        let outputs = changes.reshape(target.dims())?;
+        Ok(match self.spec.predictor_output {
+            PredictorOutput::Residual => (previous + outputs)?,
+            PredictorOutput::Absolute => outputs,
+        })
     }
 
     /// Predicts the features `[N, horizon, F]` of N rollouts from B windows with `features` `[B, context, F]`. Rollout n
@@ -155,7 +159,7 @@ impl DenseModel {
         let decoder = Decoder {
             cell: &self.predictor,
             output: &self.predictor_output,
-            residual: true,
+            residual: self.spec.predictor_output == PredictorOutput::Residual,
         };
         decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
     }

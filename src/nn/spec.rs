@@ -109,6 +109,23 @@ named_enum!(
 );
 
 named_enum!(
+    /// What the dense network's predictor gives at each step.
+    PredictorOutput, "predictor output", "\"residual\" and \"absolute\"", {
+        /// The change of the features since the previous frame.
+        Residual = "residual",
+        /// The features themselves, as in the paper.
+        Absolute = "absolute",
+    }
+);
+
+impl PredictorOutput {
+    /// That of specifications that name none.
+    pub(crate) fn residual() -> Self {
+        Self::Residual
+    }
+}
+
+named_enum!(
     /// The inputs of a prediction besides the context frames.
     Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
         /// No further inputs.
@@ -177,6 +194,9 @@ pub struct ModelSpec {
     pub hidden: usize,
     /// How the context frames are reconstructed.
     pub reconstruction: Reconstruction,
+    /// What the predictor gives at each step; not used by the flow network.
+    #[serde(default = "PredictorOutput::residual")]
+    pub predictor_output: PredictorOutput,
     /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
     /// Components of an action in the training data; used only if `conditioning` includes actions.
@@ -204,6 +224,7 @@ impl Default for ModelSpec {
             features: 128,
             hidden: 256,
             reconstruction: Reconstruction::Sequence,
+            predictor_output: PredictorOutput::Residual,
             conditioning: Conditioning::None,
             actions: Vec::new(),
             states: Vec::new(),

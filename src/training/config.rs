@@ -7,7 +7,7 @@ use super::optimizer::AdamConfig;
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
 use crate::nn::loss::Loss;
-use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, Reconstruction};
+use crate::nn::{Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, PredictorOutput, Reconstruction};
 use crate::types::{Channel, Seed};
 
 /// Largest number of steps of one stage.
@@ -55,6 +55,9 @@ pub struct ModelConfig {
     /// Which of the paper's two approaches reconstructs the context (dense network).
     #[serde(default = "default_reconstruction")]
     pub reconstruction: Reconstruction,
+    /// Whether the predictor gives the change of the features or the features themselves (dense network).
+    #[serde(default = "PredictorOutput::residual")]
+    pub predictor_output: PredictorOutput,
     /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
     /// How frames are converted to the model's value range.
@@ -344,6 +347,7 @@ impl TrainConfig {
             features: model.features,
             hidden: model.hidden,
             reconstruction: model.reconstruction,
+            predictor_output: model.predictor_output,
             conditioning: model.conditioning,
             actions,
             states,

@@ -1,7 +1,7 @@
 //! Small models and inputs for the tests of the network.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{ChannelScale, Conditioning, ConditioningTensors, ModelSpec, Reconstruction};
+use foreframe::nn::{ChannelScale, Conditioning, ConditioningTensors, ModelSpec, PredictorOutput, Reconstruction};
 
 pub(crate) fn channel(name: &str, mean: f32, std: f32) -> ChannelScale {
     ChannelScale {
@@ -67,6 +67,13 @@ pub(crate) fn all_kinds() -> Vec<(ModelSpec, bool)> {
                 kinds.push((tiny(conditioning, reconstruction), truth));
             }
         }
+    }
+    for truth in [false, true] {
+        let absolute = ModelSpec {
+            predictor_output: PredictorOutput::Absolute,
+            ..tiny(Conditioning::StateAction, Reconstruction::Sequence)
+        };
+        kinds.push((absolute, truth));
     }
     kinds
 }
