@@ -25,7 +25,7 @@ mod rendered_robot;
 pub mod robot;
 pub mod scenario;
 
-pub use config::{CameraConfig, WorldConfig};
+pub use config::{CameraConfig, Look, WorldConfig};
 pub use environment::Environment;
 pub use error::SimError;
 pub use scenario::{PidGains, Scenario, TrialParameters};

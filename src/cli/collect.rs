@@ -10,7 +10,7 @@ use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::collect::{CollectConfig, collect};
 use crate::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
 use crate::jobs::spec::MAX_TRIALS;
-use crate::sim::{Scenario, WorldConfig};
+use crate::sim::{Look, Scenario, WorldConfig};
 use crate::training::TrainConfig;
 use crate::training::config::WindowBudget;
 use crate::types::Seed;
@@ -54,6 +54,9 @@ pub(super) struct CollectArgs {
     /// Standard deviation of the camera noise; white is 1
     #[arg(long, value_name = "STD", default_value_t = WorldConfig::default().camera.noise_std)]
     noise: f64,
+    /// What the room looks like: gray, or bright (white walls and floor, so that only robots stand out)
+    #[arg(long, default_value_t = Look::Gray)]
+    look: Look,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -68,6 +71,7 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     config.world.frame_width_px = args.frame_size;
     config.world.frame_height_px = args.frame_size;
     config.world.camera.noise_std = args.noise;
+    config.world.look = args.look;
     config.threads = args.threads.unwrap_or_default().into();
     config.validate()?;
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("trials"));

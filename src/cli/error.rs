@@ -79,7 +79,7 @@ impl UsageError for SimError {
     fn is_usage(&self) -> bool {
         matches!(
             self,
-            Self::UnknownScenario { .. } | Self::FrameSize { .. } | Self::Setting { .. }
+            Self::UnknownScenario { .. } | Self::UnknownLook { .. } | Self::FrameSize { .. } | Self::Setting { .. }
         )
     }
 }

@@ -11,7 +11,7 @@ use rapier3d::prelude::Vector;
 
 use super::ray_cast::UprightCylinder;
 use super::rendered_robot::{NearestHit, RenderedRobot, RobotView, face};
-use super::{PlanarPose, SimError, WorldConfig, arena};
+use super::{Look, PlanarPose, SimError, WorldConfig, arena};
 use crate::frame::Frame;
 
 /// A pixel at an edge is the mean of a square grid of rays with this many rays on each side.
@@ -45,6 +45,7 @@ pub struct Camera {
     width: usize,
     height: usize,
     noise_std: f32,
+    look: Look,
 }
 
 impl Camera {
@@ -62,6 +63,7 @@ impl Camera {
             width: config.frame_width_px as usize,
             height: config.frame_height_px as usize,
             noise_std: config.camera.noise_std as f32,
+            look: config.look,
         }
     }
 
@@ -189,13 +191,22 @@ impl Camera {
         for view in views {
             view.cast(direction, &mut hit);
         }
+        let mut shade = 1.0;
         if hit.surface == FLOOR {
             let point = self.position + direction * hit.time;
-            hit.albedo *= views
+            shade = views
                 .iter()
                 .map(|view| view.robot.shade(point.x, point.y))
                 .product::<f32>();
         }
+        if self.look == Look::Bright && hit.robot_id == 0 {
+            return RaySample {
+                gray: WHITE * shade,
+                surface: hit.surface,
+                robot_id: 0,
+            };
+        }
+        hit.albedo *= shade;
         let lambert = hit.normal.dot(*LIGHT).max(0.0);
         let distance_squared = direction.length_squared() * hit.time * hit.time;
         let falloff = 1.0 / (1.0 + 0.012 * distance_squared);
@@ -228,6 +239,8 @@ impl Camera {
     }
 }
 
+/// The gray value of a white room.
+const WHITE: f32 = 0.97;
 /// The side of the room that is the floor.
 const FLOOR: u16 = 4;
 

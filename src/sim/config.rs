@@ -1,5 +1,8 @@
 //! Settings of a world and their ranges.
 
+use std::fmt;
+use std::str::FromStr;
+
 use serde::{Deserialize, Serialize};
 
 use super::{SimError, arena};
@@ -43,6 +46,53 @@ impl Default for CameraConfig {
     }
 }
 
+/// What the room looks like.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum Look {
+    /// Walls, pillars and floor in shades of gray.
+    #[default]
+    Gray,
+    /// Walls, pillars and floor are white, so that only the robots and their shadows stand out: bright, sparse frames as in
+    /// the paper.
+    Bright,
+}
+
+impl Look {
+    /// All looks.
+    pub const ALL: [Self; 2] = [Self::Gray, Self::Bright];
+
+    /// `gray` or `bright`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Gray => "gray",
+            Self::Bright => "bright",
+        }
+    }
+
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+    fn is_gray(&self) -> bool {
+        *self == Self::Gray
+    }
+}
+
+impl fmt::Display for Look {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
+
+impl FromStr for Look {
+    type Err = SimError;
+
+    fn from_str(name: &str) -> Result<Self, SimError> {
+        let found = Self::ALL.into_iter().find(|look| look.name() == name);
+        found.ok_or_else(|| SimError::UnknownLook { name: name.to_owned() })
+    }
+}
+
 /// Settings of a world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
@@ -58,6 +108,9 @@ pub struct WorldConfig {
     pub camera: CameraConfig,
     /// Time limit of a trial, in seconds. A trial has the frames before this time; the first frame is at 0 s.
     pub max_duration_s: f64,
+    /// What the room looks like.
+    #[serde(skip_serializing_if = "Look::is_gray")]
+    pub look: Look,
 }
 
 impl Default for WorldConfig {
@@ -68,6 +121,7 @@ impl Default for WorldConfig {
             frame_period_s: 0.2,
             camera: CameraConfig::default(),
             max_duration_s: 8.0,
+            look: Look::Gray,
         }
     }
 }

@@ -14,6 +14,12 @@ pub enum SimError {
         /// The name given.
         name: String,
     },
+    /// No look has this name.
+    #[error("there is no look \"{name}\"; there are gray and bright")]
+    UnknownLook {
+        /// The name given.
+        name: String,
+    },
     /// A frame side is zero or too large.
     #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]
     FrameSize {

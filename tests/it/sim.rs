@@ -3,7 +3,7 @@
 use foreframe::sim::camera::Camera;
 use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
 use foreframe::sim::{
-    Observation, PlanarPose, Scenario, TrialParameters, World, WorldConfig, action_channels, arena, robot,
+    Look, Observation, PlanarPose, Scenario, TrialParameters, World, WorldConfig, action_channels, arena, robot,
     state_channels,
 };
 use foreframe::types::{Action, Seed};
@@ -329,4 +329,20 @@ fn channel_lists_match_actions_and_states() {
     assert_eq!(world.policy_action().as_slice(), [0.0, 0.0]);
     assert_eq!(action_channels().len(), 2);
     assert_eq!(state_channels().len(), world.observe().state.as_slice().len());
+}
+
+#[test]
+fn a_bright_room_is_white_where_no_robot_is() {
+    let bright = WorldConfig {
+        look: Look::Bright,
+        ..WorldConfig::default()
+    };
+    let (seen, _) = whole_trial(Scenario::StaticObserver, Seed(4), 2, &bright);
+    let observation = &seen[0];
+    let pixels = observation.frame.pixels().iter().zip(&observation.mask);
+    let (mut room, mut robot) = (Vec::new(), Vec::new());
+    pixels.for_each(|(&pixel, &id)| if id == 0 { &mut room } else { &mut robot }.push(pixel));
+    let mean = |values: &[u8]| values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len() as f64;
+    assert!(mean(&room) > 240.0, "{}", mean(&room));
+    assert!(mean(&robot) < 160.0, "{}", mean(&robot));
 }
