@@ -1,14 +1,20 @@
 //! The OpenAPI document: what all routes have in common. The routes describe themselves.
 
+mod responses;
+mod variants;
+
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use serde_json::Value;
-use utoipa::openapi::path::ParameterBuilder;
+use utoipa::openapi::RefOr;
+use utoipa::openapi::path::{Parameter, ParameterBuilder};
+use utoipa::openapi::schema::{KnownFormat, Schema, SchemaFormat};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
-use utoipa::openapi::{Content, Header, Ref, RefOr, Response, ResponseBuilder};
 use utoipa::{Modify, OpenApi};
 
+use self::responses::{Responses, operations};
+use self::variants::Variants;
 use super::http::problem::Problem;
 
 #[derive(OpenApi)]
@@ -49,45 +55,25 @@ impl Modify for KeySecurity {
     }
 }
 
-/// What all errors have in common: their media type, when to try again, and that an API key may be missing.
-struct Problems;
+/// Makes the names of operations unique: a name that several resources use gets its tag in front.
+struct OperationIds;
 
-impl Modify for Problems {
+impl Modify for OperationIds {
     fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
-        for (path, item) in &mut contract.paths.paths {
-            let operations = [&mut item.get, &mut item.post, &mut item.delete];
-            for operation in operations.into_iter().flatten() {
-                let responses = &mut operation.responses.responses;
-                if path.starts_with("/v1") {
-                    responses.insert("401".to_owned(), RefOr::T(no_key()));
-                }
-                for (status, response) in responses {
-                    if let RefOr::T(response) = response
-                        && status.starts_with(['4', '5'])
-                    {
-                        as_problem(status, response);
-                    }
-                }
+        let mut uses = BTreeMap::<String, usize>::new();
+        for operation in contract.paths.paths.values_mut().flat_map(operations) {
+            *uses
+                .entry(operation.operation_id.clone().unwrap_or_default())
+                .or_default() += 1;
+        }
+        for operation in contract.paths.paths.values_mut().flat_map(operations) {
+            let tag = operation.tags.iter().flatten().next();
+            if let (Some(id), Some(tag)) = (&mut operation.operation_id, tag)
+                && uses.get(id).is_some_and(|uses| *uses > 1)
+            {
+                *id = format!("{tag}_{id}");
             }
         }
-    }
-}
-
-fn no_key() -> Response {
-    let problem = Content::new(Some(Ref::from_schema_name("Problem")));
-    ResponseBuilder::new()
-        .description("No valid API key; only if authentication is on")
-        .content("application/json", problem)
-        .build()
-}
-
-fn as_problem(status: &str, response: &mut Response) {
-    if let Some(content) = response.content.swap_remove("application/json") {
-        response.content.insert("application/problem+json".to_owned(), content);
-    }
-    if status == "503" {
-        let seconds = Header::new(utoipa::schema!(u64));
-        response.headers.insert("Retry-After".to_owned(), RefOr::T(seconds));
     }
 }
 
@@ -116,12 +102,11 @@ impl Modify for Examples {
         for (path, item) in &mut contract.paths.paths {
             let example = examples.remove(path);
             let model = example.as_ref().and_then(|example| example.model.as_deref());
-            let operations = [&mut item.get, &mut item.post, &mut item.delete];
-            for operation in operations.into_iter().flatten() {
+            for operation in operations(item) {
                 for parameter in operation.parameters.iter_mut().flatten() {
-                    if let RefOr::T(parameter) = parameter
-                        && parameter.name == "model"
-                    {
+                    let RefOr::T(parameter) = parameter else { continue };
+                    limit(parameter);
+                    if parameter.name == "model" {
                         let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
                         *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
                     }
@@ -137,6 +122,15 @@ impl Modify for Examples {
     }
 }
 
+/// Says how large the number in a path can be: not every client knows the format `uint32`.
+fn limit(parameter: &mut Parameter) {
+    if let Some(RefOr::T(Schema::Object(number))) = &mut parameter.schema
+        && number.format == Some(SchemaFormat::KnownFormat(KnownFormat::UInt32))
+    {
+        number.maximum = Some(u32::MAX.into());
+    }
+}
+
 /// The contract without its paths.
 pub(super) fn frame() -> utoipa::openapi::OpenApi {
     Contract::openapi()
@@ -145,8 +139,10 @@ pub(super) fn frame() -> utoipa::openapi::OpenApi {
 /// The contract with its paths, completed with what all paths have in common, as JSON with a line break at its end.
 #[expect(clippy::expect_used, reason = "the document is made of texts and maps")]
 pub(super) fn text(mut contract: utoipa::openapi::OpenApi) -> String {
+    Variants.modify(&mut contract);
     KeySecurity.modify(&mut contract);
-    Problems.modify(&mut contract);
+    Responses.modify(&mut contract);
+    OperationIds.modify(&mut contract);
     Examples.modify(&mut contract);
     let mut text = contract.to_pretty_json().expect("a contract that is not JSON is a bug");
     text.push('\n');

@@ -15,12 +15,16 @@ use crate::frame::warp::CameraModel;
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Height of the pinhole above the floor, in metres.
+    #[cfg_attr(feature = "server", schema(minimum = 0.45, maximum = 2.3))]
     pub height_m: f64,
     /// How far the camera looks down from the horizontal, in radians.
+    #[cfg_attr(feature = "server", schema(minimum = -1.2, maximum = 1.2))]
     pub tilt_down_rad: f64,
     /// Angle between the left and the right edge of the image, in radians.
+    #[cfg_attr(feature = "server", schema(minimum = 0.1, maximum = 2.8))]
     pub horizontal_fov_rad: f64,
     /// Standard deviation of the sensor's Gaussian noise, where black is 0 and white is 1.
+    #[cfg_attr(feature = "server", schema(minimum = 0, maximum = 1))]
     pub noise_std: f64,
 }
 
@@ -99,14 +103,18 @@ impl FromStr for Look {
 #[serde(default, deny_unknown_fields)]
 pub struct WorldConfig {
     /// Width of a frame in pixels.
+    #[cfg_attr(feature = "server", schema(minimum = 1, maximum = 512))]
     pub frame_width_px: u32,
     /// Height of a frame in pixels.
+    #[cfg_attr(feature = "server", schema(minimum = 1, maximum = 512))]
     pub frame_height_px: u32,
     /// Seconds from one frame to the next.
+    #[cfg_attr(feature = "server", schema(minimum = 0.01, maximum = 2))]
     pub frame_period_s: f64,
     /// Tb1's camera.
     pub camera: CameraConfig,
     /// Time limit of a trial, in seconds. A trial has the frames before this time; the first frame is at 0 s.
+    #[cfg_attr(feature = "server", schema(minimum = 0.02, maximum = 3600))]
     pub max_duration_s: f64,
     /// What the room looks like.
     #[serde(skip_serializing_if = "Look::is_gray")]

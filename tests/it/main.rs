@@ -10,6 +10,7 @@ mod client;
 mod config;
 mod connections;
 mod contract;
+mod contract_schemas;
 mod dataset_collect;
 mod dataset_sampler;
 mod environments;

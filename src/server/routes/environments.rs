@@ -55,6 +55,7 @@ struct ResetRequest {
 #[serde(deny_unknown_fields)]
 struct StepRequest {
     /// In the order and units of the environment's `action`; limited to what the robot can do: ±0.7 m/s, ±1.92 rad/s.
+    #[schema(min_items = 2, max_items = 2)]
     action: Vec<f32>,
 }
 

@@ -28,16 +28,28 @@ const POLL_EVERY: Duration = Duration::from_millis(500);
 /// The maximum number of log lines that are read at once.
 const LINES: usize = 100;
 
+/// A server-sent event.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "only described; axum writes the events")]
+struct JobEvent {
+    /// `job` or `log`.
+    event: String,
+    /// A line of a log: its number.
+    id: Option<String>,
+    /// JSON: the job, or the line.
+    data: String,
+}
+
 /// Sends the job whenever it changes (`event: job`) and each line of its log (`event: log`), until it has ended or the
 /// server stops. With `Last-Event-ID`, the log continues after that line.
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/events", tag = "jobs",
     params(
         ("id" = String, Path, description = "The job's id"),
-        ("Last-Event-ID" = Option<i64>, Header, description = "The last line of the log that was received"),
+        ("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received"),
     ),
     responses(
-        (status = 200, description = "Events", content_type = "text/event-stream", body = String),
+        (status = 200, description = "Events", content_type = "text/event-stream", body = JobEvent),
         (status = 404, description = "No such job", body = Problem),
         (status = 503, description = "Too many streams are open", body = Problem),
     )

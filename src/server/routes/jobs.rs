@@ -48,12 +48,15 @@ struct JobList {
 #[into_params(parameter_in = Query)]
 struct ListQuery {
     /// `collect`, `train` or `evaluate`.
+    #[param(pattern = "^(collect|train|evaluate)$")]
     kind: Option<String>,
     /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
     state: Option<JobState>,
     /// Only jobs that are older than the one with this id.
+    #[param(pattern = "^job-[0-9]{1,18}$")]
     before: Option<String>,
     /// The maximum number of jobs, 1 to 1000. Default: 50.
+    #[param(minimum = 1, maximum = 1000)]
     limit: Option<usize>,
 }
 
@@ -93,6 +96,7 @@ struct LogQuery {
     /// Only lines after the one with this number.
     after: Option<i64>,
     /// The maximum number of lines, 1 to 1000. Default: 1000.
+    #[param(minimum = 1, maximum = 1000)]
     limit: Option<usize>,
 }
 
@@ -131,7 +135,7 @@ impl From<LossRow> for CurvePoint {
 /// the next version of its model. The first version of a name becomes active at once, later ones when they are activated.
 #[utoipa::path(
     post, path = "/v1/jobs", tag = "jobs", request_body = JobSpec,
-    params(("Idempotency-Key" = Option<String>, Header,
+    params(("Idempotency-Key" = Option<String>, Header, pattern = "^[!-~]{1,128}$",
         description = "The client's own key for this request: a second request with the same key makes no second job")),
     responses(
         (status = 202, description = "Queued; the header Location names the job", body = Job),
