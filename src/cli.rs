@@ -1,6 +1,7 @@
 //! The command line, one file for each subcommand. Exit code 2: the command cannot be carried out as it was given. Exit
 //! code 1: it failed. Exit code 130: it was interrupted.
 
+mod backup;
 mod collect;
 mod config;
 mod error;
@@ -16,6 +17,7 @@ mod output;
 mod predict;
 mod progress;
 mod publish;
+mod restore;
 mod run_job;
 mod serve;
 mod settings;
@@ -66,6 +68,10 @@ enum Command {
     Models(models::ModelsArgs),
     /// Create, list and revoke API keys
     Keys(keys::KeysArgs),
+    /// Copy the data directory and its database, also while a server runs
+    Backup(backup::BackupArgs),
+    /// Restore a backup into a new data directory
+    Restore(restore::RestoreArgs),
     /// Print every setting with its meaning and where its value comes from
     Config(config::ConfigArgs),
     /// Ask a running server whether it is ready
@@ -105,6 +111,8 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Models(args) => models::run(&args),
         Command::Worker(args) => worker::run(&args),
         Command::Keys(args) => keys::run(&args),
+        Command::Backup(args) => backup::run(&args),
+        Command::Restore(args) => restore::run(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
         Command::RunJob => run_job::run(),

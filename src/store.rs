@@ -1,12 +1,15 @@
 //! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`]) and files in [`objects`].
+//! [`backup`] copies both.
 //! Only `database` knows that there are two kinds of database. SQL is only in this module.
 
+pub mod backup;
 mod database;
 pub mod jobs;
 pub mod keys;
 pub mod models;
 pub mod objects;
 pub mod reports;
+mod wal;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -70,6 +73,15 @@ pub enum StoreError {
         /// What SQLite found.
         reason: String,
     },
+    /// `foreframe restore` did not finish.
+    #[error(
+        "the restore into {} did not finish; run foreframe restore again",
+        data_dir.display()
+    )]
+    Restoring {
+        /// The data directory.
+        data_dir: PathBuf,
+    },
     /// The tables could not be migrated to this version of the program.
     #[error("could not migrate the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
@@ -106,7 +118,7 @@ impl StoreError {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
             Self::Io { source, .. } => source.kind() == std::io::ErrorKind::StorageFull,
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
-            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Migrate(_) => false,
+            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } | Self::Migrate(_) => false,
         }
     }
 
@@ -146,7 +158,7 @@ pub struct Store {
 
 impl Store {
     /// Opens the store, creates what is missing, and migrates the tables. Needs a tokio runtime, now and later.
-    /// Errors: `Url`, `NoTls`, `Open`, `Damaged`, `Migrate`, `Io`, `Object`.
+    /// Errors: `Url`, `NoTls`, `Open`, `Damaged`, `Restoring`, `Migrate`, `Io`, `Object`.
     pub async fn open(config: &StoreConfig) -> Result<Self, StoreError> {
         Self::open_with(config, true).await
     }
@@ -159,6 +171,10 @@ impl Store {
     async fn open_with(config: &StoreConfig, is_first: bool) -> Result<Self, StoreError> {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;
+        if data_dir.join(backup::RESTORING).exists() {
+            let data_dir = data_dir.clone();
+            return Err(StoreError::Restoring { data_dir });
+        }
         let database = match &config.database {
             Some(url) => Database::open(url, is_first).await?,
             None => Database::open_file(&data_dir.join(DATABASE_FILE), is_first).await?,

@@ -1,6 +1,6 @@
 //! SQLite and PostgreSQL behind one interface: both get the same statements and values. All differences are here.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use sqlx::{
     Type,
 };
 
-use super::StoreError;
+use super::{StoreError, wal};
 use crate::files::open_lock;
 
 /// The maximum number of connections to the database.
@@ -121,6 +121,18 @@ impl Database {
         Self::open_sqlite(SqliteConnectOptions::new().filename(path), is_first).await
     }
 
+    /// The file that a URL names; `None` if it does not name SQLite. Errors: `Open`.
+    pub(super) fn file_of(url: &str) -> Result<Option<PathBuf>, StoreError> {
+        if !url.starts_with("sqlite:") {
+            return Ok(None);
+        }
+        let options = SqliteConnectOptions::from_str(url).map_err(|source| StoreError::Open {
+            database: "SQLite",
+            source,
+        })?;
+        Ok(Some(options.get_filename().to_owned()))
+    }
+
     async fn open_sqlite(options: SqliteConnectOptions, is_first: bool) -> Result<Self, StoreError> {
         let path = options.get_filename().to_owned();
         // SQLite's migrations take no lock, and two processes can start at the same time.
@@ -131,6 +143,9 @@ impl Database {
             lock.lock().map(|()| lock)
         });
         let _lock = locked.await.unwrap_or_else(|error| Err(error.into())).map_err(failed)?;
+        if is_first {
+            wal::check(&path)?;
+        }
         let options = options
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
@@ -153,6 +168,15 @@ impl Database {
         }
         migrations().run(&pool).await.map_err(StoreError::Migrate)?;
         Ok(Self::Sqlite(pool))
+    }
+
+    /// Writes the present state into a new file, while others read and write. Returns false if this is not possible, because
+    /// the database is PostgreSQL.
+    pub(super) async fn copy_to(&self, path: &Path) -> Result<bool, StoreError> {
+        let Self::Sqlite(pool) = self else { return Ok(false) };
+        let path = path.to_string_lossy().into_owned();
+        sqlx::query("VACUUM INTO $1").bind(path).execute(pool).await?;
+        Ok(true)
     }
 
     /// The database's time in seconds since 1970, so that the clocks of several machines need not agree.

@@ -4,6 +4,7 @@
 
 mod architecture;
 mod asyncapi;
+mod backup;
 mod browser;
 mod cli;
 mod client;

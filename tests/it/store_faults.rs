@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use foreframe::store::{EnqueueResult, NewJob, Store, StoreConfig, StoreError};
+use foreframe::store::{EnqueueResult, JobPage, NewJob, Store, StoreConfig, StoreError};
 
 async fn open(dir: &Path) -> Result<Store, StoreError> {
     let config = StoreConfig {
@@ -119,6 +119,77 @@ async fn a_damaged_database_is_refused_in_one_sentence() {
     }
     std::fs::write(&path, whole).unwrap();
     open(dir.path()).await.unwrap();
+}
+
+/// The database of a store that is in use: the file and its write-ahead log.
+struct LiveCopy {
+    database: Vec<u8>,
+    log: Vec<u8>,
+}
+
+impl LiveCopy {
+    async fn with_jobs(jobs: usize) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let store = open(dir.path()).await.unwrap();
+        for _ in 0..jobs {
+            enqueue(&store).await.unwrap();
+        }
+        let read = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
+        Self {
+            database: read("foreframe.db"),
+            log: read("foreframe.db-wal"),
+        }
+    }
+
+    /// Opens a store with this database and another log.
+    async fn open_with(&self, log: &[u8]) -> Result<usize, StoreError> {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("foreframe.db"), &self.database).unwrap();
+        std::fs::write(dir.path().join("foreframe.db-wal"), log).unwrap();
+        let store = open(dir.path()).await?;
+        let page = JobPage {
+            limit: 1000,
+            ..JobPage::default()
+        };
+        Ok(store.jobs(page).await.unwrap().len())
+    }
+}
+
+#[tokio::test]
+async fn a_damaged_write_ahead_log_is_refused_in_one_sentence() {
+    let copy = LiveCopy::with_jobs(20).await;
+    assert_eq!(copy.open_with(&copy.log).await.unwrap(), 20);
+    let half = copy.log.len() / 2;
+    for (at, part) in [
+        (0, "the header"),
+        (17, "the header"),
+        (40, "frame 1"),
+        (100, "frame 1"),
+        (half, "frame "),
+    ] {
+        let mut damaged = copy.log.clone();
+        damaged[at] ^= 0x55;
+        let error = copy.open_with(&damaged).await.unwrap_err();
+        assert!(matches!(error, StoreError::Damaged { .. }), "{at}: {error:?}");
+        let sentence = error.to_string();
+        assert!(
+            sentence.contains("foreframe.db-wal is damaged (") && sentence.contains(part) && !sentence.contains('\n'),
+            "{at}: {sentence}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_log_that_ends_in_the_middle_loses_only_its_end() {
+    let copy = LiveCopy::with_jobs(20).await;
+    for end in (0..copy.log.len()).step_by(copy.log.len() / 30) {
+        let jobs = copy.open_with(&copy.log[..end]).await.unwrap();
+        assert!(jobs < 20, "{end}: {jobs}");
+    }
+    // What a power failure can leave: a last transaction that is only partly there.
+    let mut torn = copy.log.clone();
+    *torn.last_mut().unwrap() ^= 0x55;
+    assert_eq!(copy.open_with(&torn).await.unwrap(), 19);
 }
 
 #[tokio::test]

@@ -1,0 +1,141 @@
+//! `foreframe backup` and `foreframe restore`: beside a running server, on a stopped one, and with damaged files.
+#![cfg(unix)]
+
+use std::path::{Path, PathBuf};
+
+use foreframe::store::{Store, StoreConfig};
+use serde_json::{Value, json};
+
+use crate::process::{RunningServer, output, text};
+
+/// Runs a command that must succeed; returns its standard output.
+fn succeed(dir: &Path, arguments: &[&str]) -> String {
+    let output = output(dir, arguments);
+    assert!(output.status.success(), "{arguments:?}: {}", text(&output.stderr));
+    text(&output.stdout)
+}
+
+/// Runs a command that must fail; returns its standard error.
+fn fail(dir: &Path, arguments: &[&str]) -> String {
+    let output = output(dir, arguments);
+    let error = text(&output.stderr);
+    assert!(
+        !output.status.success() && error.lines().count() == 1,
+        "{arguments:?}: {error}"
+    );
+    error
+}
+
+/// Every file below a directory with its content.
+fn contents(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let (mut dirs, mut files) = (vec![root.to_owned()], Vec::new());
+    while let Some(dir) = dirs.pop() {
+        for entry in std::fs::read_dir(dir).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                dirs.push(path);
+            } else {
+                files.push((
+                    path.strip_prefix(root).unwrap().to_owned(),
+                    std::fs::read(&path).unwrap(),
+                ));
+            }
+        }
+    }
+    files.sort();
+    files
+}
+
+fn paper() -> String {
+    format!("{}/models/paper", env!("CARGO_MANIFEST_DIR"))
+}
+
+#[test]
+fn a_backup_of_a_running_server_goes_on_elsewhere() {
+    let (dir, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let server = RunningServer::start(dir.path(), &[]);
+    let collect = |name: &str, trials: u32| {
+        let spec = json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials});
+        server.ask("POST", "/v1/jobs", &spec)["id"].as_str().unwrap().to_owned()
+    };
+    let small = collect("small", 6);
+    let small = server.wait_for_job(&small, |job| job["state"] == "succeeded");
+    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
+    let large = collect("large", 40);
+    server.wait_for_job(&large, |job| job["progress"]["done"].as_u64() > Some(0));
+    let told = succeed(dir.path(), &["backup", "monday"]);
+    assert!(
+        told.contains(" files with ") && told.contains("are in monday"),
+        "{told}"
+    );
+    drop(server);
+
+    let backup = dir.path().join("monday").display().to_string();
+    succeed(other.path(), &["restore", &backup]);
+    for part in ["models", "datasets/small"] {
+        let (original, restored) = (dir.path().join("data").join(part), other.path().join("data").join(part));
+        let original = contents(&original);
+        assert!(!original.is_empty() && original == contents(&restored), "{part}");
+    }
+    let server = RunningServer::start(other.path(), &["--set", "job_lease_ms=1000"]);
+    let job = server.wait_for_job(small["id"].as_str().unwrap(), |_| true);
+    assert_eq!(job, small);
+    assert_eq!(server.ask("GET", "/v1/models/mine", &Value::Null)["active_version"], 1);
+    server.wait_for_job(&large, |job| job["state"] == "succeeded");
+}
+
+#[tokio::test]
+async fn a_backup_of_a_stopped_server_holds_its_keys() {
+    let dir = tempfile::tempdir().unwrap();
+    let key = succeed(dir.path(), &["keys", "create", "robot"]);
+    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
+    succeed(dir.path(), &["backup", "tuesday"]);
+    succeed(dir.path(), &["restore", "tuesday", "--data-dir", "restored"]);
+    let config = StoreConfig {
+        data_dir: dir.path().join("restored"),
+        ..StoreConfig::default()
+    };
+    let store = Store::open(&config).await.unwrap();
+    let keys = store.list_keys().await.unwrap();
+    assert!(keys.len() == 1 && key.contains(&keys[0].id) && store.keys_were_created());
+    let versions = store.published_versions().await.unwrap();
+    assert_eq!((versions[0].model.as_str(), versions[0].version), ("mine", 1));
+}
+
+#[test]
+fn a_damaged_backup_is_not_restored() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
+    succeed(dir.path(), &["backup", "wednesday"]);
+    let weights = dir.path().join("wednesday/models/mine/1/model.safetensors");
+    let whole = std::fs::read(&weights).unwrap();
+    let mut damaged = whole.clone();
+    damaged[whole.len() / 2] ^= 0x55;
+    std::fs::write(&weights, damaged).unwrap();
+    let restore = ["restore", "wednesday", "--data-dir", "restored"];
+    let refused = fail(dir.path(), &restore);
+    assert!(refused.contains("model.safetensors is damaged or missing"), "{refused}");
+    let refused = fail(dir.path(), &["models", "list", "--data-dir", "restored"]);
+    assert!(
+        refused.contains("the restore into restored did not finish"),
+        "{refused}"
+    );
+    std::fs::write(&weights, whole).unwrap();
+    succeed(dir.path(), &restore);
+    let listed = succeed(dir.path(), &["models", "list", "--data-dir", "restored"]);
+    assert!(listed.contains("mine"), "{listed}");
+    // What was restored is not overwritten.
+    assert!(fail(dir.path(), &restore).contains("is not empty"));
+}
+
+#[test]
+fn a_backup_needs_a_store_and_a_directory_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    assert!(fail(dir.path(), &["backup", "b"]).contains("there is nothing to back up in data"));
+    succeed(dir.path(), &["keys", "list"]);
+    std::fs::create_dir(dir.path().join("full")).unwrap();
+    std::fs::write(dir.path().join("full/file"), "").unwrap();
+    assert!(fail(dir.path(), &["backup", "full"]).contains("full is not empty"));
+    assert!(fail(dir.path(), &["backup", "data/inside"]).contains("is in the data directory"));
+    assert!(fail(dir.path(), &["restore", "full", "--data-dir", "d"]).contains("holds no complete backup"));
+}
