@@ -185,16 +185,26 @@ impl CustomOp3 for Composition {
             with_values(scene, |scene| {
                 with_values(places, |places| {
                     with_values(gradient, |gradient| {
-                        self.visit(|[pixel, at, content], frame| {
-                            let parts = self.parts(pixel, &head[at..at + HEAD_VALUES], scene[content], places, frame);
-                            let moved = parts.gradient(gradient[pixel], frame, &mut for_head[at..at + HEAD_VALUES]);
-                            let turned = usize::from(self.room_places.is_some());
-                            for place in &moved[turned..] {
-                                for_places[2 * pixel] += place[0];
-                                for_places[2 * pixel + 1] += place[1];
-                            }
-                            for_scene[content] = gradient[pixel] * parts.mask[2];
-                        });
+                        Arch::new().dispatch(
+                            #[inline(always)]
+                            || {
+                                self.visit(
+                                    #[inline(always)]
+                                    |[pixel, at, content], frame| {
+                                        let head = &head[at..at + HEAD_VALUES];
+                                        let for_head = &mut for_head[at..at + HEAD_VALUES];
+                                        let parts = self.parts(pixel, head, scene[content], places, frame);
+                                        let moved = parts.gradient(gradient[pixel], frame, for_head);
+                                        let turned = usize::from(self.room_places.is_some());
+                                        for place in &moved[turned..] {
+                                            for_places[2 * pixel] += place[0];
+                                            for_places[2 * pixel + 1] += place[1];
+                                        }
+                                        for_scene[content] = gradient[pixel] * parts.mask[2];
+                                    },
+                                );
+                            },
+                        );
                     })
                 })
             })

@@ -98,21 +98,37 @@ impl ImageGeometry {
         TAPS * self.channels
     }
 
-    /// Calls `visit` with the place of each run of channels in the matrix and in the image; `None` outside the image.
+    /// Calls `visit` with the place of each run of values in the matrix, its length, and its place in the image; `None` outside
+    /// the image. With neighbours side by side, the three of a row of the kernel are one run.
     #[inline(always)]
-    fn visit(self, mut visit: impl FnMut(usize, Option<usize>)) {
+    fn visit(self, mut visit: impl FnMut(usize, usize, Option<usize>)) {
         let ConvShape { stride, dilation } = self.shape;
+        let (channels, width) = (self.channels, self.width);
         let mut at = 0;
         for row in 0..self.out_height() {
             for column in 0..self.out_width() {
-                for tap in 0..TAPS {
-                    let y = row * stride + (tap / SIDE) * dilation;
-                    let x = column * stride + (tap % SIDE) * dilation;
-                    let is_inside =
-                        y >= dilation && x >= dilation && y < self.height + dilation && x < self.width + dilation;
-                    let place = is_inside.then(|| ((y - dilation) * self.width + x - dilation) * self.channels);
-                    visit(at, place);
-                    at += self.channels;
+                for kernel_row in 0..SIDE {
+                    let y = row * stride + kernel_row * dilation;
+                    let first = (dilation..self.height + dilation)
+                        .contains(&y)
+                        .then(|| (y - dilation) * width);
+                    let x = column * stride;
+                    if let (1, 1.., Some(first)) = (dilation, x, first)
+                        && x + 1 < width
+                    {
+                        visit(at, SIDE * channels, Some((first + x - 1) * channels));
+                        at += SIDE * channels;
+                        continue;
+                    }
+                    for kernel_column in 0..SIDE {
+                        let x = x + kernel_column * dilation;
+                        let is_inside = (dilation..width + dilation).contains(&x);
+                        let place = first
+                            .filter(|_| is_inside)
+                            .map(|first| (first + x - dilation) * channels);
+                        visit(at, channels, place);
+                        at += channels;
+                    }
                 }
             }
         }
@@ -120,11 +136,10 @@ impl ImageGeometry {
 
     /// The neighbours of every place, one place a row.
     fn unfold(self, image: &[f32], matrix: &mut [f32]) {
-        let channels = self.channels;
-        self.visit(|at, place| {
-            let out = &mut matrix[at..at + channels];
+        self.visit(|at, length, place| {
+            let out = &mut matrix[at..at + length];
             match place {
-                Some(place) => out.copy_from_slice(&image[place..place + channels]),
+                Some(place) => out.copy_from_slice(&image[place..place + length]),
                 None => out.fill(0.0),
             }
         });
@@ -132,16 +147,15 @@ impl ImageGeometry {
 
     /// Adds each row's values to the places that [`ImageGeometry::unfold`] reads them from.
     fn fold(self, matrix: &[f32], image: &mut [f32]) {
-        let channels = self.channels;
         Arch::new().dispatch(
             #[inline(always)]
             || {
                 self.visit(
                     #[inline(always)]
-                    |at, place| {
+                    |at, length, place| {
                         if let Some(place) = place {
-                            let sums = &mut image[place..place + channels];
-                            for (sum, value) in sums.iter_mut().zip(&matrix[at..at + channels]) {
+                            let sums = &mut image[place..place + length];
+                            for (sum, value) in sums.iter_mut().zip(&matrix[at..at + length]) {
                                 *sum += value;
                             }
                         }

@@ -116,14 +116,14 @@ fn sum_of(prediction: &[f32], target: &[f32], term: impl Fn(f32) -> f32) -> f64 
 /// `slope` of each difference.
 #[inline(always)]
 fn slopes(prediction: &[f32], target: &[f32], slope: impl Fn(f32) -> f32) -> Vec<f32> {
+    let mut values = vec![0.0; prediction.len()];
     Arch::new().dispatch(
         #[inline(always)]
         || {
-            prediction
-                .iter()
-                .zip(target)
-                .map(|(prediction, target)| slope(prediction - target))
-                .collect()
+            for ((value, prediction), target) in values.iter_mut().zip(prediction).zip(target) {
+                *value = slope(prediction - target);
+            }
         },
-    )
+    );
+    values
 }

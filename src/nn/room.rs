@@ -171,7 +171,7 @@ fn describe(ray: RoomRay, hit: RoomHit, out: &mut [f32]) {
     let rest = &mut out[WAVES + SIDES..];
     rest[..3].copy_from_slice(&hit.point);
     let [x, y, z] = ray.direction;
-    let level = x.hypot(y).max(1e-6);
+    let level = (x * x + y * y).sqrt().max(1e-6);
     rest[3] = ray.origin[0];
     rest[4] = ray.origin[1];
     rest[5] = x / level;
