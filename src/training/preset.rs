@@ -6,12 +6,13 @@ use crate::registry::Manifest;
 use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// Name and text of each preset.
-const PRESETS: [(&str, &str); 5] = [
+const PRESETS: [(&str, &str); 6] = [
     ("paper", include_str!("presets/paper.toml")),
     ("static", include_str!("presets/static.toml")),
     ("moving", include_str!("presets/moving.toml")),
     ("static-flow", include_str!("presets/static-flow.toml")),
     ("moving-flow", include_str!("presets/moving-flow.toml")),
+    ("recording", include_str!("presets/recording.toml")),
 ];
 
 /// The command that lists all settings.
@@ -148,7 +149,7 @@ mod tests {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
         assert_eq!(
             error,
-            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow"
+            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow, recording"
         );
     }
 
