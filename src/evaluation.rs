@@ -33,8 +33,8 @@ pub use self::samples::figure_inputs;
 use self::baselines::{Baselines, Method};
 use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
+use crate::dataset::Dataset;
 use crate::dataset::sampler::{Split, Splits, WindowShape};
-use crate::dataset::{Dataset, Window};
 use crate::nn::{Architecture, ModelSpec};
 use crate::registry::LoadedModel;
 use crate::types::Seed;
@@ -272,8 +272,12 @@ fn score_split(
     scores.windows_available = available.len();
     if spec.action_inputs().is_some() {
         let errors = actions::compare(loaded, &config.twins, dataset, &windows, watched)?;
-        let trial_of: Vec<usize> = windows.iter().map(|window: &Window| window.episode).collect();
-        scores.actions = Some(actions::table(&errors, &trial_of, &watched.bootstrap));
+        let frames = window_shape(spec).frames();
+        let group_of: Vec<usize> = windows
+            .iter()
+            .map(|&window| bootstrap::resampled_with(dataset, window, frames))
+            .collect();
+        scores.actions = Some(actions::table(&errors, &group_of, &watched.bootstrap));
         scores.plans = Some(plans::identify(loaded, dataset, &windows, watched)?);
     }
     Ok(SetOutcome::Scored(Box::new(scores)))

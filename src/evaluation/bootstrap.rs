@@ -1,9 +1,14 @@
 //! Intervals by bootstrap over trials (Efron 1979, percentiles). Windows overlap, so they are not independent; trials are.
+//! A recording has few episodes, so it is divided into blocks of time instead (Künsch 1989).
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
+use crate::dataset::{Dataset, Window};
 use crate::types::Seed;
+
+/// Length of a recording's block, in windows.
+const BLOCK_WINDOWS: usize = 5;
 
 /// Share of the resampled values that an [`Interval`] holds.
 pub const CONFIDENCE: f64 = 0.95;
@@ -23,6 +28,19 @@ impl Interval {
     pub fn is_below(&self, other: &Self) -> bool {
         self.high < other.low
     }
+}
+
+/// What a window is resampled with, windows having this number of frames: its trial, or in a recording the block of frames in
+/// which it starts, by the block's first frame.
+#[must_use]
+pub fn resampled_with(dataset: &Dataset, window: Window, frames: usize) -> usize {
+    let episode = &dataset.episodes()[window.episode];
+    if episode.trial.is_some() {
+        return window.episode;
+    }
+    let block = (BLOCK_WINDOWS * frames).max(1);
+    let within = window.first_frame - episode.first_frame;
+    episode.first_frame + within / block * block
 }
 
 /// How often to resample, from which seed.
@@ -130,6 +148,25 @@ mod tests {
 
     fn means_only(means: &[f64]) -> Vec<f64> {
         means.to_vec()
+    }
+
+    #[test]
+    fn a_recording_is_resampled_in_blocks_of_time() {
+        let info = crate::dataset::DatasetInfo {
+            frame_width_px: 1,
+            frame_height_px: 1,
+            frame_period_s: 0.1,
+            ..Default::default()
+        };
+        let episode = |frames: usize| crate::dataset::EpisodeData {
+            timestamps_s: (0..frames).map(|frame| 0.1 * frame as f64).collect(),
+            pixels: vec![0; frames],
+            ..Default::default()
+        };
+        let dataset = Dataset::from_episodes(info, vec![episode(30), episode(45)]).unwrap();
+        let group = |episode, first_frame| resampled_with(&dataset, Window { episode, first_frame }, 4);
+        assert_eq!([group(0, 0), group(0, 19), group(0, 20)], [0, 0, 20]);
+        assert_eq!([group(1, 30), group(1, 49), group(1, 50)], [30, 30, 50]);
     }
 
     #[test]

@@ -293,7 +293,8 @@ fn how(out: &mut String) -> std::fmt::Result {
         out,
         "Frames are compared as the camera saw them: intensities 0…1, neither inverted nor smoothed. PSNR is the mean of the \
          frames' PSNR, each at most {PSNR_CAP_DB:.0} dB (the error of rounding to 8 bits). SSIM uses an 11-tap Gaussian \
-         window, sigma 1.5. Intervals hold {:.0} % of the bootstrap resamples of whole trials. The strongest baseline is \
+         window, sigma 1.5. Intervals hold {:.0} % of the bootstrap resamples of whole trials, in a recording of \
+         blocks of time as long as five windows. The strongest baseline is \
          chosen at each step, and again in each resample.\n",
         100.0 * CONFIDENCE
     )?;

@@ -81,6 +81,8 @@ pub struct WindowScores {
     pub episode: usize,
     /// Its first frame in the data set.
     pub first_frame: usize,
+    /// What it is resampled with: windows of the same number are not independent.
+    pub group: usize,
     /// `frames[row][step]`, one row for each method that was scored.
     pub frames: Vec<Vec<FrameScore>>,
     /// Mean squared error of the model in its own space, per step.
@@ -183,6 +185,7 @@ mod tests {
         let window = |psnr_db, mover_pixels| WindowScores {
             episode: 0,
             first_frame: 0,
+            group: 0,
             frames: vec![
                 vec![FrameScore {
                     psnr_db,

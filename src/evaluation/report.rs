@@ -231,7 +231,7 @@ pub struct SetScores {
     pub windows: usize,
     /// Windows available at that stride.
     pub windows_available: usize,
-    /// Trials that they come from.
+    /// Trials that they come from; in a recording, blocks of time.
     pub trials: usize,
     /// The headline.
     pub skill: Skill,
@@ -254,7 +254,7 @@ pub struct SetScores {
 impl SetScores {
     /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
     pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Self {
-        let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
+        let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
         let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
         let own_space = by_trial(|window| &window.model_space_mse);
         Self {

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::baselines::{BaselineInput, Baselines, Method};
+use super::bootstrap::resampled_with;
 use super::inference::{Predicted, predict_with_ceiling};
 use super::metrics::{FrameScore, TargetFrame, WindowScores};
 use super::{EvaluationContext, EvaluationError, EvaluationStage};
@@ -109,6 +110,7 @@ fn score_window(
     WindowScores {
         episode: window.episode,
         first_frame: window.first_frame,
+        group: resampled_with(dataset, window, spec.context + spec.horizon),
         frames,
         model_space_mse: own.zip(own_truth).map(|(a, b)| quality::mse(a, b)).collect(),
         reconstruction_mse: reconstructed

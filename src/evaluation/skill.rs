@@ -33,7 +33,7 @@ pub fn skill(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap
         let rows = window.frames.iter().take(rows);
         rows.flat_map(|steps| steps.iter().map(|score| score.mse)).collect()
     };
-    let trial_of: Vec<usize> = windows.iter().map(|window| window.episode).collect();
+    let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
     let trials = TrialSums::group(&trial_of, windows.iter().map(errors_by_row));
     let means = trials.means();
     let mut intervals = trials
@@ -109,6 +109,7 @@ mod tests {
                 WindowScores {
                     episode: i / 3,
                     first_frame: i,
+                    group: i / 3,
                     frames: errors
                         .map(|mse| {
                             vec![
