@@ -1,8 +1,11 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
 //! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels.
 
+use jpeg::JpegDamage;
+
 pub mod codec;
 pub mod fit;
+pub mod jpeg;
 pub mod preprocess;
 pub mod quality;
 pub mod warp;
@@ -37,6 +40,9 @@ pub enum FrameError {
     /// The bytes are not a PNG or JPEG image.
     #[error("not a readable PNG or JPEG image")]
     Decode(#[source] image::ImageError),
+    /// A JPEG image is incomplete, or its data is not valid.
+    #[error("a damaged JPEG image: {0}")]
+    Damaged(JpegDamage),
     /// An image could not be written.
     #[error("could not encode the image")]
     Encode(#[source] image::ImageError),

@@ -7,7 +7,7 @@ use image::{
     DynamicImage, ExtendedColorType, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage,
 };
 
-use super::{Frame, FrameError, MAX_SIDE_PX};
+use super::{Frame, FrameError, MAX_SIDE_PX, jpeg};
 
 /// Weights of red, green and blue for conversion to gray (ITU-R BT.601), in thousandths.
 const GRAY_FROM_RGB: [u32; 3] = [299, 587, 114];
@@ -17,10 +17,17 @@ const MAX_METADATA_BYTES: u64 = 1 << 20;
 /// Largest pixel format, in bytes: four channels of 16 bits.
 const MAX_PIXEL_BYTES: u64 = 8;
 
-/// Reads a PNG or JPEG image and converts it to gray. Errors: `Decode` if the bytes are not PNG or JPEG, or if a side is
-/// larger than [`MAX_SIDE_PX`].
+/// Reads a PNG or JPEG image and converts it to gray. Errors: `Size` if a side is larger than [`MAX_SIDE_PX`]; `Decode` if
+/// the bytes are not PNG or JPEG; `Damaged` for a JPEG image whose data is incomplete or not valid.
 pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
     let (width, height) = dimensions(bytes)?;
+    if width.max(height) > MAX_SIDE_PX {
+        return Err(FrameError::Size { width, height });
+    }
+    // The decoder fills what is missing with gray.
+    if bytes.starts_with(&[0xff, 0xd8]) {
+        jpeg::check(bytes).map_err(FrameError::Damaged)?;
+    }
     let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE_PX);

@@ -17,7 +17,8 @@ use crate::serving::{InputError, check_size};
 const MAX_FIT_PIXELS: u32 = 1 << 22;
 
 /// How images are encoded, in both directions: `raw` is gray bytes, row by row, of the model's size; images sent as `jpeg`
-/// are answered with `png`, which is lossless. Default: `png`.
+/// are answered with `png`, which is lossless. An incomplete image is refused, and so is a changed one if the change can be
+/// found: `jpeg` has no checksum. Default: `png`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ImageFormat {

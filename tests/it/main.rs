@@ -12,6 +12,7 @@ mod config;
 mod connections;
 mod contract;
 mod contract_schemas;
+mod damaged_jpegs;
 mod dataset_collect;
 mod dataset_sampler;
 mod environments;
