@@ -19,6 +19,9 @@ pub const DEFAULT_FILE: &str = "foreframe.toml";
 /// The port to listen on by default.
 pub const DEFAULT_PORT: u16 = 8642;
 
+/// The port for health checks and metrics by default.
+pub const DEFAULT_ADMIN_PORT: u16 = 8643;
+
 /// The command that lists all settings.
 const LISTING: &str = "foreframe config";
 
@@ -74,6 +77,16 @@ pub struct Config {
     pub bind: SocketAddr,
     /// The port to listen on; replaces the port of `bind`.
     pub port: Option<u16>,
+    /// The address and port for `/livez`, `/readyz` and `/metrics` alone: HOST:PORT, HOST for port 8643, or `off`. Its
+    /// connections have a limit of their own, so that probes are answered while all others are in use. No API key is asked for.
+    /// If the default is in use by another program, `foreframe serve` goes on without. `foreframe worker` listens only if this is
+    /// set.
+    #[schema(value_type = String)]
+    #[serde(
+        serialize_with = "bind::serialize_or_off",
+        deserialize_with = "bind::deserialize_or_off"
+    )]
+    pub admin_bind: Option<SocketAddr>,
     /// Whether to accept requests from other machines although no API key exists.
     pub insecure: bool,
     /// The format of log lines: `text` or `json`.
@@ -91,6 +104,7 @@ impl Default for Config {
         Self {
             bind: SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT)),
             port: None,
+            admin_bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_ADMIN_PORT))),
             insecure: false,
             log_format: LogFormat::Text,
             otlp_endpoint: None,
@@ -156,13 +170,19 @@ impl LoadedConfig {
         Ok(Self { config, values })
     }
 
+    /// Whether no file, variable or flag gives the setting.
+    #[must_use]
+    pub fn is_default(&self, field: &str) -> bool {
+        self.values.origin(field) == SettingsLayer::DEFAULT
+    }
+
     /// Checks the directories. The data directory is created later if it does not exist. The models directory may be
     /// missing only if it is the default. Errors: `Directory`.
     pub fn check_directories(&self) -> Result<(), ConfigError> {
         let ServerConfig {
             data_dir, models_dir, ..
         } = &self.config.server;
-        let is_default = self.values.origin("models_dir") == SettingsLayer::DEFAULT;
+        let is_default = self.is_default("models_dir");
         let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
             let right = "name a directory; it is created if it does not exist";
             ("data_dir", data_dir, right)
@@ -210,6 +230,7 @@ pub fn environment_layers(variables: impl Iterator<Item = (String, String)>) -> 
 fn expected(field: &str) -> Option<String> {
     match field {
         "bind" => Some("HOST:PORT, as in 127.0.0.1:8642 or localhost:8642".to_owned()),
+        "admin_bind" => Some("HOST:PORT, as in 127.0.0.1:8643, or off".to_owned()),
         "port" => Some("0 to 65535".to_owned()),
         _ => range(field),
     }

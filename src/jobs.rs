@@ -10,7 +10,7 @@ mod instance;
 pub mod job;
 pub mod memory;
 pub mod pipeline;
-mod priority;
+pub mod priority;
 mod progress;
 pub mod queue;
 mod report;

@@ -2,15 +2,18 @@
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
-//! `config`, `http` (connections, limits, keys, problem details), `blocking`, `images`, `stream` (a session and its
-//! WebSocket), `environments`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `serve`.
+//! `config`, `http` (connections, limits, keys, problem details), `blocking`, `pictures`, `images`, `stream` (a session and its
+//! WebSocket), `environments`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
+//! address), `serve`.
 
+mod admin;
 mod blocking;
 mod config;
 mod environments;
 mod http;
 mod images;
 mod openapi;
+mod pictures;
 mod router;
 mod routes;
 mod serve;
@@ -18,11 +21,12 @@ mod state;
 mod stream;
 mod token;
 
+pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};
 pub use http::problem::Problem;
 pub use http::{keys, shutdown};
 pub use images::{ImageBytes, ImageFormat};
 pub use router::{openapi_document, router};
-pub use serve::serve;
+pub use serve::{ServerListeners, serve};
 pub use state::{App, AppParts, ServerError};
 pub use stream::protocol;

@@ -84,6 +84,14 @@ pub enum VersionError {
     Serving(ServingError),
 }
 
+impl VersionError {
+    /// Whether the store is away, so that the same request may succeed later.
+    #[must_use]
+    pub fn is_unavailable(&self) -> bool {
+        matches!(self, Self::Store(store) if store.is_unavailable())
+    }
+}
+
 fn numbers(available: &[u32]) -> String {
     let available: Vec<String> = available.iter().map(u32::to_string).collect();
     if available.is_empty() {

@@ -93,7 +93,7 @@ pub(crate) async fn run(args: &HealthArgs, bounds: &mut Bounds) {
     server.check(bounds);
 }
 
-fn collect() -> Value {
+pub(crate) fn collect() -> Value {
     json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": TRIALS})
 }
 
@@ -104,12 +104,12 @@ fn train() -> Value {
 }
 
 /// Creates a job and returns its path.
-async fn post(http: &mut Http, job: &Value) -> String {
+pub(crate) async fn post(http: &mut Http, job: &Value) -> String {
     let created = http.expect(202, &Request::json("/v1/jobs", job)).await.json();
     format!("/v1/jobs/{}", created["id"].as_str().expect("a job has an id"))
 }
 
-async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) -> bool) {
+pub(crate) async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) -> bool) {
     let since = Instant::now();
     loop {
         let job = http.expect(200, &Request::get(path)).await.json();

@@ -6,6 +6,7 @@
 mod churn;
 mod health;
 mod http;
+mod previews;
 mod process_usage;
 mod report;
 mod robot;
@@ -58,17 +59,20 @@ enum Scenario {
     SlowReader(slow_reader::SlowReaderArgs),
     /// Many sessions and requests: measure leaks of memory, file descriptors and threads
     Churn(churn::ChurnArgs),
+    /// Predictions while other clients ask for pictures: measure latencies
+    Previews(previews::PreviewsArgs),
     /// Health checks and streams while a training uses every core: measure latencies
     Health(health::HealthArgs),
 }
 
 /// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.
-const SHORT_FORMS: [&str; 6] = [
+const SHORT_FORMS: [&str; 7] = [
     "stream --sessions 4 --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
     "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mb 40 --sessions 32",
     "saturate --over streams --skip-late --late-p99-ms 1000 --peak-s 1 --seconds 3 --growth-mb 40 --sessions 32",
     "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mb 40",
     "churn --sessions 300 --requests 3000 --growth-mb 40",
+    "previews --rounds 1 --seconds 2 --noise-ms 1000",
     "health --seconds 3 --livez-p99-ms 1000 --p99-ms 1000",
 ];
 
@@ -104,6 +108,7 @@ async fn run(scenario: &Scenario, bounds: &mut Bounds) {
         Scenario::Saturate(args) => saturate::run(args, bounds).await,
         Scenario::SlowReader(args) => slow_reader::run(args, bounds).await,
         Scenario::Churn(args) => churn::run(args, bounds).await,
+        Scenario::Previews(args) => previews::run(args, bounds).await,
         Scenario::Health(args) => health::run(args, bounds).await,
     }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::settings::ServerArgs;
 use super::{CliError, print_line};
+use crate::config::LoadedConfig;
 
 /// Longer than a healthy server takes, even while it trains.
 const TIMEOUT: Duration = Duration::from_secs(3);
@@ -13,14 +14,14 @@ const TIMEOUT: Duration = Duration::from_secs(3);
 /// Ask a running server whether it is ready: exit code 0 if it is, 1 if not.
 ///
 /// For containers, which have no curl. Without --url it asks the address that `foreframe serve` would listen on with the same
-/// settings.
+/// settings: `admin_bind` if it is set, else `bind`.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe healthcheck
   foreframe healthcheck --port 9000
   foreframe healthcheck --url http://127.0.0.1:8642/livez")]
 pub(super) struct HealthcheckArgs {
-    /// The URL to ask [default: /readyz at the address to listen on]
+    /// The URL to ask [default: /readyz at `admin_bind` or `bind`]
     #[arg(long, value_name = "URL")]
     url: Option<String>,
     #[command(flatten)]
@@ -30,7 +31,7 @@ pub(super) struct HealthcheckArgs {
 pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     let url = match &args.url {
         Some(url) => url.clone(),
-        None => format!("http://{}/readyz", reachable(args.settings.load()?.config.bind)),
+        None => format!("http://{}/readyz", reachable(address(&args.settings.load()?))),
     };
     let answer = get(&url)?;
     let status = answer.lines().next().unwrap_or_default();
@@ -38,6 +39,12 @@ pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
         return print_line(format!("{url}: ready"));
     }
     Err(CliError::Failed(format!("{url}: {status}")))
+}
+
+/// `admin_bind` if it was set, since the default may be in use by another server; else `bind`.
+fn address(loaded: &LoadedConfig) -> SocketAddr {
+    let admin = loaded.config.admin_bind.filter(|_| !loaded.is_default("admin_bind"));
+    admin.unwrap_or(loaded.config.bind)
 }
 
 /// The address under which this machine reaches a server that listens on `bind`.

@@ -1,13 +1,15 @@
 //! `foreframe serve`
 
+use std::net::SocketAddr;
+
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
 use super::settings::{ServerArgs, open_store, with_checked_directories};
 use super::{CliError, print_line};
-use crate::config::Config;
+use crate::config::{Config, LoadedConfig};
 use crate::server::keys::Keys;
-use crate::server::{self, App};
+use crate::server::{self, App, ServerListeners};
 use crate::store::Store;
 use crate::telemetry;
 
@@ -29,23 +31,25 @@ pub(super) struct ServeArgs {
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let mut config = with_checked_directories(args.settings.load()?)?;
+    let loaded = args.settings.load()?;
+    let admin = AdminAddress::of(&loaded);
+    let mut config = with_checked_directories(loaded)?;
     config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
     telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
-        // Every such thread uses memory, and many decoding threads would slow down the one that predicts.
+        // For files; the threads of `App` decode images. Every such thread uses memory.
         .max_blocking_threads(config.server.request_threads)
         .build()
         .map_err(CliError::failed)?;
-    let result = runtime.block_on(listen(config));
+    let result = runtime.block_on(listen(config, admin));
     // Tasks that did not end by the deadline are dropped.
     runtime.shutdown_background();
     result
 }
 
-async fn listen(config: Config) -> Result<(), CliError> {
+async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
     let store = open_store(&config).await?;
     let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
@@ -55,6 +59,7 @@ async fn listen(config: Config) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
+    let admin = admin.listen().await?;
     let app = Box::pin(App::with_store(config.server, store))
         .await
         .map_err(CliError::failed)?
@@ -63,12 +68,53 @@ async fn listen(config: Config) -> Result<(), CliError> {
     let shutdown = server::shutdown::requested();
     print_line(format!("Foreframe listens on http://{address}/ — press Ctrl-C to stop"))?;
     let store = app.store().clone();
-    server::serve(listener, app, shutdown).await;
+    let listeners = ServerListeners {
+        public: listener,
+        admin,
+    };
+    server::serve(listeners, app, shutdown).await;
     // From now on the database file alone is complete.
     if let Err(error) = store.close().await {
         warn!(%error, "could not close the store");
     }
     Ok(())
+}
+
+/// Where to answer health checks and metrics.
+pub(super) struct AdminAddress {
+    /// `None`: nowhere.
+    address: Option<SocketAddr>,
+    /// Whether nobody set it.
+    pub(super) is_default: bool,
+}
+
+impl AdminAddress {
+    pub(super) fn of(loaded: &LoadedConfig) -> Self {
+        Self {
+            address: loaded.config.admin_bind,
+            is_default: loaded.is_default("admin_bind"),
+        }
+    }
+
+    /// The listener. If the default address is in use, probably by another server of this machine, there is none.
+    /// Errors: `Failed` for an address that was set.
+    pub(super) async fn listen(&self) -> Result<Option<TcpListener>, CliError> {
+        let Some(address) = self.address else { return Ok(None) };
+        match TcpListener::bind(address).await {
+            Ok(listener) => {
+                let address = listener.local_addr().map_err(CliError::failed)?;
+                info!("health checks and metrics are also at http://{address}/");
+                Ok(Some(listener))
+            }
+            Err(error) if self.is_default => {
+                warn!(%error, "could not listen on {address} for health checks; set admin_bind to another address or to off");
+                Ok(None)
+            }
+            Err(error) => Err(CliError::Failed(format!(
+                "could not listen on {address} for health checks: {error}; set admin_bind to another address or to off"
+            ))),
+        }
+    }
 }
 
 /// Logs the models that are served, or what to do if there are none.

@@ -2,13 +2,16 @@
 
 use std::time::{Duration, Instant};
 
+use tokio::sync::watch;
 use tracing::{info, warn};
 
+use super::serve::AdminAddress;
 use super::settings::{CommonArgs, open_store, with_checked_directories};
 use super::{CliError, print_line};
 use crate::config::Config;
 use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{Jobs, child};
+use crate::server::serve_worker_health;
 use crate::telemetry;
 use crate::versions::Versions;
 
@@ -25,31 +28,45 @@ pub(super) struct WorkerArgs {
 }
 
 pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
-    let mut config = with_checked_directories(args.settings.load()?)?;
+    let loaded = args.settings.load()?;
+    let admin = AdminAddress::of(&loaded);
+    let mut config = with_checked_directories(loaded)?;
     config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
+    telemetry::install_recorder();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(CliError::failed)?;
-    runtime.block_on(work(&config))
+    runtime.block_on(work(&config, &admin))
 }
 
-async fn work(config: &Config) -> Result<(), CliError> {
+async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let server = &config.server;
     let store = open_store(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
     let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory_limit(server.job_memory_mb);
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
+    let (stopping, is_stopping) = watch::channel(false);
+    // Beside a server of the same machine, the default address would be taken.
+    let admin = if admin.is_default { None } else { admin.listen().await? };
+    let admin = admin.map(|admin| {
+        let (server, store) = (server.clone(), store.clone());
+        tokio::spawn(async move { serve_worker_health(admin, &server, store, is_stopping).await })
+    });
     let shutdown = crate::server::shutdown::requested();
     print_line("Foreframe runs jobs — press Ctrl-C to stop")?;
     shutdown.await;
     info!("stopping");
+    stopping.send_replace(true);
     jobs.begin_stop();
     let deadline = Instant::now() + Duration::from_millis(server.shutdown_deadline_ms);
     if jobs.finish_stop(deadline).await {
         info!("stopped");
+    }
+    if let Some(admin) = admin {
+        admin.abort();
     }
     if let Err(error) = store.close().await {
         warn!(%error, "could not close the store");

@@ -3,27 +3,51 @@
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 
 use serde::de::Error as _;
-use serde::{Deserialize, Deserializer};
+use serde::{Deserialize, Deserializer, Serializer};
 
-use super::DEFAULT_PORT;
+use super::{DEFAULT_ADMIN_PORT, DEFAULT_PORT};
 
 /// Reads `HOST:PORT` or `HOST`. Errors: text that is neither, or a host name that cannot be resolved.
 pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
     let text = String::deserialize(deserializer)?;
-    resolve(&text).ok_or_else(|| D::Error::custom("not HOST:PORT"))
+    resolve(&text, DEFAULT_PORT).ok_or_else(|| D::Error::custom("not HOST:PORT"))
+}
+
+/// The text for no address.
+const OFF: &str = "off";
+
+/// Reads `HOST:PORT`, `HOST` or `off`. Errors: other text, or a host name that cannot be resolved.
+pub(super) fn deserialize_or_off<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<SocketAddr>, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    if text == OFF {
+        return Ok(None);
+    }
+    let address = resolve(&text, DEFAULT_ADMIN_PORT);
+    address
+        .map(Some)
+        .ok_or_else(|| D::Error::custom("neither HOST:PORT nor off"))
+}
+
+/// Writes what [`deserialize_or_off`] reads.
+#[expect(clippy::ref_option, reason = "serde passes a reference to the field")]
+pub(super) fn serialize_or_off<S: Serializer>(address: &Option<SocketAddr>, serializer: S) -> Result<S::Ok, S::Error> {
+    match address {
+        Some(address) => serializer.collect_str(address),
+        None => serializer.serialize_str(OFF),
+    }
 }
 
 /// The address of a host name or an IP address, with or without a port. Of several addresses, the first IPv4 address:
 /// clients that know only 127.0.0.1 then reach `localhost` too.
-fn resolve(text: &str) -> Option<SocketAddr> {
+fn resolve(text: &str, default_port: u16) -> Option<SocketAddr> {
     if let Ok(ip) = text.parse::<IpAddr>() {
-        return Some(SocketAddr::new(ip, DEFAULT_PORT));
+        return Some(SocketAddr::new(ip, default_port));
     }
     let has_port = text.contains(':');
     let addresses: Vec<SocketAddr> = if has_port {
         text.to_socket_addrs().ok()?.collect()
     } else {
-        (text, DEFAULT_PORT).to_socket_addrs().ok()?.collect()
+        (text, default_port).to_socket_addrs().ok()?.collect()
     };
     let first_ipv4 = addresses.iter().find(|address| address.is_ipv4());
     first_ipv4.or_else(|| addresses.first()).copied()
@@ -42,14 +66,14 @@ mod tests {
             ("::1", "[::1]:8642"),
             ("[::1]:9000", "[::1]:9000"),
         ] {
-            assert_eq!(resolve(text), Some(address.parse().unwrap()), "{text}");
+            assert_eq!(resolve(text, DEFAULT_PORT), Some(address.parse().unwrap()), "{text}");
         }
     }
 
     #[test]
     fn what_is_no_host_and_port_is_refused() {
         for text in ["", "localhost:http", "localhost:99999", ":8642:"] {
-            assert_eq!(resolve(text), None, "{text}");
+            assert_eq!(resolve(text, DEFAULT_PORT), None, "{text}");
         }
     }
 }

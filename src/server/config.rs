@@ -51,10 +51,27 @@ pub struct ServerConfig {
     pub max_queued_predictions: usize,
     /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch.
     pub max_batch: usize,
-    /// Maximum number of connections; more are refused with 503 and closed.
+    /// Maximum size of all request bodies that the server reads or works with at the same time, in bytes; more are refused with
+    /// 503. At least `max_body_bytes`. Messages of streams are not counted.
+    pub max_total_body_bytes: usize,
+    /// Maximum number of connections. If all are open, a new one replaces the one that was idle the longest; see
+    /// `connection_evict_ms`. If none is idle, it is refused with 503 and closed.
     pub max_connections: usize,
+    /// Maximum number of connections from one IPv4 address or one /64 network of IPv6. Behind a reverse proxy, all come from
+    /// the same address: set it to `max_connections`.
+    pub max_connections_per_address: usize,
+    /// How long a connection must have been idle, without a request that is being answered, to be replaced by a new one, in
+    /// milliseconds.
+    pub connection_evict_ms: u64,
+    /// Maximum number of connections to `admin_bind`.
+    pub max_admin_connections: usize,
+    /// Maximum number of requests that are processed at the same time; more are refused with 503. Streams and event streams
+    /// are not counted.
+    pub max_requests: usize,
     /// Maximum number of streams; more are refused with 503.
     pub max_streams: usize,
+    /// Maximum number of event streams of jobs; more are refused with 503.
+    pub max_event_streams: usize,
     /// Maximum number of simulated environments; see `environment_evict_ms`.
     pub max_environments: usize,
     /// Maximum number of sessions; more are refused with 503.
@@ -76,8 +93,14 @@ pub struct ServerConfig {
     pub max_job_log_lines: usize,
     /// Number of threads for jobs.
     pub job_threads: usize,
-    /// Number of threads that decode and encode images, simulate and read files for requests; more such work waits.
+    /// Number of threads that decode and encode the images of predictions; more such work waits. As many again simulate,
+    /// and read files.
     pub request_threads: usize,
+    /// Number of threads that make pictures of data sets, models and predictions, and read reports; more such work waits. On
+    /// Linux, they run at lower priority.
+    pub picture_threads: usize,
+    /// Maximum size of the pictures and reports that are kept to answer the same request again, in bytes; 0 keeps none.
+    pub max_cached_bytes: usize,
     /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
     pub job_memory_mb: u64,
     /// After this many attempts in a row that ended abnormally without progress, a job fails.
@@ -138,8 +161,14 @@ impl Default for ServerConfig {
             max_frames: 64,
             max_queued_predictions: 256,
             max_batch: 64,
+            max_total_body_bytes: 256 << 20,
             max_connections: 512,
+            max_connections_per_address: 256,
+            connection_evict_ms: 1_000,
+            max_admin_connections: 32,
+            max_requests: 384,
             max_streams: 128,
+            max_event_streams: 128,
             max_environments: 16,
             max_sessions: 1024,
             max_pipelined_frames: 16,
@@ -151,6 +180,8 @@ impl Default for ServerConfig {
             max_job_log_lines: 1000,
             job_threads: spare_cores(),
             request_threads: 4,
+            picture_threads: 1,
+            max_cached_bytes: 64 << 20,
             job_memory_mb: crate::jobs::memory::default_limit_mb(),
             job_max_attempts: 3,
             job_time_limit_s: 0,
@@ -217,8 +248,26 @@ impl ServerConfig {
                 count.clone(),
             ),
             ("max_batch", self.max_batch as u64, 1..=4096),
+            (
+                "max_total_body_bytes",
+                self.max_total_body_bytes as u64,
+                self.max_body_bytes as u64..=1 << 40,
+            ),
             ("max_connections", self.max_connections as u64, count.clone()),
+            (
+                "max_connections_per_address",
+                self.max_connections_per_address as u64,
+                count.clone(),
+            ),
+            ("connection_evict_ms", self.connection_evict_ms, 0..=MAX_DEADLINE_MS),
+            (
+                "max_admin_connections",
+                self.max_admin_connections as u64,
+                count.clone(),
+            ),
+            ("max_requests", self.max_requests as u64, count.clone()),
             ("max_streams", self.max_streams as u64, count.clone()),
+            ("max_event_streams", self.max_event_streams as u64, count.clone()),
             ("max_sessions", self.max_sessions as u64, count),
             ("max_environments", self.max_environments as u64, 1..=10_000),
             ("max_pipelined_frames", self.max_pipelined_frames as u64, 1..=4096),
@@ -234,6 +283,8 @@ impl ServerConfig {
             ("max_job_log_lines", self.max_job_log_lines as u64, 1..=100_000),
             ("job_threads", self.job_threads as u64, 1..=1024),
             ("request_threads", self.request_threads as u64, 1..=1024),
+            ("picture_threads", self.picture_threads as u64, 1..=1024),
+            ("max_cached_bytes", self.max_cached_bytes as u64, 0..=1 << 36),
             ("job_memory_mb", self.job_memory_mb, 0..=1 << 30),
             ("job_max_attempts", u64::from(self.job_max_attempts), 1..=1_000_000),
             ("job_time_limit_s", self.job_time_limit_s, 0..=100_000_000),

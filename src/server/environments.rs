@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use tracing::info;
 
 use super::config::ServerConfig;
+use super::http::keys::Caller;
 use super::http::problem::ApiError;
 use super::token::Token;
 use crate::sim::Environment;
@@ -38,6 +39,7 @@ impl From<EnvironmentTableError> for ApiError {
 
 struct Entry {
     environment: SharedEnvironment,
+    maker: Caller,
     used: Instant,
 }
 
@@ -62,7 +64,12 @@ impl Environments {
 
     /// Adds an environment and gives its random id. If the table is full, it replaces the environment that was idle the
     /// longest, if that was long enough. Errors: `Full`, `Random`.
-    pub(super) fn add(&self, environment: Environment, now: Instant) -> Result<String, EnvironmentTableError> {
+    pub(super) fn add(
+        &self,
+        environment: Environment,
+        maker: Caller,
+        now: Instant,
+    ) -> Result<String, EnvironmentTableError> {
         let id = Token::random().map_err(EnvironmentTableError::Random)?.id();
         let mut table = self.table(now);
         if table.len() >= self.limit {
@@ -70,6 +77,7 @@ impl Environments {
         }
         let entry = Entry {
             environment: Arc::new(Mutex::new(environment)),
+            maker,
             used: now,
         };
         table.insert(id.clone(), entry);
@@ -87,17 +95,25 @@ impl Environments {
         Ok(())
     }
 
-    /// The environment; counts as use. Errors: `Unknown`.
-    pub(super) fn get(&self, id: &str, now: Instant) -> Result<SharedEnvironment, EnvironmentTableError> {
+    /// The environment; counts as use. Errors: `Unknown`, also if it is another caller's.
+    pub(super) fn get(
+        &self,
+        id: &str,
+        caller: Caller,
+        now: Instant,
+    ) -> Result<SharedEnvironment, EnvironmentTableError> {
         let mut table = self.table(now);
-        let entry = table.get_mut(id).ok_or_else(|| self.unknown(id))?;
+        let entry = table.get_mut(id).filter(|entry| caller.may_use(entry.maker));
+        let entry = entry.ok_or_else(|| self.unknown(id))?;
         entry.used = entry.used.max(now);
         Ok(Arc::clone(&entry.environment))
     }
 
-    /// Errors: `Unknown`.
-    pub(super) fn remove(&self, id: &str, now: Instant) -> Result<(), EnvironmentTableError> {
-        let removed = self.table(now).remove(id);
+    /// Errors: `Unknown`, also if it is another caller's.
+    pub(super) fn remove(&self, id: &str, caller: Caller, now: Instant) -> Result<(), EnvironmentTableError> {
+        let mut table = self.table(now);
+        let is_usable = table.get(id).is_some_and(|entry| caller.may_use(entry.maker));
+        let removed = is_usable.then(|| table.remove(id)).flatten();
         removed.map(drop).ok_or_else(|| self.unknown(id))
     }
 
@@ -136,26 +152,34 @@ mod tests {
     fn a_full_table_replaces_the_idlest_environment() {
         let (table, start) = (table(2), Instant::now());
         let after = |seconds| start + Duration::from_secs(seconds);
-        let first = table.add(environment(), start).unwrap();
-        let second = table.add(environment(), start).unwrap();
-        assert!(table.get(&first, after(3)).is_ok());
-        let third = table.add(environment(), after(6)).unwrap();
-        assert!(table.get(&second, after(6)).is_err(), "it was idle for 6 s");
-        assert!(table.get(&first, after(6)).is_ok() && table.get(&third, after(6)).is_ok());
+        let first = table.add(environment(), Caller::default(), start).unwrap();
+        let second = table.add(environment(), Caller::default(), start).unwrap();
+        assert!(table.get(&first, Caller::default(), after(3)).is_ok());
+        let third = table.add(environment(), Caller::default(), after(6)).unwrap();
+        assert!(
+            table.get(&second, Caller::default(), after(6)).is_err(),
+            "it was idle for 6 s"
+        );
+        assert!(
+            table.get(&first, Caller::default(), after(6)).is_ok()
+                && table.get(&third, Caller::default(), after(6)).is_ok()
+        );
     }
 
     #[test]
     fn an_environment_in_use_is_not_replaced() {
         let (table, start) = (table(1), Instant::now());
-        table.add(environment(), start).unwrap();
-        let error = table.add(environment(), start + Duration::from_secs(2)).unwrap_err();
+        table.add(environment(), Caller::default(), start).unwrap();
+        let error = table
+            .add(environment(), Caller::default(), start + Duration::from_secs(2))
+            .unwrap_err();
         assert_eq!(error, EnvironmentTableError::Full(1));
     }
 
     #[test]
     fn ids_are_long_and_random() {
         let (table, now) = (table(2), Instant::now());
-        let ids = [(); 2].map(|()| table.add(environment(), now).unwrap());
+        let ids = [(); 2].map(|()| table.add(environment(), Caller::default(), now).unwrap());
         assert!(ids[0] != ids[1] && ids.iter().all(|id| id.len() == 32));
     }
 }

@@ -1,6 +1,8 @@
 //! HTTP itself, before any resource: connections, limits, who may call, and the one shape that errors have.
 
 pub(super) mod admission;
+pub(super) mod body_budget;
+mod connection_table;
 pub(super) mod connections;
 pub(super) mod extract;
 pub(super) mod listener;
@@ -9,6 +11,7 @@ pub(super) mod multipart;
 pub(super) mod origin;
 pub(super) mod page;
 pub(super) mod problem;
+pub(super) mod request_limit;
 pub(super) mod streams;
 
 pub mod keys;

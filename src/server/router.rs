@@ -7,10 +7,12 @@ use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::config::ServerConfig;
+use super::http::body_budget::{self, BodyBudget};
 use super::http::keys;
 use super::http::middleware::{self, RequestTrace};
 use super::http::origin::{self, OriginPolicy};
 use super::http::problem::ApiError;
+use super::http::request_limit::{self, RequestLimit};
 use super::openapi;
 use super::routes::{
     contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict, preview,
@@ -21,7 +23,11 @@ use super::state::App;
 /// Every route of the service.
 pub fn router(app: App) -> Router {
     let config = app.config();
-    let api = api_routes(config).route_layer(from_fn_with_state(app.keys().clone(), keys::check));
+    let limit = RequestLimit::new(config);
+    let api = request_routes(config)
+        .route_layer(from_fn_with_state(limit, request_limit::check))
+        .merge(stream_routes())
+        .route_layer(from_fn_with_state(app.keys().clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();
     let document = openapi::text(contract);
     let trace = RequestTrace::new(config, app.draining());
@@ -32,6 +38,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(config.max_body_bytes))
+        .layer(from_fn_with_state(BodyBudget::new(config), body_budget::count))
         .layer(from_fn_with_state(origins, origin::check))
         .layer(from_fn(move |request, next| {
             middleware::trace(trace.clone(), request, next)
@@ -46,7 +53,10 @@ pub fn openapi_document() -> String {
 }
 
 fn contract(config: &ServerConfig) -> OpenApi {
-    open_routes().merge(api_routes(config)).into_openapi()
+    open_routes()
+        .merge(request_routes(config))
+        .merge(stream_routes())
+        .into_openapi()
 }
 
 /// The routes that need no API key.
@@ -58,17 +68,22 @@ fn open_routes() -> OpenApiRouter<App> {
         .merge(contract::routes())
 }
 
-/// The routes that need an API key if authentication is on.
-fn api_routes(config: &ServerConfig) -> OpenApiRouter<App> {
+/// The routes of requests; they need an API key if authentication is on.
+fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .merge(models::routes())
         .merge(predict::routes())
         .merge(preview::routes())
         .merge(rollouts::routes())
         .merge(sessions::routes())
-        .merge(streams::routes())
         .merge(jobs::routes(config.max_job_bytes))
-        .merge(job_events::routes())
         .merge(datasets::routes())
         .merge(environments::routes())
+}
+
+/// The routes of streams, which have limits of their own; they need an API key if authentication is on.
+fn stream_routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .merge(streams::routes())
+        .merge(job_events::routes())
 }

@@ -6,6 +6,7 @@ use tokio::net::TcpListener;
 use tokio::time::{timeout, timeout_at};
 use tracing::{info, warn};
 
+use super::admin;
 use super::http::connections::Connections;
 use super::http::listener::BoundedListener;
 use super::router::router;
@@ -15,10 +16,42 @@ use super::state::App;
 /// How long [`serve`] may take past the deadline to report what did not end.
 const GRACE: Duration = Duration::from_millis(200);
 
-/// Answers on the listener until `shutdown` completes. Then it reports that it is not ready, but accepts requests for
+/// Where a server listens.
+#[derive(Debug)]
+pub struct ServerListeners {
+    /// For everything.
+    pub public: TcpListener,
+    /// For `/livez`, `/readyz` and `/metrics`, with connections of its own.
+    pub admin: Option<TcpListener>,
+}
+
+impl From<TcpListener> for ServerListeners {
+    fn from(public: TcpListener) -> Self {
+        Self { public, admin: None }
+    }
+}
+
+/// Answers on the listeners until `shutdown` completes. Then it reports that it is not ready, but accepts requests for
 /// another `drain_ms`. After that it accepts no connections, answers the requests it has, closes every stream with code
 /// 1001, lets the running job write its checkpoint, and returns when all have ended or the deadline has passed.
-pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
+pub async fn serve(listeners: impl Into<ServerListeners>, app: App, shutdown: impl Future<Output = ()>) {
+    let ServerListeners {
+        public: listener,
+        admin,
+    } = listeners.into();
+    // Until the end, also while the server stops.
+    let admin = admin.map(|admin| tokio::spawn(answer_admin(admin, app.clone())));
+    serve_public(listener, app, shutdown).await;
+    if let Some(admin) = admin {
+        admin.abort();
+    }
+}
+
+async fn answer_admin(listener: TcpListener, app: App) {
+    admin::answer(listener, admin::server_router(&app), app.config()).await;
+}
+
+async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
     let config = app.config();
     let limit = Duration::from_millis(config.shutdown_deadline_ms);
     let drain = Duration::from_millis(config.drain_ms);
@@ -38,10 +71,12 @@ pub async fn serve(listener: TcpListener, app: App, shutdown: impl Future<Output
     let Err(_) = timeout(drain, connections.accept(&listener)).await;
     drop(listener);
     app.streams().stop();
+    app.event_streams().stop();
     if timeout_at(deadline.into(), connections.ended()).await.is_err() {
         warn!("some requests were not answered within the deadline");
     }
-    if timeout_at(deadline.into(), app.streams().ended()).await.is_err() {
+    let streams = async { tokio::join!(app.streams().ended(), app.event_streams().ended()) };
+    if timeout_at(deadline.into(), streams).await.is_err() {
         warn!("some streams did not end within the deadline");
     }
     let ended = async {

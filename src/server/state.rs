@@ -12,8 +12,9 @@ use super::blocking::BlockingWork;
 use super::config::{ServerConfig, SettingError};
 use super::environments::Environments;
 use super::http::admission::Admission;
-use super::http::keys::Keys;
+use super::http::keys::{Caller, Keys};
 use super::http::streams::{Streams, stop_requested};
+use super::pictures::Pictures;
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
 use crate::jobs::child;
@@ -76,7 +77,10 @@ struct AppState {
     config: Arc<ServerConfig>,
     parts: AppParts,
     streams: Streams,
+    event_streams: Streams,
     admission: Admission,
+    predictions: BlockingWork,
+    pictures: Pictures,
     blocking: BlockingWork,
     environments: Environments,
     draining: Arc<AtomicBool>,
@@ -137,9 +141,12 @@ impl App {
     pub fn with_parts(config: ServerConfig, parts: AppParts) -> Self {
         Self {
             shared: Arc::new(AppState {
-                streams: Streams::new(config.max_streams),
+                streams: Streams::new("streams", config.max_streams),
+                event_streams: Streams::new("event streams", config.max_event_streams),
                 admission: Admission::new(&config),
-                blocking: BlockingWork::new(config.request_threads),
+                predictions: BlockingWork::new("predictions", config.request_threads),
+                pictures: Pictures::new(&config),
+                blocking: BlockingWork::new("requests", config.request_threads),
                 environments: Environments::new(&config),
                 draining: Arc::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
@@ -198,10 +205,24 @@ impl App {
         &self.shared.streams
     }
 
+    pub(super) fn event_streams(&self) -> &Streams {
+        &self.shared.event_streams
+    }
+
     pub(super) fn admission(&self) -> &Admission {
         &self.shared.admission
     }
 
+    /// The threads for images of predictions.
+    pub(super) fn predictions(&self) -> &BlockingWork {
+        &self.shared.predictions
+    }
+
+    pub(super) fn pictures(&self) -> &Pictures {
+        &self.shared.pictures
+    }
+
+    /// The threads for simulations and for what is neither a prediction nor a picture.
     pub(super) fn blocking(&self) -> &BlockingWork {
         &self.shared.blocking
     }
@@ -228,13 +249,15 @@ impl App {
         Arc::clone(&self.shared.draining)
     }
 
-    /// What a stream needs of this app.
-    pub(super) fn stream_services(&self) -> StreamServices {
+    /// What a stream of that caller needs of this app.
+    pub(super) fn stream_services(&self, caller: Caller) -> StreamServices {
         StreamServices {
             config: self.shared_config(),
             predictor: self.predictor().clone(),
-            blocking: self.blocking().clone(),
+            blocking: self.predictions().clone(),
             streams: self.streams().clone(),
+            keys: self.keys().clone(),
+            caller,
         }
     }
 

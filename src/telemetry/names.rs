@@ -22,6 +22,7 @@ pub(super) fn initialize_counters() {
     for name in [
         INFERENCE_PANICS,
         HTTP_CONNECTIONS_REFUSED,
+        HTTP_CONNECTIONS_EVICTED,
         AUTH_REFUSED,
         SESSIONS_EVICTED,
         STREAM_DROPPED,
@@ -39,7 +40,9 @@ names! {
         "Time from receiving the request's headers to sending the response's headers, by route.";
     describe_gauge HTTP_CONNECTIONS = "foreframe_http_connections_open" in Count: "Open connections, including streams.";
     describe_counter HTTP_CONNECTIONS_REFUSED = "foreframe_http_connections_refused_total" in Count:
-        "Connections refused because the limit of open connections was reached.";
+        "Connections refused because a limit of open connections was reached.";
+    describe_counter HTTP_CONNECTIONS_EVICTED = "foreframe_http_connections_evicted_total" in Count:
+        "Idle connections closed for new ones because a limit of open connections was reached.";
     describe_counter AUTH_REFUSED = "foreframe_auth_refused_total" in Count: "Requests refused because they had no valid key.";
 
     describe_histogram PREDICTION_QUEUE_WAIT_SECONDS = "foreframe_prediction_queue_wait_seconds" in Seconds:

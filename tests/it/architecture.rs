@@ -186,6 +186,7 @@ const SERVER_ROOMS: &[&str] = &[
     "config",
     "http",
     "blocking",
+    "pictures",
     "images",
     "stream",
     "environments",
@@ -193,6 +194,7 @@ const SERVER_ROOMS: &[&str] = &[
     "routes",
     "openapi",
     "router",
+    "admin",
     "serve",
 ];
 

@@ -268,6 +268,27 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
 }
 
 #[tokio::test]
+async fn the_documentation_is_shown_under_its_security_policy() {
+    let Some(program) = chromium() else {
+        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(crate::service::app(dir.path(), ServerConfig::default())).await;
+    let profile = dir.path().join("profile");
+    let mut page = Page::open(&program, &profile, &format!("http://{}/docs/", server.address)).await;
+    page.wait_until("document.querySelectorAll('.opblock').length > 20")
+        .await;
+    // An operation opens and shows its form.
+    page.value("document.querySelector('.opblock-summary-control').click()")
+        .await;
+    page.wait_until("document.querySelector('.opblock-body') !== null")
+        .await;
+    page.screenshot("docs", 1280, "light").await;
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn page_deletes_its_environment_when_it_closes() {
     let Some(program) = chromium() else {
         eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");

@@ -103,6 +103,62 @@ async fn headers_over_the_limit_are_answered_431() {
 }
 
 #[tokio::test]
+async fn an_unreadable_request_is_answered_with_problem_details() {
+    let (_dir, server) = start(ServerConfig {
+        max_header_bytes: 8192,
+        ..ServerConfig::default()
+    })
+    .await;
+    let long_head = format!("GET /livez HTTP/1.1\r\nhost: a\r\nx: {}\r\n\r\n", "y".repeat(9000));
+    let long_path = format!("GET /{} HTTP/1.1\r\nhost: a\r\n\r\n", "y".repeat(70_000));
+    for (request, statuses) in [
+        (long_head.as_str(), &[431][..]),
+        (long_path.as_str(), &[414, 431]),
+        ("nonsense\r\n\r\n", &[400]),
+        ("GET /livez HTTP/1.1\r\na b: c\r\n\r\n", &[400]),
+    ] {
+        let mut client = connect(server.address).await;
+        // The server may answer and close before it has read everything.
+        let _ = client.write_all(request.as_bytes()).await;
+        let answer = read_to_end(&mut client).await;
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+        let problem: serde_json::Value = serde_json::from_str(body).unwrap();
+        assert!(statuses.iter().any(|status| problem["status"] == *status), "{answer}");
+        assert!(
+            head.contains("application/problem+json") && head.contains("nosniff"),
+            "{answer}"
+        );
+        assert!(problem["detail"].as_str().is_some_and(|detail| !detail.is_empty()));
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn every_answer_forbids_guessing_its_type() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    for path in [
+        "/",
+        "/livez",
+        "/docs/",
+        "/docs/swagger-ui.css",
+        "/v1/models",
+        "/nothing",
+    ] {
+        let headers = get(&app, path).await.headers;
+        assert_eq!(headers[header::X_CONTENT_TYPE_OPTIONS], "nosniff", "{path}");
+    }
+    for path in ["/", "/docs/"] {
+        let headers = get(&app, path).await.headers;
+        let policy = headers[header::CONTENT_SECURITY_POLICY].to_str().unwrap();
+        assert!(
+            policy.contains("default-src 'self'") && policy.contains("script-src 'self';"),
+            "{policy}"
+        );
+    }
+}
+
+#[tokio::test]
 async fn a_client_that_never_reads_is_disconnected() {
     let (_dir, server) = start(ServerConfig {
         write_stall_ms: 100,

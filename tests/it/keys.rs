@@ -5,10 +5,11 @@ use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
 use foreframe::server::{App, ServerConfig};
 use foreframe::store::{Store, StoreConfig};
-use tokio_tungstenite::tungstenite::Error;
+use futures_util::{SinkExt as _, StreamExt as _};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::service::{Answer, app, get, run, send};
+use crate::service::{Answer, TIMEOUT, app, get, run, send};
 
 async fn app_with_keys(is_required: bool) -> (tempfile::TempDir, Store, Keys, App) {
     let dir = tempfile::tempdir().unwrap();
@@ -72,6 +73,68 @@ async fn the_api_requires_a_valid_key() {
     assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
     keys.refresh().await.unwrap();
     assert_eq!(models_with(&app, &format!("Bearer {}", key.text)).await.status, 401);
+}
+
+#[tokio::test]
+async fn a_stream_ends_when_its_key_is_revoked() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let [key, other] = [new_key(&store, &keys).await, new_key(&store, &keys).await];
+    let server = run(app).await;
+    let connect = async |key: &NewKey| {
+        let url = format!("ws://{}/v1/models/plain/stream", server.address);
+        let mut request = url.into_client_request().unwrap();
+        let authorization = format!("Bearer {}", key.text).parse().unwrap();
+        request.headers_mut().insert(header::AUTHORIZATION, authorization);
+        tokio_tungstenite::connect_async(request).await.unwrap().0
+    };
+    let (mut revoked, mut kept) = (connect(&key).await, connect(&other).await);
+    assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    keys.refresh().await.unwrap();
+    let mut messages = Vec::new();
+    while let Some(Ok(message)) = tokio::time::timeout(TIMEOUT, revoked.next()).await.unwrap() {
+        messages.push(message);
+    }
+    let [.., Message::Text(last), Message::Close(Some(close))] = &messages[..] else {
+        panic!("{messages:?}");
+    };
+    assert!(last.contains("closing") && last.contains("revoked"), "{last}");
+    assert_eq!(u16::from(close.code), 1008);
+    kept.send(Message::text("{\"type\": \"ping\", \"timestamp_us\": 1}"))
+        .await
+        .unwrap();
+    for expected in ["ready", "pong"] {
+        let message = tokio::time::timeout(TIMEOUT, kept.next()).await.unwrap().unwrap();
+        assert!(message.unwrap().to_text().unwrap().contains(expected));
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_environment_is_its_makers_alone() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let [maker, other] = [new_key(&store, &keys).await, new_key(&store, &keys).await];
+    let ask = async |method: &str, path: &str, key: &NewKey| {
+        let request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(header::AUTHORIZATION, format!("Bearer {}", key.text))
+            .header(header::CONTENT_TYPE, "application/json");
+        let body = match path.rsplit('/').next() {
+            Some("environments") => "{\"scenario\": \"static-observer\"}",
+            Some("step") => "{\"action\": [0, 0]}",
+            _ => "{}",
+        };
+        send(&app, request.body(Body::from(body)).unwrap()).await
+    };
+    let made = ask("POST", "/v1/environments", &maker).await;
+    assert_eq!(made.status, 201);
+    let path = made.headers[header::LOCATION].to_str().unwrap().to_owned();
+    for (method, part, status) in [("POST", "/step", 200), ("POST", "/reset", 200), ("DELETE", "", 204)] {
+        let path = format!("{path}{part}");
+        let refused = ask(method, &path, &other).await.detail(404);
+        assert!(refused.starts_with("there is no environment"), "{refused}");
+        assert_eq!(ask(method, &path, &maker).await.status, status, "{path}");
+    }
 }
 
 #[tokio::test]

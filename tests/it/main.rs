@@ -39,6 +39,7 @@ mod nn_optimizer;
 mod nn_spec;
 #[cfg(feature = "otlp")]
 mod otlp;
+mod overload;
 mod path_traversal;
 mod process;
 mod program;

@@ -67,6 +67,7 @@ async fn every_metric_is_measured() {
         "max_stream_buffer_bytes=1048576".to_owned(),
         "max_queued_predictions=1".to_owned(),
         format!("max_connections={CONNECTIONS}"),
+        "connection_evict_ms=60000".to_owned(),
     ];
     let settings: Vec<&str> = limits.iter().flat_map(|limit| ["--set", limit]).collect();
     let server = RunningServer::start(dir.path(), &settings);
@@ -78,6 +79,7 @@ async fn every_metric_is_measured() {
         names::STREAM_DROPPED,
         names::AUTH_REFUSED,
         names::HTTP_CONNECTIONS_REFUSED,
+        names::HTTP_CONNECTIONS_EVICTED,
     ] {
         assert_metric(&server, name, 0.0);
     }

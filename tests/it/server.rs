@@ -240,6 +240,7 @@ async fn a_connection_over_the_limit_is_answered_503() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         max_connections: 1,
+        connection_evict_ms: 60_000,
         ..ServerConfig::default()
     };
     let server = run(app(dir.path(), config)).await;

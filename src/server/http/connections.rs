@@ -1,17 +1,25 @@
 //! Open connections, one task each, so that the server can ask all to end, wait for them, and cut them off.
 
 use std::convert::Infallible;
-use std::pin::pin;
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
+use axum::body::{Body, Bytes, HttpBody};
+use axum::http::{Request, StatusCode};
+use axum::response::Response;
+use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::server::conn::http1;
+use hyper::service::Service;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::debug;
 
+use super::connection_table::{BusyConnection, ConnectionPlace};
 use super::listener::{BoundedConnection, BoundedListener};
 use super::streams::stop_requested;
 use crate::server::config::ServerConfig;
@@ -67,12 +75,17 @@ async fn answer(
     router: Router,
     mut stopping: watch::Receiver<bool>,
 ) {
-    let service = TowerToHyperService::new(router);
+    let Some(place) = connection.place() else { return };
+    let evicted = place.evicted();
+    let router = TowerToHyperService::new(router);
+    let service = BusyService { router, place };
     let mut connection = pin!(http.serve_connection(TokioIo::new(connection), service).with_upgrades());
     let result = tokio::select! {
         // The connection first: it reads what has arrived before an idle connection is closed.
         biased;
         result = connection.as_mut() => result,
+        // Another connection has its place now.
+        () = evicted => return,
         () = stop_requested(&mut stopping) => {
             connection.as_mut().graceful_shutdown();
             connection.await
@@ -80,5 +93,53 @@ async fn answer(
     };
     if let Err(error) = result {
         debug!(%error, "connection failed");
+    }
+}
+
+/// Answers requests, and marks the connection as busy until the response was sent.
+struct BusyService {
+    router: TowerToHyperService<Router>,
+    place: Arc<ConnectionPlace>,
+}
+
+impl Service<Request<Incoming>> for BusyService {
+    type Response = Response;
+    type Error = Infallible;
+    type Future = Pin<Box<dyn Future<Output = Result<Response, Infallible>> + Send>>;
+
+    fn call(&self, request: Request<Incoming>) -> Self::Future {
+        let busy = self.place.begin();
+        let answered = self.router.call(request);
+        Box::pin(async move {
+            let response = answered.await?;
+            if response.status() == StatusCode::SWITCHING_PROTOCOLS {
+                busy.keep();
+                return Ok(response);
+            }
+            Ok(response.map(|body| Body::new(BusyBody { body, _busy: busy })))
+        })
+    }
+}
+
+/// A response body; the connection is busy as long as it exists.
+struct BusyBody {
+    body: Body,
+    _busy: BusyConnection,
+}
+
+impl HttpBody for BusyBody {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(cx)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }

@@ -11,6 +11,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
+use super::body_budget;
 use super::problem::ApiError;
 
 /// A JSON body. It must be an object: serde would also accept a list of the fields' values.
@@ -131,6 +132,8 @@ impl From<BytesRejection> for ApiError {
     fn from(rejection: BytesRejection) -> Self {
         if rejection.status() == StatusCode::PAYLOAD_TOO_LARGE {
             Self::TooLarge("the body is longer than this server takes".to_owned())
+        } else if let Some(refused) = body_budget::exceeded(&rejection) {
+            refused
         } else {
             Self::Malformed(rejection.body_text())
         }

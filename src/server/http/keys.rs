@@ -13,6 +13,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use metrics::counter;
 use sha2::{Digest as _, Sha256};
+use tokio::sync::watch;
 use tracing::warn;
 
 use super::problem::ApiError;
@@ -61,7 +62,7 @@ impl NewKey {
 }
 
 /// SHA-256 of a key's whole text.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct KeyHash([u8; 32]);
 
 impl KeyHash {
@@ -77,6 +78,17 @@ impl KeyHash {
     }
 }
 
+/// Who sent a request: the key that it presented, or nobody if authentication was off.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(in crate::server) struct Caller(Option<KeyHash>);
+
+impl Caller {
+    /// Whether this caller may use what another made. What was made without a key is everybody's.
+    pub(in crate::server) fn may_use(self, maker: Self) -> bool {
+        maker.0.is_none() || maker == self
+    }
+}
+
 /// Who may call; clones share it.
 #[derive(Clone)]
 pub struct Keys {
@@ -87,6 +99,8 @@ struct KeyCache {
     store: Option<Store>,
     is_required: bool,
     known: RwLock<KnownKeys>,
+    /// Notified when the keys were read.
+    refreshed: watch::Sender<()>,
 }
 
 #[derive(Default)]
@@ -120,6 +134,7 @@ impl Keys {
                 store,
                 is_required,
                 known: RwLock::default(),
+                refreshed: watch::Sender::new(()),
             }),
         }
     }
@@ -150,7 +165,19 @@ impl Keys {
             exist: !rows.is_empty() || store.keys_were_created(),
             outdated,
         };
+        drop(known);
+        self.shared.refreshed.send_replace(());
         Ok(())
+    }
+
+    /// Completes when the caller's key is no longer valid; never for a caller without a key.
+    pub(in crate::server) async fn revoked(&self, caller: Caller) {
+        let Caller(Some(key)) = caller else {
+            return std::future::pending().await;
+        };
+        let mut refreshed = self.shared.refreshed.subscribe();
+        // The sender lives as long as these keys.
+        while self.known().valid.contains(&key) && refreshed.changed().await.is_ok() {}
     }
 
     /// Reads the keys again and again, so that no request has to wait for the store.
@@ -170,16 +197,17 @@ impl Keys {
     }
 
     /// Takes the same time for every key that is not valid: the whole text is hashed, then looked up.
-    fn check(&self, presented: Option<&str>) -> Result<(), ApiError> {
+    fn check(&self, presented: Option<&str>) -> Result<Caller, ApiError> {
         if !self.are_required() {
-            return Ok(());
+            return Ok(Caller(None));
         }
         let key = presented.ok_or(ApiError::Unauthorized(
             "this server requires an API key: send the header Authorization: Bearer KEY; create a key with foreframe keys \
              create NAME",
         ))?;
-        if self.known().valid.contains(&KeyHash::of(key)) {
-            return Ok(());
+        let hash = KeyHash::of(key);
+        if self.known().valid.contains(&hash) {
+            return Ok(Caller(Some(hash)));
         }
         Err(ApiError::Unauthorized(
             "the API key is not valid: it is unknown or was revoked",
@@ -191,10 +219,13 @@ impl Keys {
     }
 }
 
-/// Refuses a request without a valid key if authentication is on.
-pub(in crate::server) async fn check(State(keys): State<Keys>, request: Request, next: Next) -> Response {
+/// Refuses a request without a valid key if authentication is on. Others get their [`Caller`] as an extension.
+pub(in crate::server) async fn check(State(keys): State<Keys>, mut request: Request, next: Next) -> Response {
     match keys.check(presented(request.headers())) {
-        Ok(()) => next.run(request).await,
+        Ok(caller) => {
+            request.extensions_mut().insert(caller);
+            next.run(request).await
+        }
         Err(refused) => {
             counter!(names::AUTH_REFUSED).increment(1);
             refused.into_response()

@@ -1,21 +1,23 @@
-//! A listener with a bounded number of connections. A connection over the bound gets a 503 response and is closed.
+//! A listener with a bounded number of connections. A connection over the bound takes the place of one that is idle. If there
+//! is none, it gets a 503 response and is closed.
 
 use std::future::poll_fn;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use metrics::{counter, gauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Semaphore;
 use tokio::time::Sleep;
 use tracing::warn;
 
-use super::problem::CONNECTIONS_FULL_RESPONSE;
+use super::connection_table::{ConnectionLimits, ConnectionPlace, ConnectionTable};
+use super::problem::{self, CONNECTIONS_FULL_RESPONSE};
 use crate::server::config::ServerConfig;
 use crate::telemetry::names;
 
@@ -28,16 +30,40 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 pub(in crate::server) struct BoundedListener {
     inner: TcpListener,
-    places: Arc<Semaphore>,
+    table: Arc<ConnectionTable>,
     refusing: Arc<Semaphore>,
     write_stall: Duration,
 }
 
 impl BoundedListener {
     pub(in crate::server) fn new(inner: TcpListener, config: &ServerConfig) -> Self {
+        Self::with(
+            inner,
+            config,
+            config.max_connections,
+            config.max_connections_per_address,
+        )
+    }
+
+    /// The listener of [`super::super::admin`], whose connections have places of their own.
+    pub(in crate::server) fn for_admin(inner: TcpListener, config: &ServerConfig) -> Self {
+        Self::with(
+            inner,
+            config,
+            config.max_admin_connections,
+            config.max_admin_connections,
+        )
+    }
+
+    fn with(inner: TcpListener, config: &ServerConfig, total: usize, per_address: usize) -> Self {
+        let limits = ConnectionLimits {
+            total,
+            per_address,
+            evict_after: Duration::from_millis(config.connection_evict_ms),
+        };
         Self {
             inner,
-            places: Arc::new(Semaphore::new(config.max_connections)),
+            table: Arc::new(ConnectionTable::new(limits)),
             refusing: Arc::new(Semaphore::new(MAX_REFUSING)),
             write_stall: Duration::from_millis(config.write_stall_ms),
         }
@@ -46,8 +72,8 @@ impl BoundedListener {
     /// The next connection that has a place. Nothing is lost when the future is dropped.
     pub(in crate::server) async fn accept(&self) -> BoundedConnection {
         loop {
-            let stream = match self.inner.accept().await {
-                Ok((stream, _)) => stream,
+            let (stream, peer) = match self.inner.accept().await {
+                Ok(accepted) => accepted,
                 Err(error) => {
                     pause_after(&error).await;
                     continue;
@@ -57,9 +83,9 @@ impl BoundedListener {
             if let Err(error) = stream.set_nodelay(true) {
                 warn!(%error, "could not set TCP_NODELAY");
             }
-            match Arc::clone(&self.places).try_acquire_owned() {
-                Ok(place) => return BoundedConnection::new(stream, place, self.write_stall),
-                Err(_) => self.refuse(stream),
+            match self.table.admit(peer.ip(), Instant::now()) {
+                Some(place) => return BoundedConnection::new(stream, place, self.write_stall),
+                None => self.refuse(stream),
             }
         }
     }
@@ -114,19 +140,24 @@ async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
 /// dropped, the client still has time to read the last response.
 pub(in crate::server) struct BoundedConnection {
     /// `None` after the drop.
-    open: Option<(TcpStream, OwnedSemaphorePermit)>,
+    open: Option<(TcpStream, Arc<ConnectionPlace>)>,
     write_stall: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
 impl BoundedConnection {
-    fn new(stream: TcpStream, place: OwnedSemaphorePermit, write_stall: Duration) -> Self {
+    fn new(stream: TcpStream, place: ConnectionPlace, write_stall: Duration) -> Self {
         gauge!(names::HTTP_CONNECTIONS).increment(1.0);
         Self {
-            open: Some((stream, place)),
+            open: Some((stream, Arc::new(place))),
             write_stall,
             stalled: None,
         }
+    }
+
+    /// Its place.
+    pub(super) fn place(&self) -> Option<Arc<ConnectionPlace>> {
+        self.open.as_ref().map(|(_, place)| Arc::clone(place))
     }
 
     fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
@@ -152,8 +183,9 @@ impl BoundedConnection {
 impl Drop for BoundedConnection {
     fn drop(&mut self) {
         gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
+        let open = self.open.take().filter(|(_, place)| !place.is_evicted());
         // Without a runtime, the connection is closed at once.
-        if let (Some((stream, place)), Ok(runtime)) = (self.open.take(), Handle::try_current()) {
+        if let (Some((stream, place)), Ok(runtime)) = (open, Handle::try_current()) {
             runtime.spawn(async move {
                 let _ = tokio::time::timeout(LINGER, close_gently(stream)).await;
                 drop(place);
@@ -170,6 +202,11 @@ impl AsyncRead for BoundedConnection {
 
 impl AsyncWrite for BoundedConnection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        if let Some(refusal) = problem::unreadable_request(bytes) {
+            let written = self.stream()?.poll_write(cx, &refusal);
+            // It is short and the last response, so one write is enough.
+            return self.limit_stall(cx, written).map_ok(|_| bytes.len());
+        }
         let written = self.stream()?.poll_write(cx, bytes);
         self.limit_stall(cx, written)
     }
@@ -179,6 +216,9 @@ impl AsyncWrite for BoundedConnection {
         cx: &mut Context<'_>,
         bytes: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        if let [bytes] = bytes {
+            return self.poll_write(cx, bytes);
+        }
         let written = self.stream()?.poll_write_vectored(cx, bytes);
         self.limit_stall(cx, written)
     }

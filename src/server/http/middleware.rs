@@ -98,6 +98,7 @@ pub(in crate::server) async fn trace(trace: RequestTrace, request: Request, next
     };
     let mut response = problem::finish(work.instrument(span).await, &id);
     let headers = response.headers_mut();
+    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     if let Ok(id) = HeaderValue::from_str(&id) {
         headers.insert(REQUEST_ID, id);
     }

@@ -8,6 +8,7 @@ use axum::http::{StatusCode, header};
 use serde::de::DeserializeOwned;
 
 use super::admission::Admission;
+use super::body_budget;
 use super::extract::Json;
 use super::problem::ApiError;
 use crate::server::config::ServerConfig;
@@ -96,6 +97,8 @@ impl From<MultipartError> for ApiError {
     fn from(error: MultipartError) -> Self {
         if error.status() == StatusCode::PAYLOAD_TOO_LARGE {
             Self::TooLarge("the body is longer than this server takes".to_owned())
+        } else if let Some(refused) = body_budget::exceeded(&error) {
+            refused
         } else {
             Self::Malformed(format!("the body is not a multipart form: {}", error.body_text()))
         }

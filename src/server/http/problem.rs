@@ -165,9 +165,46 @@ pub(in crate::server) fn bounded(detail: String) -> String {
 
 /// The response to a connection over the limit, as bytes on the wire: no request is read from it.
 pub(in crate::server) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavailable\r\n\
-    Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\r\n\
+    Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\
+    X-Content-Type-Options: nosniff\r\n\r\n\
     {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
     \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
+
+/// The response to a request that is not HTTP, in place of the one without a body that hyper writes. `head`: what hyper would
+/// write. `None` if it is another response: all of ours have a request id.
+pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
+    let head = head.starts_with(b"HTTP/1.1 4").then_some(head)?;
+    let head = std::str::from_utf8(head).ok()?;
+    let (line, headers) = head.split_once("\r\n")?;
+    let is_alone = headers.ends_with("\r\n\r\n") && headers.matches("\r\n\r\n").count() == 1;
+    if !is_alone || headers.contains("x-request-id:") {
+        return None;
+    }
+    let (kind, title, status, detail) = match line.split(' ').nth(1)? {
+        "400" => ("malformed", "Bad Request", 400, "the request is not valid HTTP/1.1"),
+        "414" => ("too-large", "URI Too Long", 414, "the path of the request is too long"),
+        "431" => (
+            "too-large",
+            "Request Header Fields Too Large",
+            431,
+            "the head of the request is longer than this server takes",
+        ),
+        _ => return None,
+    };
+    let body = json(&Problem {
+        kind: format!("urn:foreframe:problem:{kind}"),
+        title,
+        status,
+        detail: detail.to_owned(),
+        instance: String::new(),
+    });
+    let head = format!(
+        "HTTP/1.1 {status} {title}\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\
+         X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\n\r\n",
+        body.len()
+    );
+    Some([head.as_bytes(), &body].concat())
+}
 
 #[cfg(test)]
 mod tests {

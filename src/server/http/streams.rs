@@ -11,15 +11,18 @@ use super::problem::ApiError;
 #[derive(Clone)]
 pub(in crate::server) struct Streams {
     places: Arc<Semaphore>,
+    /// What they are, for error messages.
+    kind: &'static str,
     limit: u32,
     stop: watch::Sender<bool>,
 }
 
 impl Streams {
-    pub(in crate::server) fn new(limit: usize) -> Self {
+    pub(in crate::server) fn new(kind: &'static str, limit: usize) -> Self {
         let limit = u32::try_from(limit).unwrap_or(u32::MAX);
         Self {
             places: Arc::new(Semaphore::new(limit as usize)),
+            kind,
             limit,
             stop: watch::Sender::new(false),
         }
@@ -27,9 +30,10 @@ impl Streams {
 
     /// A place, held until the stream's task ends. Errors: `Unavailable` if all are taken.
     pub(in crate::server) fn enter(&self) -> Result<OwnedSemaphorePermit, ApiError> {
+        let (limit, kind) = (self.limit, self.kind);
         Arc::clone(&self.places)
             .try_acquire_owned()
-            .map_err(|_| ApiError::unavailable(format!("{} streams are open already; try again later", self.limit)))
+            .map_err(|_| ApiError::unavailable(format!("{limit} {kind} are open already; try again later")))
     }
 
     /// How many are open.

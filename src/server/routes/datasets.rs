@@ -1,5 +1,6 @@
 //! The data sets, and pictures of their episodes.
 
+use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
@@ -8,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture::PictureError;
-use crate::dataset::{self, Dataset, DatasetError, DatasetInfo};
+use crate::dataset::{Dataset, DatasetError, DatasetInfo};
 use crate::error_text::with_causes;
 use crate::evaluation::figures::animation::enlarged_gif;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
@@ -102,6 +103,7 @@ impl DatasetDescription {
     responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
 )]
 async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
+    let _turn = app.pictures().turn().await;
     let names = datasets::names(app.store().objects()).await?;
     let (names, next) = page.of(names, |name| name)?;
     let mut datasets = Vec::new();
@@ -164,7 +166,8 @@ async fn sheet(
     Path((name, episode)): Path<(String, usize)>,
 ) -> Result<impl IntoResponse, ApiError> {
     let title = format!("{name}, episode {episode}");
-    let png = picture(&app, &name, episode, move |frames, _| contact_sheet(&title, frames)).await?;
+    let draw = move |frames, _| contact_sheet(&title, frames);
+    let png = picture(&app, (&name, episode, "png"), draw).await?;
     Ok(([(header::CONTENT_TYPE, "image/png")], png))
 }
 
@@ -184,7 +187,7 @@ async fn animation(
     State(app): State<App>,
     Path((name, episode)): Path<(String, usize)>,
 ) -> Result<impl IntoResponse, ApiError> {
-    let gif = picture(&app, &name, episode, |mut frames, period_s| {
+    let gif = picture(&app, (&name, episode, "gif"), |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
         enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
     });
@@ -196,20 +199,24 @@ async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError>
     Ok(DatasetDescription::new(name.to_owned(), info))
 }
 
-/// A picture of an episode's frames, given them and the seconds from one to the next.
+/// A picture of an episode's frames, given them and the seconds from one to the next. It is kept as long as the data set
+/// has the same content.
 async fn picture(
     app: &App,
-    name: &str,
-    episode: usize,
+    (name, episode, kind): (&str, usize, &str),
     draw: impl FnOnce(Vec<Frame>, f64) -> Result<Vec<u8>, FrameError> + Send + 'static,
-) -> Result<Vec<u8>, ApiError> {
+) -> Result<Bytes, ApiError> {
+    let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
+    let key = format!("dataset/{name}/{}/{episode}.{kind}", info.content_hash);
+    if let Some(picture) = app.pictures().cached(&key) {
+        return Ok(picture);
+    }
     let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
-    let drawn = app.blocking().run(move || {
+    let make = move || {
         let frames = Dataset::episode_frames(&dir, episode)?;
-        let period_s = dataset::describe(&dir)?.frame_period_s;
-        Ok::<_, ApiError>(draw(frames, period_s).map_err(PictureError::from)?)
-    });
-    drawn.await?
+        Ok::<_, ApiError>(draw(frames, info.frame_period_s).map_err(PictureError::from)?)
+    };
+    app.pictures().get_or_make(key, make).await
 }
 
 /// Frames spread evenly over an episode, in rows, each with its number.

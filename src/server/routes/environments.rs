@@ -3,6 +3,7 @@
 use std::sync::{MutexGuard, PoisonError};
 use std::time::Instant;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -13,6 +14,7 @@ use utoipa_axum::routes;
 use crate::nn::spec::MAX_MODEL_SIDE_PX;
 use crate::server::environments::SharedEnvironment;
 use crate::server::http::extract::{Json, Path};
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat};
 use crate::server::state::App;
@@ -150,9 +152,13 @@ enum EnvironmentError {
         (status = 503, description = "All environments are in use", body = Problem),
     )
 )]
-async fn create(State(app): State<App>, Json(request): Json<NewEnvironment>) -> Result<Response, ApiError> {
+async fn create(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    Json(request): Json<NewEnvironment>,
+) -> Result<Response, ApiError> {
     let (environment, body) = app.blocking().run(move || begin(&request)).await??;
-    let id = app.environments().add(environment, Instant::now())?;
+    let id = app.environments().add(environment, caller, Instant::now())?;
     let location = HeaderValue::from_str(&format!("/v1/environments/{id}"));
     let mut response = (StatusCode::CREATED, axum::Json(EnvironmentBody { id, ..body })).into_response();
     if let Ok(location) = location {
@@ -167,15 +173,16 @@ async fn create(State(app): State<App>, Json(request): Json<NewEnvironment>) -> 
     params(("id" = String, Path, description = "The environment's id")),
     responses(
         (status = 200, body = ResetBody),
-        (status = 404, description = "No such environment; one that nobody steps is dropped", body = Problem),
+        (status = 404, description = "No such environment of this API key; one that nobody steps is dropped", body = Problem),
     )
 )]
 async fn reset(
     State(app): State<App>,
+    Extension(caller): Extension<Caller>,
     Path(id): Path<String>,
     Json(request): Json<ResetRequest>,
 ) -> Result<axum::Json<ResetBody>, ApiError> {
-    let environment = app.environments().get(&id, Instant::now())?;
+    let environment = app.environments().get(&id, caller, Instant::now())?;
     let work = move || restart(&mut lock(&environment), request.seed.map(Seed));
     Ok(axum::Json(app.blocking().run(work).await??))
 }
@@ -186,17 +193,18 @@ async fn reset(
     params(("id" = String, Path, description = "The environment's id")),
     responses(
         (status = 200, body = StepBody),
-        (status = 404, description = "No such environment; one that nobody steps is dropped", body = Problem),
+        (status = 404, description = "No such environment of this API key; one that nobody steps is dropped", body = Problem),
         (status = 409, description = "The episode is over", body = Problem),
         (status = 422, description = "Not an action of this environment", body = Problem),
     )
 )]
 async fn step(
     State(app): State<App>,
+    Extension(caller): Extension<Caller>,
     Path(id): Path<String>,
     Json(request): Json<StepRequest>,
 ) -> Result<axum::Json<StepBody>, ApiError> {
-    let environment = app.environments().get(&id, Instant::now())?;
+    let environment = app.environments().get(&id, caller, Instant::now())?;
     let work = move || advance(&mut lock(&environment), request.action);
     Ok(axum::Json(app.blocking().run(work).await??))
 }
@@ -207,11 +215,15 @@ async fn step(
     params(("id" = String, Path, description = "The environment's id")),
     responses(
         (status = 204, description = "Deleted"),
-        (status = 404, description = "No such environment", body = Problem),
+        (status = 404, description = "No such environment of this API key", body = Problem),
     )
 )]
-async fn delete(State(app): State<App>, Path(id): Path<String>) -> Result<StatusCode, ApiError> {
-    app.environments().remove(&id, Instant::now())?;
+async fn delete(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+) -> Result<StatusCode, ApiError> {
+    app.environments().remove(&id, caller, Instant::now())?;
     Ok(StatusCode::NO_CONTENT)
 }
 

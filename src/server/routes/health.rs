@@ -7,6 +7,7 @@ use utoipa_axum::routes;
 
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
+use crate::store::Store;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz))
@@ -14,14 +15,14 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 
 /// The state of the server.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-struct Health {
+pub(in crate::server) struct Health {
     /// `alive` or `ready`.
     status: &'static str,
 }
 
 /// Tells whether the server is alive.
 #[utoipa::path(get, path = "/livez", tag = "health", responses((status = 200, body = Health)))]
-async fn livez() -> axum::Json<Health> {
+pub(in crate::server) async fn livez() -> axum::Json<Health> {
     axum::Json(Health { status: "alive" })
 }
 
@@ -37,7 +38,12 @@ async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> 
     if !app.predictor().is_ready() {
         return Err(ApiError::unavailable("the models are warming up"));
     }
-    if let Err(error) = app.store().check_writable().await {
+    ready(app.store()).await
+}
+
+/// Whether the store can be written.
+pub(in crate::server) async fn ready(store: &Store) -> Result<axum::Json<Health>, ApiError> {
+    if let Err(error) = store.check_writable().await {
         return Err(ApiError::unavailable(format!("the store cannot be written: {error}")));
     }
     Ok(axum::Json(Health { status: "ready" }))

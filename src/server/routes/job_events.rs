@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::sse::{Event, KeepAlive, Sse};
@@ -15,6 +16,7 @@ use utoipa_axum::routes;
 use super::jobs::LogLine;
 use crate::jobs::{Job, JobError};
 use crate::server::http::extract::Path;
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::http::streams::stop_requested;
 use crate::server::state::App;
@@ -40,8 +42,8 @@ struct JobEvent {
     data: String,
 }
 
-/// Sends the job whenever it changes (`event: job`) and each line of its log (`event: log`), until it has ended or the
-/// server stops. With `Last-Event-ID`, the log continues after that line.
+/// Sends the job whenever it changes (`event: job`) and each line of its log (`event: log`), until it has ended, the
+/// server stops, or the API key is revoked. With `Last-Event-ID`, the log continues after that line.
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/events", tag = "jobs",
     params(
@@ -51,11 +53,12 @@ struct JobEvent {
     responses(
         (status = 200, description = "Events", content_type = "text/event-stream", body = JobEvent),
         (status = 404, description = "No such job", body = Problem),
-        (status = 503, description = "Too many streams are open", body = Problem),
+        (status = 503, description = "Too many event streams are open", body = Problem),
     )
 )]
 async fn events(
     State(app): State<App>,
+    Extension(caller): Extension<Caller>,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
@@ -64,9 +67,10 @@ async fn events(
         .get("last-event-id")
         .and_then(|seen| seen.to_str().ok()?.parse().ok());
     let watch = JobEventStream {
-        _place: app.streams().enter()?,
-        stopping: app.streams().stopping(),
+        _place: app.event_streams().enter()?,
+        stopping: app.event_streams().stopping(),
         app,
+        caller,
         id,
         job: None,
         after: last_seen.unwrap_or(0),
@@ -83,6 +87,7 @@ async fn events(
 /// The events for one client.
 struct JobEventStream {
     app: App,
+    caller: Caller,
     id: String,
     /// The job as last sent.
     job: Option<Job>,
@@ -109,6 +114,7 @@ impl JobEventStream {
                 tokio::select! {
                     () = tokio::time::sleep(POLL_EVERY) => {}
                     () = stop_requested(&mut self.stopping) => return None,
+                    () = self.app.keys().revoked(self.caller) => return None,
                 }
             }
         }

@@ -1,5 +1,6 @@
 //! Collection, training and evaluation in the background.
 
+use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -274,16 +275,21 @@ async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) 
 }
 
 /// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.
-async fn report_file(app: &App, id: &str, file: &str) -> Result<Vec<u8>, ApiError> {
+async fn report_file(app: &App, id: &str, file: &str) -> Result<Bytes, ApiError> {
+    let key = format!("report/{id}/{file}");
+    if let Some(bytes) = app.pictures().cached(&key) {
+        return Ok(bytes);
+    }
     let objects = app.store().objects();
     let path = objects.data_dir().join(report_key(id)).join(file);
     let local = path.clone();
-    if !app.blocking().run(move || local.is_file()).await? {
+    if !app.pictures().threads().run(move || local.is_file()).await? {
         let pulled = objects.pull(&report_key(id), file).await;
-        pulled.map_err(|error| ApiError::Internal(error.to_string()))?;
+        pulled.map_err(JobError::Store)?;
     }
-    let bytes = app.blocking().run(move || std::fs::read(path)).await?;
-    bytes.map_err(|_| ApiError::NotFound(format!("the file of job {id} no longer exists")))
+    let gone = format!("the file of job {id} no longer exists");
+    let read = move || std::fs::read(path).map_err(|_| ApiError::NotFound(gone));
+    app.pictures().get_or_make(key, read).await
 }
 
 fn media_type(file: &str) -> &'static str {
@@ -328,6 +334,7 @@ impl From<JobError> for ApiError {
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
             JobError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
+            JobError::Versions(ref versions) if versions.is_unavailable() => Self::unavailable(with_causes(&error)),
             JobError::Record { .. }
             | JobError::Instance(_)
             | JobError::Threads(_)

@@ -13,9 +13,10 @@ use utoipa_axum::routes;
 
 use crate::jobs::{JobSpec, JobState};
 use crate::server::state::App;
+use crate::store::Store;
 use crate::telemetry::{self, names};
 
-const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
+pub(in crate::server) const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 /// How often the samples of histograms are sorted into their buckets.
 const FOLD_INTERVAL: Duration = Duration::from_secs(5);
 
@@ -32,12 +33,17 @@ async fn metrics(State(app): State<App>) -> impl IntoResponse {
     gauge!(names::STREAMS).set(app.streams().count() as f64);
     gauge!(names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
     gauge!(names::MODELS_LOADED).set(app.predictor().models().len() as f64);
-    match app.store().count_jobs().await {
+    ([(header::CONTENT_TYPE, TEXT_FORMAT)], text(app.store()).await)
+}
+
+/// All metrics as text, with the jobs of this store.
+pub(in crate::server) async fn text(store: &Store) -> String {
+    match store.count_jobs().await {
         Ok(counts) => measure_jobs(&counts),
         // The other metrics are still useful.
         Err(error) => warn!(%error, "could not count the jobs"),
     }
-    ([(header::CONTENT_TYPE, TEXT_FORMAT)], telemetry::render())
+    telemetry::render()
 }
 
 /// A state without jobs gets 0, so that a job that has left it is no longer counted there.

@@ -6,7 +6,10 @@ use axum::response::{IntoResponse, Response};
 use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
+use crate::server::blocking::BlockingWork;
+use crate::server::http::extract::ResponseFormat;
 use crate::server::http::problem::ApiError;
+use crate::server::state::App;
 
 /// How long an animation stays on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;
@@ -27,10 +30,23 @@ impl From<PictureError> for ApiError {
     }
 }
 
+/// The threads that write predictions in that format.
+pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
+    match format {
+        ResponseFormat::Json => app.predictions(),
+        ResponseFormat::Png | ResponseFormat::Gif => app.pictures().threads(),
+    }
+}
+
 /// The response with a PNG picture.
 pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, PictureError> {
-    let bytes = picture.and_then(|picture| codec::encode_png(&picture))?;
+    let bytes = png_file(picture)?;
     Ok(([(header::CONTENT_TYPE, "image/png")], bytes).into_response())
+}
+
+/// The picture as PNG.
+pub(super) fn png_file(picture: Result<Frame, FrameError>) -> Result<Vec<u8>, PictureError> {
+    Ok(picture.and_then(|picture| codec::encode_png(&picture))?)
 }
 
 /// The response with a GIF animation.

@@ -142,12 +142,12 @@ async fn predict(
     let (manifest, format) = (Arc::clone(&model.manifest), request.format);
     let max_frames = app.config().max_frames;
     let decode = move || request.into_input(&manifest, max_frames);
-    let input = app.blocking().run(decode).await??;
+    let input = app.predictions().run(decode).await??;
     let seen = input.frames.clone();
     let prediction = app.predictor().predict_by(&model, input).await?;
     let period_s = model.manifest.spec.frame_period_s;
     let encode = move || answer(wanted, format, &seen, prediction, period_s);
-    app.blocking().run(encode).await?
+    picture::threads_for(&app, wanted).run(encode).await?
 }
 
 impl PredictRequest {

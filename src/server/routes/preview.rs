@@ -1,7 +1,11 @@
 //! A picture of what a model can do: a simulated trial, the prediction, and the true frames.
 
+use std::sync::Arc;
+
+use axum::body::Bytes;
 use axum::extract::State;
-use axum::response::Response;
+use axum::http::header;
+use axum::response::{IntoResponse as _, Response};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -9,7 +13,7 @@ use super::picture;
 use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::Frame;
 use crate::nn::{Conditioning, ModelSpec};
-use crate::registry::Manifest;
+use crate::registry::{LoadedModel, Manifest};
 use crate::server::http::extract::Path;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
@@ -39,13 +43,25 @@ const TRIAL: u64 = 1;
     )
 )]
 async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Response, ApiError> {
-    let manifest = app.predictor().model(&model)?;
-    let simulated = app.blocking().run(move || simulate(&manifest)).await?;
+    let active = app.predictor().active(&model)?;
+    let key = format!("model/{model}/{}", active.manifest.weights_sha256);
+    // Many requests for the same picture compute one prediction.
+    let _turn = app.pictures().turn().await;
+    let png = match app.pictures().cached(&key) {
+        Some(png) => png,
+        None => make(&app, active, key).await?,
+    };
+    Ok(([(header::CONTENT_TYPE, "image/png")], png).into_response())
+}
+
+async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, ApiError> {
+    let manifest = Arc::clone(&model.manifest);
+    let simulated = app.pictures().threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
-    let predicted = app.predictor().predict(&model, input).await?.frames;
-    let draw = move || picture::png(prediction_sheet(&seen, &predicted, &truth));
-    Ok(app.blocking().run(draw).await??)
+    let predicted = app.predictor().predict_by(&model, input).await?.frames;
+    let draw = move || Ok::<_, ApiError>(picture::png_file(prediction_sheet(&seen, &predicted, &truth))?);
+    app.pictures().get_or_make(key, draw).await
 }
 
 /// The model's input from the trial, and the true frames after it.

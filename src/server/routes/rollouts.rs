@@ -116,10 +116,10 @@ async fn model_rollouts(
     let model = app.predictor().active(&model)?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
     let decode = move || request.into_task(&manifest, &config);
-    let (seen, task) = app.blocking().run(decode).await??;
+    let (seen, task) = app.predictions().run(decode).await??;
     let computed = app.predictor().compute(&model, task, None).await?;
     let encode = move || answer(wanted, format, &model, &seen, &computed);
-    app.blocking().run(encode).await?
+    picture::threads_for(&app, wanted).run(encode).await?
 }
 
 /// Predicts one future for each of many plans from the session's last frame. The session does not change.
@@ -164,7 +164,7 @@ async fn session_rollouts(
     )?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &model, &[], &computed);
-    app.blocking().run(encode).await?
+    picture::threads_for(&app, wanted).run(encode).await?
 }
 
 impl RolloutRequest {

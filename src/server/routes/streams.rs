@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
@@ -13,6 +14,7 @@ use utoipa_axum::routes;
 
 use super::sessions::AuthorizedSession;
 use crate::server::http::extract::Path;
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::server::stream::connection::StreamConnection;
@@ -53,10 +55,11 @@ type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
 )]
 async fn session_stream(
     State(app): State<App>,
+    Extension(caller): Extension<Caller>,
     session: AuthorizedSession,
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
-    open(&app, session.0, true, upgrade)
+    open(&app, caller, (session.0, true), upgrade)
 }
 
 /// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
@@ -73,6 +76,7 @@ async fn session_stream(
 )]
 async fn model_stream(
     State(app): State<App>,
+    Extension(caller): Extension<Caller>,
     Path(model): Path<String>,
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
@@ -84,10 +88,15 @@ async fn model_stream(
         Instant::now(),
     );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
-    open(&app, Arc::new(session), false, upgrade)
+    open(&app, caller, (Arc::new(session), false), upgrade)
 }
 
-fn open(app: &App, session: Arc<Session>, is_persistent: bool, upgrade: Upgrade) -> Result<Response, ApiError> {
+fn open(
+    app: &App,
+    caller: Caller,
+    (session, is_persistent): (Arc<Session>, bool),
+    upgrade: Upgrade,
+) -> Result<Response, ApiError> {
     let upgrade = upgrade.map_err(|_| ApiError::UpgradeRequired)?.protocols(Codec::NAMES);
     let chosen = upgrade
         .selected_protocol()
@@ -105,7 +114,7 @@ fn open(app: &App, session: Arc<Session>, is_persistent: bool, upgrade: Upgrade)
         .max_message_size(limit)
         .max_frame_size(limit)
         .read_buffer_size(READ_BYTES);
-    let services = app.stream_services();
+    let services = app.stream_services(caller);
     Ok(upgrade.on_upgrade(move |socket| {
         let connection = StreamConnection::new(services, &session, is_persistent, chosen.unwrap_or_default());
         async move {

@@ -23,6 +23,7 @@ use super::step::{FrameStep, StepError};
 use crate::frame::fit::Fit;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
+use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::problem::bounded;
 use crate::server::http::streams::{Streams, stop_requested};
 use crate::server::images::ImageFormat;
@@ -64,6 +65,9 @@ pub(in crate::server) struct StreamServices {
     pub(in crate::server) predictor: Predictor,
     pub(in crate::server) blocking: BlockingWork,
     pub(in crate::server) streams: Streams,
+    pub(in crate::server) keys: Keys,
+    /// Who opened the stream.
+    pub(in crate::server) caller: Caller,
 }
 
 pub(in crate::server) struct StreamConnection {
@@ -154,6 +158,7 @@ impl StreamConnection {
                 Owner::Connection(_) => ClosingReason::Replaced,
                 Owner::Deleted => ClosingReason::Deleted,
             }),
+            () = self.services.keys.revoked(self.services.caller) => Ok(ClosingReason::Revoked),
             end = self.read_all(stream, &inbox) => end,
         }
     }
@@ -348,7 +353,7 @@ async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Durat
 fn code_of(reason: ClosingReason) -> u16 {
     match reason {
         ClosingReason::Asked | ClosingReason::Idle | ClosingReason::Deleted => close_code::NORMAL,
-        ClosingReason::Replaced => close_code::POLICY,
+        ClosingReason::Replaced | ClosingReason::Revoked => close_code::POLICY,
         ClosingReason::TooLong => close_code::SIZE,
         ClosingReason::Malformed => close_code::PROTOCOL,
         ClosingReason::NotUtf8 => close_code::INVALID,

@@ -298,6 +298,8 @@ pub enum ClosingReason {
     Malformed,
     /// Text that is not UTF-8.
     NotUtf8,
+    /// The API key that opened the stream was revoked.
+    Revoked,
     /// The server stops.
     Shutdown,
 }
