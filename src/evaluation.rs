@@ -12,7 +12,6 @@ pub mod figures;
 pub mod inference;
 mod markdown;
 pub mod metrics;
-pub mod motion;
 mod output;
 pub mod plans;
 pub mod report;

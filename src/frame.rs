@@ -1,11 +1,14 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
-//! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels.
+//! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels, `motion`
+//! (with the feature `train`) measures how far an image moved.
 
 use jpeg::JpegDamage;
 
 pub mod codec;
 pub mod fit;
 pub mod jpeg;
+#[cfg(feature = "train")]
+pub mod motion;
 pub mod preprocess;
 pub mod quality;
 pub mod warp;

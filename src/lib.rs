@@ -57,6 +57,9 @@ pub mod sim;
 #[cfg(feature = "train")]
 pub mod dataset;
 
+#[cfg(feature = "train")]
+pub mod inspection;
+
 pub mod registry;
 
 #[cfg(feature = "train")]

@@ -12,10 +12,10 @@ use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
 use self::nearest::TrainingWindows;
 use super::EvaluationError;
-use super::motion::{Shift, phase_correlation, shifted};
 use super::score::{evenly, training_mean};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, DatasetError, Window};
+use crate::frame::motion::{Shift, phase_correlation, shifted};
 use crate::frame::preprocess::scale;
 
 /// One row of a table: who made the prediction.

@@ -14,6 +14,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("nn", &["types", "frame"]),
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "error_text", "frame", "sim"]),
+    ("inspection", &["types", "frame", "dataset"]),
     ("registry", &["types", "files", "error_text", "nn"]),
     (
         "training",

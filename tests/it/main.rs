@@ -21,6 +21,7 @@ mod fit;
 mod fixtures;
 mod healthy_robot;
 mod import;
+mod inspection;
 mod jobs;
 mod jobs_checkpoints;
 mod jobs_end_to_end;
