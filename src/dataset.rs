@@ -8,6 +8,7 @@ mod check;
 pub mod collect;
 mod collection;
 mod error;
+pub mod export;
 mod files;
 pub mod import;
 mod layout;

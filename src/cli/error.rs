@@ -93,8 +93,10 @@ impl UsageError for DatasetError {
             | Self::OtherArguments { .. }
             | Self::Unknown { .. }
             | Self::NotADataset { .. }
+            | Self::OtherTool { .. }
             | Self::Unfinished { .. }
             | Self::FrameSize { .. }
+            | Self::OddFrames { .. }
             | Self::Channels { .. }
             | Self::WindowTooLong { .. }
             | Self::TooFewWindows { .. } => true,

@@ -10,26 +10,36 @@ use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
+use crate::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
 use crate::dataset::{Dataset, Episode};
 use crate::evaluation::figures::animation::enlarged_gif;
 use crate::frame::{Frame, codec};
 
-/// Write an episode's frames as PNG, its actions and states as JSON, and a GIF to look at.
+/// Write an episode as images or MP4, or a whole data set for LeRobot.
 ///
-/// `foreframe predict` reads such a directory: frames in order, with an action and a state for each frame.
+/// Without --to, it writes an episode's frames as PNG, its actions and states as JSON, and a GIF to look at. `foreframe predict`
+/// reads such a directory: frames in order, with an action and a state for each frame.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe export --dataset moving-observer --episode 3 --out look
-  foreframe export --dataset static-observer --first 5 --count 10 --out part")]
+  foreframe export --dataset static-observer --first 5 --count 10 --out part
+  foreframe export --dataset mycar --to lerobot --videos --out mycar-lerobot
+  foreframe export --dataset mycar --to mp4 --episode 2 --out look.mp4")]
 pub(super) struct ExportArgs {
     /// The directory of a data set, or its name in `DATA_DIR/datasets`
     #[arg(long, value_name = "DATASET")]
     dataset: PathBuf,
-    /// The episode's number, counted from 0
-    #[arg(long, default_value_t = 0)]
-    episode: usize,
-    /// A new directory for the files
-    #[arg(long, value_name = "DIR")]
+    /// What to write: png (an episode's images), mp4 (an episode as video, with ffmpeg) or lerobot (the data set, version 3)
+    #[arg(long, value_enum, default_value_t = ExportFormat::Png)]
+    to: ExportFormat,
+    /// With --to lerobot: store the frames as H.264 videos (needs ffmpeg; without masks) instead of PNG images
+    #[arg(long)]
+    videos: bool,
+    /// The episode's number, counted from 0 [default: 0]
+    #[arg(long)]
+    episode: Option<usize>,
+    /// A new directory for the files; with --to mp4, a new file
+    #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// The first frame of the episode to write, counted from 0
     #[arg(long, default_value_t = 0)]
@@ -41,22 +51,42 @@ pub(super) struct ExportArgs {
     settings: CommonArgs,
 }
 
+/// What an export writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum ExportFormat {
+    Png,
+    Mp4,
+    Lerobot,
+}
+
 pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
+    let is_part = args.episode.is_some() || args.first > 0 || args.count.is_some();
+    if args.to == ExportFormat::Lerobot && is_part {
+        return Err(CliError::Usage(
+            "--to lerobot writes the whole data set; leave out --episode, --first and --count".to_owned(),
+        ));
+    }
+    if args.to != ExportFormat::Lerobot && args.videos {
+        return Err(CliError::Usage("--videos goes with --to lerobot only".to_owned()));
+    }
     let workspace = Workspace::new(args.settings.start()?);
     let (dir, dataset) = workspace.open_dataset(&args.dataset)?;
-    let episode = dataset
-        .episodes()
-        .iter()
-        .find(|episode| episode.index == args.episode)
-        .ok_or_else(|| {
-            CliError::Usage(format!(
-                "--episode is {}; {} has {} episodes, counted from 0",
-                args.episode,
-                dir.display(),
-                dataset.episodes().len()
-            ))
-        })?;
+    if args.to == ExportFormat::Lerobot {
+        return write_lerobot(args, &dataset);
+    }
+    let number = args.episode.unwrap_or(0);
+    let find = |episode: &&Episode| episode.index == number;
+    let episode = dataset.episodes().iter().find(find).ok_or_else(|| {
+        CliError::Usage(format!(
+            "--episode is {number}; {} has {} episodes, counted from 0",
+            dir.display(),
+            dataset.episodes().len()
+        ))
+    })?;
     let range = selected(args, episode)?;
+    if args.to == ExportFormat::Mp4 {
+        return write_mp4(args, &dataset, range);
+    }
     let output = OutputDirectory::create(&args.out)?;
     write(&output, &dataset, range.clone())?;
     output.finish()?;
@@ -67,12 +97,42 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     ))
 }
 
+fn write_lerobot(args: &ExportArgs, dataset: &Dataset) -> Result<(), CliError> {
+    let output = OutputDirectory::create(&args.out)?;
+    if args.videos {
+        to_lerobot_videos(dataset, output.path())?;
+    } else {
+        to_lerobot_images(dataset, output.path())?;
+    }
+    output.finish()?;
+    let info = dataset.info();
+    print_line(format!(
+        "{}: {} episodes, {} frames, LeRobot v3.0 with {}",
+        args.out.display(),
+        info.episode_count,
+        info.frame_count,
+        if args.videos { "videos" } else { "images" }
+    ))
+}
+
+fn write_mp4(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
+    if args.out.exists() {
+        return Err(CliError::Usage(format!(
+            "{} exists; name a new file",
+            args.out.display()
+        )));
+    }
+    let frames = range.len();
+    to_mp4(dataset, range, &args.out)?;
+    print_line(format!("{}: {frames} frames", args.out.display()))
+}
+
 /// The frames to write, counted over the whole data set.
 fn selected(args: &ExportArgs, episode: &Episode) -> Result<Range<usize>, CliError> {
     if args.first >= episode.frame_count {
         return Err(CliError::Usage(format!(
             "--first is {}; episode {} has {} frames, counted from 0",
-            args.first, args.episode, episode.frame_count
+            args.first, episode.index, episode.frame_count
         )));
     }
     let count = args.count.map_or(usize::MAX, |count| count as usize);

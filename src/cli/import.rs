@@ -17,19 +17,20 @@ const LISTED_ITEMS: usize = 10;
 /// Turn a recording into a data set.
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
-/// `NumPy` array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
+/// `LeRobot` data set, a `NumPy` array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
 /// it, run the same command again: it continues.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe import ~/mycar/data --name mycar --every 4
   foreframe import frames/ --name walk --rate 10
   foreframe import frames/ --csv log.csv --action speed --action turn --unit turn=rad/s
+  foreframe import pusht/ --image front --size 96x96
   foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
 then
   foreframe inspect mycar
   foreframe train --preset paper --dataset mycar")]
 pub(super) struct ImportArgs {
-    /// A folder of images, a Donkeycar tub, a .npy file or a video
+    /// A folder of images, a Donkeycar tub, a LeRobot data set, a .npy file or a video
     source: PathBuf,
     /// The data set's name [default: the source's name]
     #[arg(long)]
@@ -52,7 +53,7 @@ pub(super) struct ImportArgs {
     /// The CSV file, if it is not the only one in the folder
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// The column or input with the images [default: found by name or type]
+    /// The column, input or camera with the images [default: found by name or type]
     #[arg(long, value_name = "NAME")]
     image: Option<String>,
     /// The column with the times [default: found by name]

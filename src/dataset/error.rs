@@ -190,10 +190,20 @@ pub enum DatasetError {
     },
     /// The directory holds no data set.
     #[error(
-        "{path} holds no data set (meta/info.json is missing); give a directory that `foreframe collect` wrote",
+        "{path} holds no data set (meta/info.json is missing); give a directory that `foreframe collect` or `foreframe \
+         import` wrote; `foreframe import` makes a data set of a recording",
         path = path.display()
     )]
     NotADataset {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The data set was not written by this program.
+    #[error(
+        "{path} is a LeRobot data set of another program; make one of Foreframe of it: foreframe import {path} --name NAME",
+        path = path.display()
+    )]
+    OtherTool {
         /// The directory.
         path: PathBuf,
     },
@@ -254,6 +264,19 @@ pub enum DatasetError {
         /// The arguments of the collection.
         arguments: String,
     },
+    /// Frames with an odd side cannot be stored as video.
+    #[error(
+        "frames of {width}×{height} px cannot become a video, which needs even sides; export images, or import with another --size"
+    )]
+    OddFrames {
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+    },
+    /// A program that is needed is missing or failed.
+    #[error("{0}")]
+    Program(String),
     /// The episode does not exist.
     #[error("there is no episode {episode} in \"{name}\"; it has {count}, counted from 0")]
     NoEpisode {

@@ -1,11 +1,12 @@
 //! Turns recordings of real robots into data sets.
 //!
-//! A source (`images`, `donkeycar`, `numpy` or `video`) lists its records: time, action, state and where the image
+//! A source (`images`, `donkeycar`, `lerobot`, `numpy` or `video`) lists its records: time, action, state and where the image
 //! is. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
 //! Only one shard is in memory at a time.
 
 mod donkeycar;
 mod images;
+mod lerobot;
 mod numpy;
 mod recording;
 mod timing;
@@ -25,7 +26,7 @@ use crate::frame::fit::Fit;
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportConfig {
-    /// The recording: a folder of images, a Donkeycar tub, a `NumPy` file or a video.
+    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a `NumPy` file or a video.
     pub source: PathBuf,
     /// The data set's directory.
     pub out: PathBuf,
@@ -116,7 +117,7 @@ pub enum ImportError {
     /// The source is of no known kind.
     #[error(
         "{} is not a recording that can be imported; give a folder of PNG or JPEG images (with or without a CSV), a \
-         Donkeycar tub (manifest.json), a .npy file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
+         Donkeycar tub (manifest.json), a LeRobot data set (meta/info.json), a .npy file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
         .0.display()
     )]
     UnknownSource(PathBuf),
@@ -233,6 +234,9 @@ fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
     }
     if donkeycar::is_tub(source) {
         return donkeycar::open(source, options);
+    }
+    if lerobot::is_lerobot(source) {
+        return lerobot::open(source, &config.out, options);
     }
     if source.is_dir() {
         return images::open(source, options);

@@ -82,7 +82,8 @@ pub(super) struct DatasetMetadata {
 }
 
 impl DatasetMetadata {
-    /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotADataset`, `Corrupt`.
+    /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotADataset`, `OtherTool`,
+    /// `Corrupt`.
     pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
@@ -100,6 +101,11 @@ impl DatasetMetadata {
             );
         }
         let path = directory.join(METADATA);
+        if !path.exists() {
+            return Err(DatasetError::OtherTool {
+                path: directory.to_owned(),
+            });
+        }
         let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
         Self::parse(&path, &text)
     }

@@ -183,7 +183,8 @@ fn vector_type(size: usize) -> DataType {
     }
 }
 
-fn schema(info: &DatasetInfo) -> SchemaRef {
+/// The columns of a shard.
+pub(super) fn schema(info: &DatasetInfo) -> SchemaRef {
     let mut fields = vec![Field::new(IMAGE, DataType::Struct(image_fields()), true)];
     if info.has_masks {
         fields.push(Field::new(MASK, DataType::Struct(image_fields()), true));
@@ -199,7 +200,8 @@ fn schema(info: &DatasetInfo) -> SchemaRef {
     Arc::new(Schema::new(fields).with_metadata(metadata))
 }
 
-fn batch(
+/// The rows of one episode.
+pub(super) fn batch(
     info: &DatasetInfo,
     schema: &SchemaRef,
     start: ShardStart,

@@ -205,7 +205,7 @@ fn metadata(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String
     }
 }
 
-fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetError> {
+pub(super) fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetError> {
     let mut text = serde_json::to_string_pretty(value).map_err(|error| DatasetError::Description(error.to_string()))?;
     text.push('\n');
     write_atomically(path, text.as_bytes())

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use arrow_array::builder::{Float64Builder, ListBuilder, StringBuilder};
-use arrow_array::{ArrayRef, Int64Array, RecordBatch, StringArray};
+use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
@@ -55,6 +55,44 @@ pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
 
 /// The table of episodes: position, trial parameters and statistics of every column.
 pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
+    write(episode_columns(rows, task), &[])
+}
+
+/// The same of a data set whose frames are videos, one for each shard.
+pub(super) fn episodes_with_videos(
+    rows: &[EpisodeRow<'_>],
+    task: &str,
+    frame_period_s: f64,
+) -> Result<Vec<u8>, ParquetError> {
+    let mut columns = episode_columns(rows, task);
+    let first_frame = |shard: usize| {
+        rows.iter()
+            .find(|row| row.shard == shard)
+            .map_or(0, |row| row.first_frame)
+    };
+    let times = |frame: &dyn Fn(&EpisodeRow<'_>) -> usize| -> ArrayRef {
+        let seconds = rows
+            .iter()
+            .map(|row| (frame(row) - first_frame(row.shard)) as f64 * frame_period_s);
+        Arc::new(Float64Array::from_iter_values(seconds))
+    };
+    let places = |place: &dyn Fn((usize, usize)) -> usize| -> ArrayRef {
+        let values = rows.iter().map(|row| place(shard_location(row.shard)) as i64);
+        Arc::new(Int64Array::from_iter_values(values))
+    };
+    columns.extend([
+        (format!("videos/{IMAGE}/chunk_index"), places(&|(chunk, _)| chunk)),
+        (format!("videos/{IMAGE}/file_index"), places(&|(_, file)| file)),
+        (format!("videos/{IMAGE}/from_timestamp"), times(&|row| row.first_frame)),
+        (
+            format!("videos/{IMAGE}/to_timestamp"),
+            times(&|row| row.first_frame + row.record.frames),
+        ),
+    ]);
+    write(columns, &[])
+}
+
+fn episode_columns(rows: &[EpisodeRow<'_>], task: &str) -> Vec<(String, ArrayRef)> {
     let counts = |value: &dyn Fn(usize, &EpisodeRow<'_>) -> usize| -> ArrayRef {
         let values = rows.iter().enumerate().map(|(index, row)| value(index, row) as i64);
         Arc::new(Int64Array::from_iter_values(values))
@@ -87,7 +125,7 @@ pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, P
         ("meta/episodes/file_index".to_owned(), counts(&|_, _| 0)),
     ];
     columns.extend(stats_columns(rows));
-    write(columns, &[])
+    columns
 }
 
 fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {

@@ -29,6 +29,7 @@ mod jobs_killed;
 mod jobs_limits;
 mod jobs_priority;
 mod keys;
+mod lerobot;
 mod malformed_requests;
 mod malformed_streams;
 mod metrics;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::PoisonError;
 
+use super::lerobot::LerobotImages;
 use super::{ImportError, SkippedItem};
 use crate::frame::{Frame, codec};
 use crate::types::Channel;
@@ -39,6 +40,8 @@ pub(super) enum Images {
     Files(Vec<PathBuf>),
     /// Gray frames of one size in one file, from an offset on.
     Raw(RawImages),
+    /// Columns or videos of a data set of `LeRobot`.
+    Lerobot(LerobotImages),
 }
 
 /// Gray frames of one size in a file. A frame can lie in one piece or, for a `NumPy` array of another layout, at any stride.
@@ -91,12 +94,13 @@ impl Images {
                 })
             }
             Self::Raw(raw) => raw.read(image, place),
+            Self::Lerobot(images) => images.read(image, place),
         }
     }
 }
 
 impl RawImages {
-    fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+    pub(super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
         use std::io::{Read as _, Seek as _, SeekFrom};
         let count = self.width_px as usize * self.height_px as usize;
         let mut bytes = vec![0; count * self.pixel.bytes()];

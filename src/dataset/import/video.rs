@@ -61,14 +61,23 @@ pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<
     })
 }
 
+/// The file for the decoded frames of one of many videos.
+pub(super) fn decoded_path(out: &Path, number: usize) -> PathBuf {
+    out.join(format!("{number}-{DECODED}"))
+}
+
 /// Removes the decoded frames of a finished import.
 pub(super) fn clean_up(out: &Path) {
-    // Nothing is lost if the file stays.
-    let _ = std::fs::remove_file(out.join(DECODED));
+    for entry in std::fs::read_dir(out).into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().ends_with(DECODED) {
+            // Nothing is lost if the file stays.
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
 }
 
 /// Width and height of the first video stream.
-fn frame_size(video: &Path) -> Result<(u32, u32), ImportError> {
+pub(super) fn frame_size(video: &Path) -> Result<(u32, u32), ImportError> {
     let found = probe(video, "stream=width,height")?;
     let stream = &found["streams"][0];
     let side = |name: &str| stream[name].as_u64().and_then(|side| u32::try_from(side).ok());
@@ -91,6 +100,16 @@ fn frame_times(video: &Path) -> Result<Vec<f64>, ImportError> {
     frames.iter().enumerate().map(time).collect()
 }
 
+/// The presentation times of all frames in seconds, in order, without decoding them. Errors: `Program`, `Record`.
+pub(super) fn packet_times(video: &Path) -> Result<Vec<f64>, ImportError> {
+    let found = probe(video, "packet=pts_time")?;
+    let packets = found["packets"].as_array().map(Vec::as_slice).unwrap_or_default();
+    let time = |packet: &Value| packet["pts_time"].as_str()?.parse::<f64>().ok();
+    let mut times_s: Vec<f64> = packets.iter().filter_map(time).collect();
+    times_s.sort_by(f64::total_cmp);
+    Ok(times_s)
+}
+
 fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
     let mut command = Command::new("ffprobe");
     command
@@ -111,7 +130,7 @@ fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
 }
 
 /// Writes all frames as 8-bit gray, one after the other.
-fn decode(video: &Path, decoded: &Path) -> Result<(), ImportError> {
+pub(super) fn decode(video: &Path, decoded: &Path) -> Result<(), ImportError> {
     let mut command = Command::new("ffmpeg");
     command
         .args(["-v", "error", "-nostdin", "-y", "-xerror", "-i"])

@@ -1,0 +1,64 @@
+//! Encodes frames as H.264 with the program `ffmpeg`.
+
+use std::io::Write as _;
+use std::ops::Range;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use super::super::{Dataset, DatasetError};
+
+/// Writes frames, counted over the whole data set, as an MP4 file; one frame takes the data set's frame period.
+/// Errors: `Program`, `Io`.
+pub(super) fn write(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<(), DatasetError> {
+    let directory = path.parent().unwrap_or(Path::new("."));
+    std::fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
+    // The file appears when it is whole.
+    let partial = path.with_extension("partial.mp4");
+    let encoded = start(dataset, &partial).and_then(|encoder| encode(dataset, frames, encoder));
+    let finished = encoded.and_then(|()| std::fs::rename(&partial, path).map_err(DatasetError::io("write", path)));
+    if finished.is_err() {
+        // A later run overwrites it if it stays.
+        let _ = std::fs::remove_file(&partial);
+    }
+    finished
+}
+
+fn start(dataset: &Dataset, path: &Path) -> Result<Child, DatasetError> {
+    let info = dataset.info();
+    let mut command = Command::new("ffmpeg");
+    command
+        .args([
+            "-v", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "gray", "-s",
+        ])
+        .arg(format!("{}x{}", info.frame_width_px, info.frame_height_px))
+        .arg("-r")
+        .arg((1.0 / info.frame_period_s).to_string())
+        .args(["-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264"])
+        // A key frame every other frame, so that single frames can be read quickly.
+        .args(["-crf", "12", "-g", "2", "-pix_fmt", "yuv420p"])
+        .arg(Path::new(".").join(path))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped());
+    command.spawn().map_err(|error| {
+        DatasetError::Program(match error.kind() {
+            std::io::ErrorKind::NotFound => {
+                "ffmpeg is not installed; it writes videos (Debian: apt-get install ffmpeg)".to_owned()
+            }
+            _ => format!("ffmpeg could not be started: {error}"),
+        })
+    })
+}
+
+fn encode(dataset: &Dataset, mut frames: Range<usize>, mut encoder: Child) -> Result<(), DatasetError> {
+    let sent = encoder.stdin.take().map_or(Ok(()), |mut input| {
+        frames.try_for_each(|frame| input.write_all(dataset.pixels(frame)))
+    });
+    let failed = |reason: String| DatasetError::Program(format!("ffmpeg could not write the video: {reason}"));
+    let output = encoder.wait_with_output().map_err(|error| failed(error.to_string()))?;
+    if !output.status.success() {
+        let text = String::from_utf8_lossy(&output.stderr);
+        return Err(failed(text.lines().next().unwrap_or("it gave no reason").to_owned()));
+    }
+    sent.map_err(|error| failed(error.to_string()))
+}

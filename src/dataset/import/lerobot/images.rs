@@ -1,0 +1,242 @@
+//! The images of a data set of `LeRobot`: columns of tables, or videos. Few of them are in memory at a time.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use arrow_array::cast::AsArray;
+use arrow_array::{Array, RecordBatch};
+use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+use super::super::images::inside;
+use super::super::recording::{PixelType, RawImages};
+use super::super::{ImportError, video};
+use crate::frame::{Frame, codec};
+
+/// Rows that are read together.
+const BLOCK_ROWS: usize = 256;
+/// Blocks of rows, or decoded videos, that are kept: parallel readers are at most so far apart.
+const KEPT: usize = 3;
+
+/// Where the images are.
+pub(in super::super) enum LerobotImages {
+    Tables(ImageTable),
+    Videos(VideoFiles),
+}
+
+impl LerobotImages {
+    /// Decodes an image as gray. Errors: `Image`, `Io`, `Record`, `Program`.
+    pub(in super::super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+        match self {
+            Self::Tables(tables) => tables.read(image, place),
+            Self::Videos(videos) => videos.read(image, place),
+        }
+    }
+}
+
+/// Images in a column of tables.
+pub(in super::super) struct ImageTable {
+    source: PathBuf,
+    column: String,
+    tables: Vec<PathBuf>,
+    /// Table and row of each image.
+    places: Vec<(usize, usize)>,
+    blocks: Mutex<VecDeque<ImageBlock>>,
+}
+
+/// Some consecutive rows of a table.
+struct ImageBlock {
+    table: usize,
+    first: usize,
+    images: Vec<StoredImage>,
+}
+
+/// An image in a table: its bytes, or a file's name.
+#[derive(Clone)]
+enum StoredImage {
+    Bytes(Vec<u8>),
+    File(String),
+    Missing,
+}
+
+impl ImageTable {
+    pub(super) fn new(source: &Path, column: &str, tables: Vec<PathBuf>, places: Vec<(usize, usize)>) -> Self {
+        Self {
+            source: source.to_owned(),
+            column: column.to_owned(),
+            tables,
+            places,
+            blocks: Mutex::new(VecDeque::new()),
+        }
+    }
+
+    fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+        let (table, row) = self.places[image];
+        let path = &self.tables[table];
+        let (bytes, path) = match self.stored(table, row)? {
+            StoredImage::Bytes(bytes) => (bytes, path.clone()),
+            StoredImage::File(name) => {
+                let path = inside(&self.source, &name, place)?;
+                (std::fs::read(&path).map_err(ImportError::io("read", &path))?, path)
+            }
+            StoredImage::Missing => {
+                return Err(ImportError::record(place, format!("{} has no image", self.column)));
+            }
+        };
+        codec::decode(&bytes).map_err(|source| ImportError::Image {
+            place: place.to_owned(),
+            path,
+            source,
+        })
+    }
+
+    fn stored(&self, table: usize, row: usize) -> Result<StoredImage, ImportError> {
+        let mut blocks = self.blocks.lock().unwrap_or_else(PoisonError::into_inner);
+        let find = |blocks: &VecDeque<ImageBlock>| {
+            let holds = |block: &&ImageBlock| block.table == table && row >= block.first;
+            let mut found = blocks.iter().filter(holds);
+            found.find_map(|block| block.images.get(row - block.first).cloned())
+        };
+        if let Some(image) = find(&blocks) {
+            return Ok(image);
+        }
+        let first = row / BLOCK_ROWS * BLOCK_ROWS;
+        let images = self.load(table, first)?;
+        blocks.push_back(ImageBlock { table, first, images });
+        if blocks.len() > KEPT {
+            blocks.pop_front();
+        }
+        Ok(find(&blocks).unwrap_or(StoredImage::Missing))
+    }
+
+    /// The images of a block of rows. Errors: `Io`, `Record`.
+    fn load(&self, table: usize, first: usize) -> Result<Vec<StoredImage>, ImportError> {
+        let path = &self.tables[table];
+        let wrong = |reason: String| ImportError::record(path.display().to_string(), reason.trim());
+        let file = File::open(path).map_err(ImportError::io("read", path))?;
+        let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|error| wrong(error.to_string()))?;
+        let root = builder
+            .schema()
+            .fields()
+            .iter()
+            .position(|field| *field.name() == self.column);
+        let root = root.ok_or_else(|| wrong(format!("it has no column {:?}", self.column)))?;
+        let mask = ProjectionMask::roots(builder.parquet_schema(), [root]);
+        // Only the row groups that hold the block are opened.
+        let (mut groups, mut start, mut skipped) = (Vec::new(), 0, 0);
+        for (number, group) in builder.metadata().row_groups().iter().enumerate() {
+            let end = start + group.num_rows() as usize;
+            if end > first && start < first + BLOCK_ROWS {
+                groups.push(number);
+            } else if end <= first {
+                skipped = end;
+            }
+            start = end;
+        }
+        let reader = builder
+            .with_projection(mask)
+            .with_row_groups(groups)
+            .with_offset(first - skipped)
+            .with_limit(BLOCK_ROWS)
+            .with_batch_size(BLOCK_ROWS)
+            .build();
+        let mut images = Vec::with_capacity(BLOCK_ROWS);
+        for batch in reader.map_err(|error| wrong(error.to_string()))? {
+            let batch = batch.map_err(|error| wrong(error.to_string()))?;
+            let stored = stored_images(&batch)
+                .ok_or_else(|| wrong(format!("its column {:?} does not hold images", self.column)))?;
+            images.extend(stored);
+        }
+        Ok(images)
+    }
+}
+
+/// The images of a batch whose only column is one of images; `None` if it is of another type.
+fn stored_images(batch: &RecordBatch) -> Option<Vec<StoredImage>> {
+    let column = batch.columns().first()?.as_struct_opt()?;
+    let (bytes, paths) = (column.column_by_name("bytes")?, column.column_by_name("path"));
+    let bytes_at = |row: usize| -> Option<Vec<u8>> {
+        let (small, large) = (bytes.as_binary_opt::<i32>(), bytes.as_binary_opt::<i64>());
+        let small = small.map(|array| array.value(row).to_vec());
+        small.or_else(|| large.map(|array| array.value(row).to_vec()))
+    };
+    let path_at = |row: usize| -> Option<String> {
+        let paths = paths.filter(|paths| paths.is_valid(row))?.as_string_opt::<i32>()?;
+        Some(paths.value(row).to_owned())
+    };
+    if bytes.as_binary_opt::<i32>().is_none() && bytes.as_binary_opt::<i64>().is_none() {
+        return None;
+    }
+    let image = |row: usize| match (bytes.is_valid(row).then(|| bytes_at(row)).flatten(), path_at(row)) {
+        (Some(bytes), _) => StoredImage::Bytes(bytes),
+        (None, Some(path)) => StoredImage::File(path),
+        (None, None) => StoredImage::Missing,
+    };
+    Some((0..batch.num_rows()).map(image).collect())
+}
+
+/// Frames of videos, each decoded into a file when it is needed.
+pub(in super::super) struct VideoFiles {
+    out: PathBuf,
+    /// Each video and its number of frames.
+    videos: Vec<(PathBuf, usize)>,
+    /// Video and frame of each image.
+    places: Vec<(usize, usize)>,
+    decoded: Mutex<VecDeque<(usize, RawImages)>>,
+}
+
+impl VideoFiles {
+    pub(super) fn new(out: &Path, videos: Vec<(PathBuf, usize)>, places: Vec<(usize, usize)>) -> Self {
+        Self {
+            out: out.to_owned(),
+            videos,
+            places,
+            decoded: Mutex::new(VecDeque::new()),
+        }
+    }
+
+    fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+        let (video, frame) = self.places[image];
+        let mut decoded = self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
+        if !decoded.iter().any(|(number, _)| *number == video) {
+            decoded.push_back((video, self.decode(video)?));
+            if decoded.len() > KEPT
+                && let Some((_, old)) = decoded.pop_front()
+            {
+                // It is overwritten or removed later if it stays.
+                let _ = std::fs::remove_file(old.path);
+            }
+        }
+        match decoded.iter().find(|(number, _)| *number == video) {
+            Some((_, images)) => images.read(frame, place),
+            None => Err(ImportError::record(place, "its video was not decoded")),
+        }
+    }
+
+    /// Decodes a whole video into a file of gray frames. Errors: `Program`, `Record`, `Io`.
+    fn decode(&self, number: usize) -> Result<RawImages, ImportError> {
+        let (path, frames) = &self.videos[number];
+        let (width_px, height_px) = video::frame_size(path)?;
+        let decoded = video::decoded_path(&self.out, number);
+        video::decode(path, &decoded)?;
+        let file = File::open(&decoded).map_err(ImportError::io("read", &decoded))?;
+        let frame_bytes = u64::from(width_px) * u64::from(height_px);
+        let found = file.metadata().map_err(ImportError::io("read", &decoded))?.len() / frame_bytes.max(1);
+        if found < *frames as u64 {
+            return Err(ImportError::record(
+                format!("{} frame {found}", path.display()),
+                format!("the video ends here; it announces {frames} frames"),
+            ));
+        }
+        Ok(RawImages {
+            path: decoded,
+            file: Mutex::new(file),
+            width_px,
+            height_px,
+            offsets: (0..found).map(|frame| frame * frame_bytes).collect(),
+            pixel: PixelType::U8,
+        })
+    }
+}

@@ -1,0 +1,141 @@
+//! The numbers of a table's rows. Images are not read.
+
+use std::fs::File;
+use std::path::Path;
+
+use arrow_array::cast::AsArray;
+use arrow_array::types::{
+    Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type, UInt32Type,
+};
+use arrow_array::{Array, ArrayRef, RecordBatch};
+use arrow_schema::DataType;
+use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+use super::super::ImportError;
+use super::description::Component;
+
+/// The numbers of one row.
+pub(super) struct Row {
+    pub(super) episode: usize,
+    /// Seconds since the start of the episode.
+    pub(super) timestamp_s: f64,
+    /// The chosen components.
+    pub(super) values: Vec<f32>,
+    /// A column with a value that is missing or not finite.
+    pub(super) bad: Option<String>,
+}
+
+/// Reads the chosen components of all rows. Errors: `Io`, `Record`.
+pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> Result<Vec<Row>, ImportError> {
+    let wrong = |reason: String| ImportError::record(path.display().to_string(), reason);
+    let file = File::open(path).map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => wrong(format!("the table {} is missing", name.display())),
+        _ => ImportError::io("read", path)(error),
+    })?;
+    let builder =
+        ParquetRecordBatchReaderBuilder::try_new(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+    let mut wanted = vec!["episode_index", "timestamp"];
+    wanted.extend(components.iter().map(|component| component.feature.as_str()));
+    let fields = builder.schema().fields();
+    if let Some(missing) = wanted.iter().find(|name| fields.find(name).is_none()) {
+        return Err(wrong(format!("it has no column {missing:?}")));
+    }
+    let roots = (0..fields.len()).filter(|&root| wanted.contains(&fields[root].name().as_str()));
+    let mask = ProjectionMask::roots(builder.parquet_schema(), roots.collect::<Vec<_>>());
+    let reader = builder
+        .with_projection(mask)
+        .build()
+        .map_err(|error| wrong(error.to_string()))?;
+    let mut rows = Vec::new();
+    for batch in reader {
+        let batch = batch.map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+        append(&batch, components, &mut rows).map_err(|column| {
+            wrong(format!(
+                "column {column:?} does not hold one list of numbers in every row, as its feature states"
+            ))
+        })?;
+    }
+    Ok(rows)
+}
+
+/// Errors: the column of another type or length.
+fn append(batch: &RecordBatch, components: &[Component], rows: &mut Vec<Row>) -> Result<(), String> {
+    let scalar = |name: &str| column_numbers(batch, name).ok_or_else(|| name.to_owned());
+    let (episodes, times) = (scalar("episode_index")?, scalar("timestamp")?);
+    let mut vectors = Vec::with_capacity(components.len());
+    for component in components {
+        let column = batch.column_by_name(&component.feature);
+        let lists = column.and_then(vectors_of).ok_or_else(|| component.feature.clone())?;
+        if lists.iter().any(|list| component.index >= list.len()) {
+            return Err(component.feature.clone());
+        }
+        vectors.push(lists);
+    }
+    for row in 0..batch.num_rows() {
+        let values: Vec<f32> = components
+            .iter()
+            .zip(&vectors)
+            .map(|(component, lists)| lists[row][component.index] as f32)
+            .collect();
+        let bad = values.iter().position(|value| !value.is_finite());
+        let bad = bad.map(|place| components[place].feature.clone());
+        rows.push(Row {
+            episode: episodes[row] as usize,
+            timestamp_s: times[row],
+            values,
+            bad: bad.or_else(|| (!times[row].is_finite()).then(|| "timestamp".to_owned())),
+        });
+    }
+    Ok(())
+}
+
+/// A column of single numbers; NaN where one is missing.
+pub(super) fn column_numbers(batch: &RecordBatch, name: &str) -> Option<Vec<f64>> {
+    numbers(batch.column_by_name(name)?)
+}
+
+/// The numbers of an array of any numeric type; NaN where one is missing.
+fn numbers(array: &ArrayRef) -> Option<Vec<f64>> {
+    macro_rules! cast {
+        ($kind:ty) => {
+            array
+                .as_primitive::<$kind>()
+                .iter()
+                .map(|value| value.map_or(f64::NAN, f64::from))
+                .collect()
+        };
+    }
+    Some(match array.data_type() {
+        DataType::Float32 => cast!(Float32Type),
+        DataType::Float64 => cast!(Float64Type),
+        DataType::Int8 => cast!(Int8Type),
+        DataType::Int16 => cast!(Int16Type),
+        DataType::Int32 => cast!(Int32Type),
+        DataType::UInt8 => cast!(UInt8Type),
+        DataType::UInt16 => cast!(UInt16Type),
+        DataType::UInt32 => cast!(UInt32Type),
+        DataType::Int64 => array
+            .as_primitive::<Int64Type>()
+            .iter()
+            .map(|value| value.map_or(f64::NAN, |value| value as f64))
+            .collect(),
+        DataType::Boolean => array
+            .as_boolean()
+            .iter()
+            .map(|value| value.map_or(f64::NAN, |value| f64::from(u8::from(value))))
+            .collect(),
+        _ => return None,
+    })
+}
+
+/// The rows of a column of lists, or of single numbers.
+fn vectors_of(array: &ArrayRef) -> Option<Vec<Vec<f64>>> {
+    let list = |values: ArrayRef| numbers(&values);
+    match array.data_type() {
+        DataType::List(_) => array.as_list::<i32>().iter().map(|row| list(row?)).collect(),
+        DataType::LargeList(_) => array.as_list::<i64>().iter().map(|row| list(row?)).collect(),
+        DataType::FixedSizeList(..) => array.as_fixed_size_list().iter().map(|row| list(row?)).collect(),
+        _ => Some(numbers(array)?.into_iter().map(|value| vec![value]).collect()),
+    }
+}
