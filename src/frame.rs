@@ -11,6 +11,7 @@ pub mod jpeg;
 pub mod motion;
 pub mod preprocess;
 pub mod quality;
+mod resize;
 pub mod warp;
 
 /// The largest accepted width and height of a frame, in pixels.

@@ -2,10 +2,9 @@
 
 use std::str::FromStr;
 
-use image::imageops::{self, FilterType};
-use image::{GrayImage, Luma};
 use serde::{Deserialize, Serialize};
 
+use super::resize::{GrayView, resize};
 use super::{Frame, FrameError, MAX_SIDE_PX};
 
 /// How a frame of another shape becomes one of the wanted shape.
@@ -52,47 +51,51 @@ pub fn fit(frame: &Frame, width_px: u32, height_px: u32, fit: Fit) -> Result<Fra
     if (frame.width(), frame.height()) == (width_px, height_px) {
         return Ok(frame.clone());
     }
-    let fitted = match fit {
-        Fit::Crop => crop(frame, width_px, height_px)?,
-        Fit::Letterbox => letterbox(frame, width_px, height_px)?,
-        Fit::Stretch => resize(&image_from(frame)?, width_px, height_px),
+    let view = GrayView {
+        pixels: frame.pixels(),
+        stride: frame.width() as usize,
+        width: frame.width() as usize,
+        height: frame.height() as usize,
     };
-    Frame::new(width_px, height_px, fitted.into_raw())
+    let fitted = match fit {
+        Fit::Crop => crop(view, width_px, height_px),
+        Fit::Letterbox => letterbox(view, width_px, height_px),
+        Fit::Stretch => resize(view, width_px as usize, height_px as usize),
+    };
+    Frame::new(width_px, height_px, fitted)
 }
 
-fn crop(frame: &Frame, width_px: u32, height_px: u32) -> Result<GrayImage, FrameError> {
-    let image = image_from(frame)?;
-    let kept_width = frame.width().min(scaled(frame.height(), width_px, height_px));
-    let kept_height = frame.height().min(scaled(frame.width(), height_px, width_px));
-    let (left, top) = ((frame.width() - kept_width) / 2, (frame.height() - kept_height) / 2);
-    let kept = imageops::crop_imm(&image, left, top, kept_width, kept_height).to_image();
-    Ok(resize(&kept, width_px, height_px))
+fn crop(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
+    let (width, height) = (view.width as u32, view.height as u32);
+    let kept_width = width.min(scaled(height, width_px, height_px));
+    let kept_height = height.min(scaled(width, height_px, width_px));
+    let (left, top) = ((width - kept_width) / 2, (height - kept_height) / 2);
+    let kept = GrayView {
+        pixels: &view.pixels[top as usize * view.stride + left as usize..],
+        stride: view.stride,
+        width: kept_width as usize,
+        height: kept_height as usize,
+    };
+    resize(kept, width_px as usize, height_px as usize)
 }
 
-fn letterbox(frame: &Frame, width_px: u32, height_px: u32) -> Result<GrayImage, FrameError> {
-    let inner_width = width_px.min(scaled(height_px, frame.width(), frame.height()));
-    let inner_height = height_px.min(scaled(width_px, frame.height(), frame.width()));
-    let inner = resize(&image_from(frame)?, inner_width, inner_height);
-    let mut whole = GrayImage::from_pixel(width_px, height_px, Luma([0]));
-    let (left, top) = ((width_px - inner_width) / 2, (height_px - inner_height) / 2);
-    imageops::replace(&mut whole, &inner, i64::from(left), i64::from(top));
-    Ok(whole)
+fn letterbox(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
+    let (width, height) = (view.width as u32, view.height as u32);
+    let inner_width = width_px.min(scaled(height_px, width, height)) as usize;
+    let inner_height = height_px.min(scaled(width_px, height, width)) as usize;
+    let inner = resize(view, inner_width, inner_height);
+    let (width, height) = (width_px as usize, height_px as usize);
+    let (left, top) = ((width - inner_width) / 2, (height - inner_height) / 2);
+    let mut whole = vec![0; width * height];
+    for (row, pixels) in inner.chunks(inner_width).enumerate() {
+        whole[(top + row) * width + left..][..inner_width].copy_from_slice(pixels);
+    }
+    whole
 }
 
 /// `length` · `numerator` / `denominator`, rounded, at least 1. Sides are at most [`MAX_SIDE_PX`], so nothing overflows.
 fn scaled(length: u32, numerator: u32, denominator: u32) -> u32 {
     ((length * numerator + denominator / 2) / denominator).max(1)
-}
-
-fn resize(image: &GrayImage, width_px: u32, height_px: u32) -> GrayImage {
-    imageops::resize(image, width_px, height_px, FilterType::CatmullRom)
-}
-
-fn image_from(frame: &Frame) -> Result<GrayImage, FrameError> {
-    GrayImage::from_raw(frame.width(), frame.height(), frame.pixels().to_vec()).ok_or(FrameError::Size {
-        width: frame.width(),
-        height: frame.height(),
-    })
 }
 
 #[cfg(test)]
