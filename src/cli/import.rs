@@ -17,7 +17,8 @@ const LISTED_ITEMS: usize = 10;
 /// Turn a recording into a data set.
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
-/// `LeRobot` data set, a `NumPy` array (.npy), or a video (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
+/// `LeRobot` data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), `NumPy` arrays (.npy, .npz), or a video
+/// (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
 /// it, run the same command again: it continues.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
@@ -25,12 +26,13 @@ const LISTED_ITEMS: usize = 10;
   foreframe import frames/ --name walk --rate 10
   foreframe import frames/ --csv log.csv --action speed --action turn --unit turn=rad/s
   foreframe import pusht/ --image front --size 96x96
+  foreframe import drive.mcap --image /camera/image_raw --action /cmd_vel --state /odom --rate 10
   foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
 then
   foreframe inspect mycar
   foreframe train --preset paper --dataset mycar")]
 pub(super) struct ImportArgs {
-    /// A folder of images, a Donkeycar tub, a LeRobot data set, a .npy file or a video
+    /// A folder of images, a Donkeycar tub, a LeRobot data set, a bag of ROS 2, a .npy or .npz file, or a video
     source: PathBuf,
     /// The data set's name [default: the source's name]
     #[arg(long)]
@@ -53,21 +55,24 @@ pub(super) struct ImportArgs {
     /// The CSV file, if it is not the only one in the folder
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// The column, input or camera with the images [default: found by name or type]
+    /// The column, input, camera, array or topic with the images [default: found by name or type]
     #[arg(long, value_name = "NAME")]
     image: Option<String>,
-    /// The column with the times [default: found by name]
+    /// The column or array with the times [default: found by name]; for a bag, `header` or `log` [default: header if near log]
     #[arg(long, value_name = "NAME")]
     time: Option<String>,
-    /// A component of the action; may be given many times [default: found by name]
+    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times [default: found by name or type]
     #[arg(long = "action", value_name = "NAME")]
     actions: Vec<String>,
-    /// A component of the state; may be given many times [default: found by name]
+    /// A component of the state, or a topic as for the action; may be given many times [default: found by name or type]
     #[arg(long = "state", value_name = "NAME")]
     states: Vec<String>,
     /// The unit of an action or state, as in speed=m/s; may be given many times
     #[arg(long = "unit", value_name = "NAME=UNIT")]
     units: Vec<String>,
+    /// For how long the last action and state of a bag hold
+    #[arg(long, value_name = "SECONDS", default_value_t = 1.0)]
+    hold: f64,
     /// Leave out what is damaged and list it, instead of stopping there
     #[arg(long)]
     skip_bad: bool,
@@ -103,6 +108,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             actions: args.actions,
             states: args.states,
             units: args.units,
+            hold_s: args.hold,
             skip_bad: args.skip_bad,
         },
     };

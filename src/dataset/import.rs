@@ -1,12 +1,14 @@
 //! Turns recordings of real robots into data sets.
 //!
-//! A source (`images`, `donkeycar`, `lerobot`, `numpy` or `video`) lists its records: time, action, state and where the image
+//! A source (`images`, `donkeycar`, `lerobot`, `numpy`, `npz`, `video` or `bag`) lists its records: time, action, state and where the image
 //! is. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
 //! Only one shard is in memory at a time.
 
+mod bag;
 mod donkeycar;
 mod images;
 mod lerobot;
+mod npz;
 mod numpy;
 mod recording;
 mod timing;
@@ -26,7 +28,7 @@ use crate::frame::fit::Fit;
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportConfig {
-    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a `NumPy` file or a video.
+    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a bag, a `NumPy` file or a video.
     pub source: PathBuf,
     /// The data set's directory.
     pub out: PathBuf,
@@ -50,9 +52,9 @@ pub struct ImportOptions {
     pub every: usize,
     /// A CSV file with one line per image.
     pub csv: Option<PathBuf>,
-    /// The CSV column, or the array, of the images; by default the usual names.
+    /// The CSV column, the array, or the bag's topic, of the images; by default the usual names.
     pub image: Option<String>,
-    /// The CSV column of the time in seconds (or `_ms`, `_us`, `_ns` by its name).
+    /// The CSV column of the time in seconds (or `_ms`, `_us`, `_ns` by its name). For a bag, `header` or `log`.
     pub time: Option<String>,
     /// Names of the action's components; by default those that the source marks as actions.
     pub actions: Vec<String>,
@@ -60,6 +62,8 @@ pub struct ImportOptions {
     pub states: Vec<String>,
     /// Units as `NAME=UNIT`.
     pub units: Vec<String>,
+    /// For how long, in seconds, the last action and state of a bag hold.
+    pub hold_s: f64,
     /// Leaves out what is damaged, counts it and lists it, instead of stopping there.
     pub skip_bad: bool,
 }
@@ -78,6 +82,7 @@ impl Default for ImportOptions {
             actions: Vec::new(),
             states: Vec::new(),
             units: Vec::new(),
+            hold_s: 1.0,
             skip_bad: false,
         }
     }
@@ -117,7 +122,8 @@ pub enum ImportError {
     /// The source is of no known kind.
     #[error(
         "{} is not a recording that can be imported; give a folder of PNG or JPEG images (with or without a CSV), a \
-         Donkeycar tub (manifest.json), a LeRobot data set (meta/info.json), a .npy file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
+         Donkeycar tub (manifest.json), a LeRobot data set (meta/info.json), a bag of ROS 2 (.mcap, .db3 or its directory), a .npy \
+         or .npz file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
         .0.display()
     )]
     UnknownSource(PathBuf),
@@ -238,11 +244,15 @@ fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
     if lerobot::is_lerobot(source) {
         return lerobot::open(source, &config.out, options);
     }
+    if bag::is_bag(source) {
+        return bag::open(source, options);
+    }
     if source.is_dir() {
         return images::open(source, options);
     }
     match extension(source).as_str() {
         "npy" => numpy::open(source, options),
+        "npz" => npz::open(source, &config.out, options),
         "mp4" | "mkv" | "avi" | "mov" | "webm" => video::open(source, &config.out, options),
         _ => Err(ImportError::UnknownSource(source.clone())),
     }
@@ -256,6 +266,12 @@ impl ImportOptions {
         if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
             return Err(ImportError::Option(format!(
                 "--rate is {rate}; it must be 0.01 to 1000 frames per second"
+            )));
+        }
+        if !(0.0..=3600.0).contains(&self.hold_s) {
+            return Err(ImportError::Option(format!(
+                "--hold is {}; it must be 0 to 3600 seconds",
+                self.hold_s
             )));
         }
         for (what, side) in [("width", self.frame_width_px), ("height", self.frame_height_px)] {

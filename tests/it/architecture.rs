@@ -98,6 +98,8 @@ const USED_IN: &[(&str, &[&str])] = &[
     ("image::", &["frame"]),
     ("tokio", &["server", "jobs", "versions", "store", "serving", "cli"]),
     ("sqlx", &["store"]),
+    ("rusqlite", &["dataset"]),
+    ("zip::", &["dataset"]),
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),

@@ -5,6 +5,8 @@
 mod architecture;
 mod asyncapi;
 mod backup;
+mod bag_files;
+mod bags;
 mod browser;
 mod cli;
 mod client;

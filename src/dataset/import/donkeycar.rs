@@ -130,6 +130,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
             .unwrap_or_else(|| "tub".to_owned()),
         action_channels: reader.actions.iter().map(channel).collect(),
         state_channels: reader.states.iter().map(channel).collect(),
+        camera: None,
         records: Vec::new(),
         images: Images::Files(Vec::new()),
         skipped: Vec::new(),

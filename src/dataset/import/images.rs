@@ -48,7 +48,7 @@ fn csv_file(folder: &Path, options: &ImportOptions) -> Result<Option<PathBuf>, I
     }
 }
 
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
+pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
     let entries = std::fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
     let mut paths: Vec<PathBuf> = entries
         .map_err(ImportError::io("read", folder))?
@@ -89,6 +89,7 @@ fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, Impo
         name: name_of(folder),
         action_channels: Vec::new(),
         state_channels: Vec::new(),
+        camera: None,
         records: paths.iter().enumerate().map(record).collect(),
         images: Images::Files(paths),
         skipped: Vec::new(),
@@ -120,6 +121,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         name: name_of(folder),
         action_channels: channels(&header, &columns.actions, options),
         state_channels: channels(&header, &columns.states, options),
+        camera: None,
         records: Vec::new(),
         images: Images::Files(Vec::new()),
         skipped: Vec::new(),
@@ -277,7 +279,7 @@ impl Columns {
 }
 
 /// Seconds per unit of a time column, by its name's ending.
-fn seconds_per_unit(name: &str) -> f64 {
+pub(super) fn seconds_per_unit(name: &str) -> f64 {
     let unit = |ending: &str| name.ends_with(ending);
     match () {
         () if unit("_ms") => 1e-3,

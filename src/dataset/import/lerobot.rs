@@ -63,6 +63,7 @@ pub(super) fn open(source: &Path, out: &Path, options: &ImportOptions) -> Result
             .unwrap_or_else(|| "lerobot".to_owned()),
         action_channels: actions.iter().map(channel).collect(),
         state_channels: states.iter().map(channel).collect(),
+        camera: None,
         records: reader.records,
         images: Images::Lerobot(images),
         skipped: reader.skipped,

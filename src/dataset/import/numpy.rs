@@ -1,5 +1,5 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
-//! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1.
+//! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -15,10 +15,41 @@ const MAX_HEADER_BYTES: usize = 1 << 16;
 
 /// Shape and type of an array, and where its values begin.
 #[derive(Debug, PartialEq)]
-struct Header {
-    pixel: PixelType,
-    shape: Vec<usize>,
-    data_offset: u64,
+pub(super) struct ArrayHeader {
+    pub(super) number: NumberType,
+    pub(super) shape: Vec<usize>,
+    pub(super) data_offset: u64,
+}
+
+/// How a number is stored: little endian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum NumberType {
+    U8,
+    I32,
+    I64,
+    F32,
+    F64,
+}
+
+impl NumberType {
+    pub(super) fn bytes(self) -> usize {
+        match self {
+            Self::U8 => 1,
+            Self::I32 | Self::F32 => 4,
+            Self::I64 | Self::F64 => 8,
+        }
+    }
+
+    pub(super) fn values(self, bytes: &[u8]) -> Vec<f64> {
+        let (fours, eights) = (bytes.as_chunks::<4>().0.iter(), bytes.as_chunks::<8>().0.iter());
+        match self {
+            Self::U8 => bytes.iter().map(|&value| f64::from(value)).collect(),
+            Self::I32 => fours.map(|bytes| f64::from(i32::from_le_bytes(*bytes))).collect(),
+            Self::F32 => fours.map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect(),
+            Self::I64 => eights.map(|bytes| i64::from_le_bytes(*bytes) as f64).collect(),
+            Self::F64 => eights.map(|bytes| f64::from_le_bytes(*bytes)).collect(),
+        }
+    }
 }
 
 /// Reads the header of an array. Errors: `Option` (no rate), `Io`, `Record`.
@@ -30,14 +61,14 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
         )));
     };
     let file = File::open(path).map_err(ImportError::io("read", path))?;
-    let header = Header::read(BufReader::new(&file), path)?;
-    let layout = ArrayLayout::of(&header, path)?;
-    let frame_bytes = (layout.height * layout.width * header.pixel.bytes()) as u64;
-    let needed = header.data_offset + (layout.sequences * layout.frames) as u64 * frame_bytes;
+    let place = path.display().to_string();
+    let header = ArrayHeader::read(BufReader::new(&file), &place)?;
+    let layout = FrameLayout::of(&header, &place)?;
+    let needed = header.data_offset.saturating_add(header.bytes());
     let found = file.metadata().map_err(ImportError::io("read", path))?.len();
     if found < needed {
         return Err(ImportError::record(
-            format!("{} byte {found}", path.display()),
+            format!("{place} byte {found}"),
             format!("the file ends here; its shape {:?} needs {needed} bytes", header.shape),
         ));
     }
@@ -50,9 +81,9 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
                 action: Vec::new(),
                 state: Vec::new(),
                 image: offsets.len(),
-                place: format!("{} sequence {sequence} frame {frame}", path.display()),
+                place: format!("{place} sequence {sequence} frame {frame}"),
             });
-            offsets.push(header.data_offset + layout.position(sequence, frame) as u64 * frame_bytes);
+            offsets.push(header.data_offset + layout.position(sequence, frame) as u64 * layout.frame_bytes());
         }
     }
     Ok(Recording {
@@ -61,6 +92,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
             .map_or_else(|| "array".to_owned(), |name| name.to_string_lossy().into_owned()),
         action_channels: Vec::new(),
         state_channels: Vec::new(),
+        camera: None,
         records,
         images: Images::Raw(RawImages {
             path: path.to_owned(),
@@ -68,45 +100,59 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
             width_px: layout.width as u32,
             height_px: layout.height as u32,
             offsets,
-            pixel: header.pixel,
+            pixel: layout.pixel,
         }),
         skipped: Vec::new(),
     })
 }
 
 /// Which sides of the array are sequences, time, rows and columns.
-struct ArrayLayout {
-    sequences: usize,
-    frames: usize,
-    height: usize,
-    width: usize,
+pub(super) struct FrameLayout {
+    pub(super) sequences: usize,
+    pub(super) frames: usize,
+    pub(super) height: usize,
+    pub(super) width: usize,
+    pub(super) pixel: PixelType,
     time_first: bool,
+    /// The sides before the rows.
+    pub(super) leading: Vec<usize>,
 }
 
-impl ArrayLayout {
-    fn of(header: &Header, path: &Path) -> Result<Self, ImportError> {
-        let (sequences, frames, height, width, time_first) = match *header.shape.as_slice() {
+impl FrameLayout {
+    /// Errors: `Record` if the array holds no frames.
+    pub(super) fn of(header: &ArrayHeader, place: &str) -> Result<Self, ImportError> {
+        let wrong = |reason: String| Err(ImportError::record(place, reason));
+        let pixel = match header.number {
+            NumberType::U8 => PixelType::U8,
+            NumberType::F32 => PixelType::F32,
+            NumberType::F64 => PixelType::F64,
+            NumberType::I32 | NumberType::I64 => {
+                return wrong(
+                    "its values are int32 or int64; frames must be uint8, or float32 or float64 from 0 to 1".to_owned(),
+                );
+            }
+        };
+        // Frames of three columns are not worth predicting, so these are colors.
+        let (shape, pixel) = match header.shape.as_slice() {
+            [shape @ .., 3] if shape.len() >= 3 && pixel == PixelType::U8 => (shape, PixelType::Rgb8),
+            shape => (shape, pixel),
+        };
+        let (sequences, frames, height, width, time_first) = match *shape {
             [frames, height, width] => (1, frames, height, width, false),
             [frames, sequences, height, width] if frames <= sequences => (sequences, frames, height, width, true),
             [sequences, frames, height, width] => (sequences, frames, height, width, false),
             _ => {
-                return Err(ImportError::record(
-                    path.display().to_string(),
-                    format!(
-                        "the array's shape is {:?}; it must be T×H×W, T×N×H×W or N×T×H×W",
-                        header.shape
-                    ),
+                return wrong(format!(
+                    "the array's shape is {:?}; it must be T×H×W, T×N×H×W or N×T×H×W, or the same with 3 colors at the end",
+                    header.shape
                 ));
             }
         };
         let sides = 1..=crate::frame::MAX_SIDE_PX as usize;
         if !sides.contains(&height) || !sides.contains(&width) {
-            return Err(ImportError::record(
-                path.display().to_string(),
-                format!(
-                    "its frames are {width}×{height} px; each side must be 1 to {} px",
-                    crate::frame::MAX_SIDE_PX
-                ),
+            return wrong(format!(
+                "its frames are {width}×{height} px; each side must be 1 to {} px",
+                crate::frame::MAX_SIDE_PX
             ));
         }
         Ok(Self {
@@ -114,12 +160,18 @@ impl ArrayLayout {
             frames,
             height,
             width,
+            pixel,
             time_first,
+            leading: shape[..shape.len() - 2].to_vec(),
         })
     }
 
+    pub(super) fn frame_bytes(&self) -> u64 {
+        (self.height * self.width * self.pixel.bytes()) as u64
+    }
+
     /// The frame's position in the file, in frames.
-    fn position(&self, sequence: usize, frame: usize) -> usize {
+    pub(super) fn position(&self, sequence: usize, frame: usize) -> usize {
         if self.time_first {
             frame * self.sequences + sequence
         } else {
@@ -128,10 +180,16 @@ impl ArrayLayout {
     }
 }
 
-impl Header {
+impl ArrayHeader {
+    /// The bytes of all values.
+    pub(super) fn bytes(&self) -> u64 {
+        let sides = self.shape.iter().map(|&side| side as u64);
+        sides.fold(self.number.bytes() as u64, u64::saturating_mul)
+    }
+
     /// Reads the `.npy` header, format versions 1 to 3. Errors: `Io`, `Record`.
-    fn read(mut reader: impl Read, path: &Path) -> Result<Self, ImportError> {
-        let wrong = |reason: String| ImportError::record(path.display().to_string(), reason);
+    pub(super) fn read(mut reader: impl Read, place: &str) -> Result<Self, ImportError> {
+        let wrong = |reason: String| ImportError::record(place, reason);
         let mut read = |bytes: &mut [u8]| {
             let what = |_| wrong("the file ends within its header".to_owned());
             reader.read_exact(bytes).map_err(what)
@@ -154,10 +212,12 @@ impl Header {
         read(&mut text)?;
         let text = String::from_utf8_lossy(&text);
         let kind = quoted(&text, "descr").ok_or_else(|| wrong("its header names no type".to_owned()))?;
-        let pixel = match kind.as_str() {
-            "|u1" | "<u1" | ">u1" | "u1" => PixelType::U8,
-            "<f4" => PixelType::F32,
-            "<f8" => PixelType::F64,
+        let number = match kind.as_str() {
+            "|u1" | "<u1" | ">u1" | "u1" => NumberType::U8,
+            "<i4" => NumberType::I32,
+            "<i8" => NumberType::I64,
+            "<f4" => NumberType::F32,
+            "<f8" => NumberType::F64,
             kind if kind.contains('O') => {
                 return Err(wrong(
                     "it holds Python objects (pickle), which are never read; save an array of uint8".to_owned(),
@@ -165,7 +225,7 @@ impl Header {
             }
             other => {
                 return Err(wrong(format!(
-                    "its values have type {other}; they must be uint8, or float32 or float64 (little endian) from 0 to 1"
+                    "its values have type {other}; frames must be uint8, or float32 or float64 (little endian) from 0 to 1"
                 )));
             }
         };
@@ -179,7 +239,7 @@ impl Header {
             .map(|(sides, _)| sides.split(',').map(str::trim).filter(|side| !side.is_empty()))
             .and_then(|sides| sides.map(|side| side.parse().ok()).collect::<Option<Vec<usize>>>());
         Ok(Self {
-            pixel,
+            number,
             shape: shape.ok_or_else(|| wrong("its header has no shape".to_owned()))?,
             data_offset: (8 + length_bytes + length) as u64,
         })
@@ -209,8 +269,9 @@ mod tests {
         bytes
     }
 
-    fn read(dictionary: &str) -> Result<Header, ImportError> {
-        Header::read(array(dictionary).as_slice(), Path::new("a.npy"))
+    fn read(dictionary: &str) -> Result<ArrayHeader, ImportError> {
+        let header = ArrayHeader::read(array(dictionary).as_slice(), "a.npy")?;
+        FrameLayout::of(&header, "a.npy").map(|_| header)
     }
 
     #[test]
@@ -219,15 +280,18 @@ mod tests {
         let header = read(text).unwrap();
         assert_eq!(
             header,
-            Header {
-                pixel: PixelType::U8,
+            ArrayHeader {
+                number: NumberType::U8,
                 shape: vec![20, 10000, 64, 64],
                 data_offset: 10 + text.len() as u64
             }
         );
-        let layout = ArrayLayout::of(&header, Path::new("a.npy")).unwrap();
+        let layout = FrameLayout::of(&header, "a.npy").unwrap();
         assert_eq!((layout.sequences, layout.frames), (10000, 20));
         assert_eq!(layout.position(3, 2), 2 * 10000 + 3);
+        let header = read("{'descr': '|u1', 'fortran_order': False, 'shape': (9, 48, 64, 3), }").unwrap();
+        let layout = FrameLayout::of(&header, "a.npy").unwrap();
+        assert_eq!((layout.frames, layout.width, layout.pixel), (9, 64, PixelType::Rgb8));
     }
 
     #[test]

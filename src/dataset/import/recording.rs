@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::PoisonError;
 
+use super::bag::BagImages;
 use super::lerobot::LerobotImages;
 use super::{ImportError, SkippedItem};
+use crate::frame::warp::CameraModel;
 use crate::frame::{Frame, codec};
 use crate::types::Channel;
 
@@ -29,6 +31,8 @@ pub(super) struct Recording {
     pub(super) name: String,
     pub(super) action_channels: Vec<Channel>,
     pub(super) state_channels: Vec<Channel>,
+    /// How the camera projects the fitted images, where the source says it.
+    pub(super) camera: Option<CameraModel>,
     pub(super) records: Vec<Record>,
     pub(super) images: Images,
     pub(super) skipped: Vec<SkippedItem>,
@@ -42,6 +46,8 @@ pub(super) enum Images {
     Raw(RawImages),
     /// Columns or videos of a data set of `LeRobot`.
     Lerobot(LerobotImages),
+    /// Messages of a bag.
+    Bag(BagImages),
 }
 
 /// Gray frames of one size in a file. A frame can lie in one piece or, for a `NumPy` array of another layout, at any stride.
@@ -55,10 +61,15 @@ pub(super) struct RawImages {
     pub(super) pixel: PixelType,
 }
 
+/// The decoded frames of some sources, beside the data set; removed when it is complete.
+pub(super) const DECODED: &str = "decoded.gray.tmp";
+
 /// How a pixel is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelType {
     U8,
+    /// Red, green and blue.
+    Rgb8,
     /// Little endian, 0 to 1.
     F32,
     /// Little endian, 0 to 1.
@@ -69,6 +80,7 @@ impl PixelType {
     pub(super) fn bytes(self) -> usize {
         match self {
             Self::U8 => 1,
+            Self::Rgb8 => 3,
             Self::F32 => 4,
             Self::F64 => 8,
         }
@@ -95,6 +107,7 @@ impl Images {
             }
             Self::Raw(raw) => raw.read(image, place),
             Self::Lerobot(images) => images.read(image, place),
+            Self::Bag(bag) => bag.read(image, place),
         }
     }
 }
@@ -112,6 +125,7 @@ impl RawImages {
         }
         let pixels = match self.pixel {
             PixelType::U8 => bytes,
+            PixelType::Rgb8 => codec::gray_from_rgb(&bytes),
             PixelType::F32 => {
                 let values = bytes.as_chunks::<4>().0.iter();
                 gray_levels(values.map(|bytes| f64::from(f32::from_le_bytes(*bytes))), place)?

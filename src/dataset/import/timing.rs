@@ -191,6 +191,7 @@ mod tests {
             name: "test".to_owned(),
             action_channels: vec![Channel::new("turn", "")],
             state_channels: Vec::new(),
+            camera: None,
             records: times_s.iter().enumerate().map(record).collect(),
             images: Images::Files(Vec::new()),
             skipped: Vec::new(),

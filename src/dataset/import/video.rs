@@ -7,11 +7,8 @@ use std::sync::Mutex;
 
 use serde_json::Value;
 
-use super::recording::{Images, PixelType, RawImages, Record, Recording};
+use super::recording::{DECODED, Images, PixelType, RawImages, Record, Recording};
 use super::{ImportError, ImportOptions};
-
-/// The decoded frames, beside the data set; removed when it is complete.
-const DECODED: &str = "decoded.gray.tmp";
 
 /// Decodes a video into a file of gray frames and lists them with their times. Errors: `Program`, `Io`, `Record`.
 pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
@@ -48,6 +45,7 @@ pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<
             .map_or_else(|| "video".to_owned(), |name| name.to_string_lossy().into_owned()),
         action_channels: Vec::new(),
         state_channels: Vec::new(),
+        camera: None,
         records: times_s.iter().enumerate().map(record).collect(),
         images: Images::Raw(RawImages {
             path: decoded,

@@ -188,6 +188,7 @@ fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
         frame_period_s: plan.frame_period_s,
         action_channels: plan.recording.action_channels.clone(),
         state_channels: plan.recording.state_channels.clone(),
+        camera: plan.recording.camera,
         ..DatasetInfo::default()
     }
 }

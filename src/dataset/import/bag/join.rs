@@ -1,0 +1,323 @@
+//! Gives every image its action and its state.
+//!
+//! The rule: a topic's times are those in its messages' headers if half of them lie within 1 s of the time at which they
+//! were recorded, else the latter. A value holds until the next one, at most for `hold_s`. The state of an image is the one
+//! that holds at its time. Its action is the mean of what holds from its time until the next image, each value weighted by
+//! how long it holds. An image without an action or a state is left out.
+
+use super::choice::{ChosenTopics, ChosenValues};
+use super::collector::{Collector, Content, ImageEntry, MessageTime, ValueStream};
+use crate::dataset::import::recording::Record;
+use crate::dataset::import::{ImportError, ImportOptions, SkippedItem};
+
+/// Headers that differ more from the time of recording, in the median, are of another clock.
+const SAME_CLOCK_NS: i64 = 1_000_000_000;
+/// A jump of the images' time by more than so many median periods is a gap.
+const GAP_PERIODS: i64 = 3;
+
+/// Which of a message's times counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Clock {
+    Header,
+    Log,
+}
+
+impl Clock {
+    /// The clock of a topic: the one given as `--time`, else by the rule above. Errors: `Option` for another word.
+    fn of(times: &[MessageTime], options: &ImportOptions) -> Result<Self, ImportError> {
+        match options.time.as_deref() {
+            Some("header") => return Ok(Self::Header),
+            Some("log") => return Ok(Self::Log),
+            Some(other) => {
+                return Err(ImportError::Option(format!(
+                    "--time is {other:?}; for a bag it must be header (the time in the messages) or log (the time of recording)"
+                )));
+            }
+            None => {}
+        }
+        let difference = |time: &MessageTime| match time.stamp_ns {
+            Some(stamp) => time.log_ns.abs_diff(stamp),
+            None => u64::MAX,
+        };
+        let mut differences: Vec<u64> = times.iter().map(difference).collect();
+        if differences.is_empty() {
+            return Ok(Self::Log);
+        }
+        let middle = differences.len() / 2;
+        let median = *differences.select_nth_unstable(middle).1;
+        Ok(if median <= SAME_CLOCK_NS as u64 {
+            Self::Header
+        } else {
+            Self::Log
+        })
+    }
+
+    fn time(self, time: MessageTime) -> i64 {
+        match self {
+            Self::Header => time.stamp_ns.unwrap_or(time.log_ns),
+            Self::Log => time.log_ns,
+        }
+    }
+}
+
+/// The chosen values of a topic at the times of its messages.
+struct HeldValues<'a> {
+    topic: &'a str,
+    times_ns: Vec<i64>,
+    /// One row per message; NaN before a field had its first value.
+    rows: Vec<f32>,
+    width: usize,
+    hold_ns: i64,
+}
+
+impl<'a> HeldValues<'a> {
+    /// Errors: `Record` if time goes back, unless damage is left out.
+    fn new(
+        collector: &'a Collector<'_>,
+        chosen: &ChosenValues,
+        skipped: &mut Vec<SkippedItem>,
+    ) -> Result<Self, ImportError> {
+        let (topic, options) = (&collector.topics[chosen.topic], collector.options);
+        let empty = ValueStream::default();
+        let stream = match &topic.content {
+            Content::Values(stream) => stream,
+            _ => &empty,
+        };
+        let clock = Clock::of(&stream.times, options)?;
+        let mut held = Self {
+            topic: &topic.name,
+            times_ns: Vec::with_capacity(stream.times.len()),
+            rows: Vec::new(),
+            width: chosen.fields.len(),
+            hold_ns: (options.hold_s * 1e9) as i64,
+        };
+        let mut row = vec![f32::NAN; held.width];
+        for (message, &time) in stream.times.iter().enumerate() {
+            let time_ns = clock.time(time);
+            if let Some(&before) = held.times_ns.last().filter(|&&before| time_ns < before) {
+                let error = ImportError::record(
+                    format!(
+                        "{} message {} of {}",
+                        collector.source.display(),
+                        stream.numbers[message],
+                        topic.name
+                    ),
+                    format!(
+                        "its time {} s is before that of the message before, {} s; times must grow",
+                        seconds(time_ns),
+                        seconds(before)
+                    ),
+                );
+                match error.skippable().filter(|_| options.skip_bad) {
+                    Some(item) => skipped.push(item),
+                    None => return Err(error),
+                }
+                continue;
+            }
+            let mut changed = false;
+            for &(field, value) in stream.values(message) {
+                if let Some(column) = chosen.fields.iter().position(|&of| of == field as usize) {
+                    (row[column], changed) = (value, true);
+                }
+            }
+            if changed {
+                held.times_ns.push(time_ns);
+                held.rows.extend_from_slice(&row);
+            }
+        }
+        Ok(held)
+    }
+
+    /// The message that holds at a time.
+    fn at(&self, time_ns: i64) -> Option<usize> {
+        let message = self.times_ns.partition_point(|&time| time <= time_ns).checked_sub(1)?;
+        let is_fresh = time_ns.saturating_sub(self.times_ns[message]) <= self.hold_ns;
+        let row = self.row(message);
+        (is_fresh && row.iter().all(|value| value.is_finite())).then_some(message)
+    }
+
+    fn row(&self, message: usize) -> &[f32] {
+        &self.rows[message * self.width..(message + 1) * self.width]
+    }
+
+    /// Mean of what holds from `start_ns`, when message `first` holds, to `end_ns`.
+    fn mean(&self, first: usize, start_ns: i64, end_ns: i64) -> Vec<f32> {
+        let mut sums = vec![0.0f64; self.width];
+        let (mut message, mut from_ns) = (first, start_ns);
+        while from_ns < end_ns {
+            let next_ns = self.times_ns.get(message + 1).copied().unwrap_or(i64::MAX);
+            let until_ns = next_ns.clamp(from_ns, end_ns);
+            for (sum, value) in sums.iter_mut().zip(self.row(message)) {
+                *sum += f64::from(*value) * (until_ns - from_ns) as f64;
+            }
+            (message, from_ns) = (message + 1, until_ns);
+        }
+        let duration = end_ns.saturating_sub(start_ns).max(1) as f64;
+        sums.into_iter().map(|sum| (sum / duration) as f32).collect()
+    }
+}
+
+fn seconds(time_ns: i64) -> f64 {
+    time_ns as f64 / 1e9
+}
+
+/// The images with what belongs to them.
+pub(super) struct JoinedImages {
+    pub(super) records: Vec<Record>,
+    /// For each record, which image it is.
+    pub(super) images: Vec<usize>,
+    pub(super) skipped: Vec<SkippedItem>,
+}
+
+/// Joins the chosen topics. Errors: `Option`, `Record`.
+pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<JoinedImages, ImportError> {
+    let (topic, options) = (&collector.topics[chosen.image], collector.options);
+    let empty = Vec::new();
+    let entries = match &topic.content {
+        Content::Images(entries) => entries,
+        _ => &empty,
+    };
+    let times: Vec<MessageTime> = entries.iter().map(|entry| entry.time).collect();
+    let clock = Clock::of(&times, options)?;
+    let times_ns: Vec<i64> = times.into_iter().map(|time| clock.time(time)).collect();
+    let mut skipped = Vec::new();
+    let mut held = |values: &[ChosenValues]| -> Result<Vec<HeldValues<'_>>, ImportError> {
+        let one = |chosen: &ChosenValues| HeldValues::new(collector, chosen, &mut skipped);
+        values.iter().map(one).collect()
+    };
+    let (actions, states) = (held(&chosen.actions)?, held(&chosen.states)?);
+    let period_ns = median_period(&times_ns);
+    let (mut joined, mut left_out) = (Vec::new(), LeftOut::default());
+    let mut images = Vec::new();
+    for (index, entry) in entries.iter().enumerate() {
+        let start_ns = times_ns[index];
+        let next_ns = times_ns.get(index + 1).copied().unwrap_or(i64::MAX);
+        let is_next = next_ns > start_ns && next_ns.saturating_sub(start_ns) <= period_ns.saturating_mul(GAP_PERIODS);
+        let end_ns = if is_next {
+            next_ns
+        } else {
+            start_ns.saturating_add(period_ns)
+        };
+        let values = actions
+            .iter()
+            .chain(&states)
+            .map(|held| held.at(start_ns).ok_or(held.topic));
+        let messages = match values.collect::<Result<Vec<usize>, &str>>() {
+            Ok(messages) => messages,
+            Err(missing) => {
+                left_out.add(missing, entry);
+                continue;
+            }
+        };
+        let (of_actions, of_states) = messages.split_at(actions.len());
+        let action = actions.iter().zip(of_actions);
+        let state = states.iter().zip(of_states);
+        joined.push(Record {
+            timestamp_s: seconds(start_ns),
+            session: String::new(),
+            action: action
+                .flat_map(|(held, &first)| held.mean(first, start_ns, end_ns))
+                .collect(),
+            state: state.flat_map(|(held, &at)| held.row(at).iter().copied()).collect(),
+            image: images.len(),
+            place: collector.place(entry.file, topic, entry.number, entry.position),
+        });
+        images.push(index);
+    }
+    skipped.extend(left_out.items(collector, &topic.name));
+    Ok(JoinedImages {
+        records: joined,
+        images,
+        skipped,
+    })
+}
+
+/// The median distance of two images in time, at least 1 ns.
+fn median_period(times_ns: &[i64]) -> i64 {
+    let mut steps: Vec<i64> = times_ns
+        .windows(2)
+        .map(|pair| pair[1].saturating_sub(pair[0]))
+        .collect();
+    if steps.is_empty() {
+        return 1;
+    }
+    let middle = steps.len() / 2;
+    (*steps.select_nth_unstable(middle).1).max(1)
+}
+
+/// Images without an action or a state, in runs: the topic that has no value, first and last image.
+#[derive(Default)]
+struct LeftOut<'a>(Vec<(&'a str, u64, u64)>);
+
+impl<'a> LeftOut<'a> {
+    fn add(&mut self, missing: &'a str, image: &ImageEntry) {
+        match self.0.last_mut() {
+            Some((topic, _, last)) if *topic == missing && *last + 1 == image.number => *last = image.number,
+            _ => self.0.push((missing, image.number, image.number)),
+        }
+    }
+
+    fn items(self, collector: &Collector<'_>, image_topic: &str) -> Vec<SkippedItem> {
+        let item = |(topic, first, last): (&str, u64, u64)| SkippedItem {
+            place: format!(
+                "{} messages {first} to {last} of {image_topic}",
+                collector.source.display()
+            ),
+            reason: format!(
+                "{topic} has no value in the {} s before them (--hold)",
+                collector.options.hold_s
+            ),
+        };
+        self.0.into_iter().map(item).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn held(messages: &[(i64, f32)]) -> HeldValues<'static> {
+        HeldValues {
+            topic: "/cmd_vel",
+            times_ns: messages.iter().map(|(time, _)| *time).collect(),
+            rows: messages.iter().map(|(_, value)| *value).collect(),
+            width: 1,
+            hold_ns: 100,
+        }
+    }
+
+    #[test]
+    fn an_action_is_weighted_by_how_long_it_holds() {
+        let held = held(&[(0, 1.0), (30, 5.0), (90, 7.0)]);
+        assert_eq!(held.mean(0, 10, 50), [3.0]);
+        assert_eq!(held.mean(2, 95, 200), [7.0]);
+    }
+
+    #[test]
+    fn a_value_holds_for_a_while_only() {
+        let held = held(&[(10, 1.0), (30, f32::NAN), (90, 7.0)]);
+        assert_eq!(
+            [5, 10, 29, 30, 190, 191].map(|time| held.at(time)),
+            [None, Some(0), Some(0), None, Some(2), None]
+        );
+    }
+
+    #[test]
+    fn headers_of_another_clock_do_not_count() {
+        let times = |offset: i64| -> Vec<MessageTime> {
+            let at = |index: i64| MessageTime {
+                log_ns: index * 100_000_000,
+                stamp_ns: Some(index * 100_000_000 + offset),
+            };
+            (0..9).map(at).collect()
+        };
+        let options = ImportOptions::default();
+        assert_eq!(Clock::of(&times(40_000_000), &options).unwrap(), Clock::Header);
+        assert_eq!(Clock::of(&times(7_000_000_000), &options).unwrap(), Clock::Log);
+        let forced = ImportOptions {
+            time: Some("header".to_owned()),
+            ..options
+        };
+        assert_eq!(Clock::of(&times(7_000_000_000), &forced).unwrap(), Clock::Header);
+    }
+}
