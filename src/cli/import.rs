@@ -30,7 +30,7 @@ const LISTED_ITEMS: usize = 10;
   foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
 then
   foreframe inspect mycar
-  foreframe train --preset paper --dataset mycar")]
+  foreframe train --preset recording --dataset mycar")]
 pub(super) struct ImportArgs {
     /// A folder of images, a Donkeycar tub, a LeRobot data set, a bag of ROS 2, a .npy or .npz file, or a video
     source: PathBuf,
@@ -148,7 +148,18 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             ))?;
         }
     }
-    print_line(format!("next: foreframe train --dataset {}", out.display()))
+    print_line(format!("next: foreframe inspect {}", out.display()))?;
+    let (has_actions, has_states) = (!info.action_channels.is_empty(), !info.state_channels.is_empty());
+    let conditioning = match (has_actions, has_states) {
+        (true, true) => " --set model.conditioning=state-action",
+        (true, false) => "",
+        (false, true) => " --set model.conditioning=state",
+        (false, false) => " --set model.conditioning=none",
+    };
+    print_line(format!(
+        "      foreframe train --preset recording --dataset {}{conditioning}",
+        out.display()
+    ))
 }
 
 /// The data set's name: the one given, or one made of the source's. Errors: `Usage` if the given name is not valid.
