@@ -9,6 +9,7 @@ pub mod datasets;
 mod instance;
 pub mod job;
 pub mod memory;
+mod patience;
 pub mod pipeline;
 pub mod priority;
 mod progress;
@@ -55,6 +56,14 @@ pub enum JobError {
     QueueFull {
         /// How many jobs can wait.
         limit: usize,
+    },
+    /// The submitter's share of the queue is full.
+    #[error(
+        "{limit} jobs of this API key are waiting, which is its share of the job queue; cancel one or try again later"
+    )]
+    ShareFull {
+        /// How many jobs of one key can wait.
+        limit: i64,
     },
     /// A field of the job is not valid.
     #[error("{field}: {reason}")]
@@ -130,6 +139,18 @@ pub enum JobError {
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
+}
+
+impl JobError {
+    /// Whether a store cannot be reached or written now, but may be later.
+    #[must_use]
+    pub fn is_unavailable(&self) -> bool {
+        match self {
+            Self::Store(error) => error.is_unavailable(),
+            Self::Versions(error) => matches!(&**error, VersionError::Store(error) if error.is_unavailable()),
+            _ => false,
+        }
+    }
 }
 
 impl From<DatasetError> for JobError {

@@ -1,7 +1,8 @@
-//! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`]) and files in [`objects`].
-//! [`backup`] copies both.
+//! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`], [`audit`]) and files in
+//! [`objects`]. [`backup`] copies both.
 //! Only `database` knows that there are two kinds of database. SQL is only in this module.
 
+pub mod audit;
 pub mod backup;
 mod database;
 pub mod jobs;
@@ -17,10 +18,11 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use tokio::sync::Mutex;
+use tracing::warn;
 
 use self::database::Database;
 pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
-pub use self::keys::KeyRow;
+pub use self::keys::{KeyRow, KeyScope};
 pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
@@ -35,6 +37,8 @@ const WRITE_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 const WRITE_PROBE: &str = "write-check";
 /// Its size: more than what is left in blocks that a full file system has already given out.
 const PROBE_BYTES: usize = 16 << 10;
+/// The pause between two attempts to open the database.
+const OPEN_AGAIN_AFTER: Duration = Duration::from_secs(1);
 /// The file in the data directory that says that API keys were created.
 const KEYS_MARKER: &str = "api-keys-created";
 
@@ -72,6 +76,14 @@ pub enum StoreError {
         path: PathBuf,
         /// What SQLite found.
         reason: String,
+    },
+    /// PostgreSQL could not be reached for a while.
+    #[error("gave up after waiting {waited_s} s for the database (database_wait_s): {source}")]
+    Away {
+        /// How long, in seconds.
+        waited_s: u64,
+        /// The last error.
+        source: Box<StoreError>,
     },
     /// `foreframe restore` did not finish.
     #[error(
@@ -118,6 +130,7 @@ impl StoreError {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
             Self::Io { source, .. } => source.kind() == std::io::ErrorKind::StorageFull,
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
+            Self::Away { .. } => true,
             Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } | Self::Migrate(_) => false,
         }
     }
@@ -140,6 +153,11 @@ pub struct StoreConfig {
 }
 
 impl StoreConfig {
+    /// Whether the database is another process, which can be away for a while.
+    fn is_remote(&self) -> bool {
+        self.database.as_ref().is_some_and(|url| url.starts_with("postgres"))
+    }
+
     /// Whether there is a store to open: one in the data directory, or one that is named.
     #[must_use]
     pub fn exists(&self) -> bool {
@@ -166,6 +184,26 @@ impl Store {
     /// Opens a store that this program has opened before, without the check of its integrity. Errors: as [`Store::open`].
     pub async fn open_existing(config: &StoreConfig) -> Result<Self, StoreError> {
         Self::open_with(config, false).await
+    }
+
+    /// Opens the store as [`Store::open`]. While its PostgreSQL cannot be reached, tries again for `limit`.
+    /// Errors: as [`Store::open`], and `Away`.
+    pub async fn open_waiting(config: &StoreConfig, limit: Duration) -> Result<Self, StoreError> {
+        let started = Instant::now();
+        loop {
+            let error = match Self::open(config).await {
+                Err(error @ StoreError::Open { .. }) if config.is_remote() && error.is_unavailable() => error,
+                opened => return opened,
+            };
+            if started.elapsed() >= limit {
+                return Err(StoreError::Away {
+                    waited_s: started.elapsed().as_secs(),
+                    source: Box::new(error),
+                });
+            }
+            warn!(%error, waited_s = started.elapsed().as_secs(), limit_s = limit.as_secs(), "waiting for the database");
+            tokio::time::sleep(OPEN_AGAIN_AFTER.min(limit)).await;
+        }
     }
 
     async fn open_with(config: &StoreConfig, is_first: bool) -> Result<Self, StoreError> {

@@ -157,9 +157,24 @@ impl Versions {
         Ok(parsed.unwrap_or_else(|| manifest.metrics.clone()))
     }
 
+    /// Deletes what is left of versions whose deletion was interrupted, for example by `kill -9`. Failures are logged.
+    async fn sweep(&self) -> Result<(), StoreError> {
+        let mut deleted = BTreeMap::<String, Vec<String>>::new();
+        for (model, version) in self.store.deleted_versions().await? {
+            deleted.entry(model).or_default().push(version.to_string());
+        }
+        for (model, versions) in deleted {
+            if let Err(error) = self.store.objects().sweep(&format!("models/{model}"), &versions).await {
+                warn!(model, %error, "could not delete what is left of deleted versions");
+            }
+        }
+        Ok(())
+    }
+
     /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions
     /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
     pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
+        self.sweep().await?;
         let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
         for path in registry::misnamed(&self.shipped_dir)? {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
-use super::settings::{ServerArgs, open_store, with_checked_directories};
+use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
 use super::{CliError, print_line};
 use crate::config::{Config, LoadedConfig};
 use crate::server::keys::Keys;
@@ -50,7 +50,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
-    let store = open_store(&config).await?;
+    let store = open_store_waiting(&config).await?;
     let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
         CliError::Failed(format!(

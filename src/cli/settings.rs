@@ -1,6 +1,7 @@
 //! The flags that set values of the configuration. Each flag has the name of its setting.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use super::CliError;
 use crate::config::{Config, ConfigError, LoadedConfig};
@@ -138,6 +139,12 @@ pub(super) fn with_checked_directories(loaded: LoadedConfig) -> Result<Config, C
 /// The store of the configuration.
 pub(super) async fn open_store(config: &Config) -> Result<Store, CliError> {
     Ok(Store::open(&config.server.store()).await?)
+}
+
+/// The store of the configuration; waits for its PostgreSQL.
+pub(super) async fn open_store_waiting(config: &Config) -> Result<Store, CliError> {
+    let limit = Duration::from_secs(config.server.database_wait_s);
+    Ok(Store::open_waiting(&config.server.store(), limit).await?)
 }
 
 impl From<ConfigError> for CliError {

@@ -6,7 +6,7 @@ use tokio::sync::watch;
 use tracing::{info, warn};
 
 use super::serve::AdminAddress;
-use super::settings::{CommonArgs, open_store, with_checked_directories};
+use super::settings::{CommonArgs, open_store_waiting, with_checked_directories};
 use super::{CliError, print_line};
 use crate::config::Config;
 use crate::jobs::pipeline::Pipeline;
@@ -43,7 +43,7 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
 
 async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let server = &config.server;
-    let store = open_store(config).await?;
+    let store = open_store_waiting(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
     let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory_limit(server.job_memory_mb);
     let executor = child::executor(pipeline, server.job_process());

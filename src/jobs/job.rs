@@ -28,6 +28,9 @@ pub struct Job {
     pub cancelling: bool,
     /// How often a worker claimed it: more than once after a server was killed, or after the job was resumed.
     pub attempts: i64,
+    /// The id of the API key that submitted it; absent without a key.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub submitter: Option<String>,
     /// When it was submitted, in seconds since 1970.
     pub queued_unix_s: f64,
     /// When its first attempt started, in seconds since 1970.
@@ -60,6 +63,7 @@ impl Job {
             result: outcome.map_err(|error| record(error.to_string()))?,
             cancelling: row.cancelling,
             attempts: row.token,
+            submitter: Some(row.submitter.clone()).filter(|submitter| !submitter.is_empty()),
             queued_unix_s: row.queued_s,
             started_unix_s: row.started_s,
             ended_unix_s: row.ended_s,

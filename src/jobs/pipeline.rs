@@ -10,6 +10,7 @@ use serde_json::json;
 use tokio::runtime::Handle;
 
 use super::checkpoints::{self, CheckpointSync};
+use super::patience::Patience;
 use super::report::JobReporter;
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
@@ -18,7 +19,7 @@ use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
-use crate::store::{LossRow, ModelMetrics, Store};
+use crate::store::{LossRow, ModelMetrics, Store, StoreError};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
@@ -128,8 +129,8 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
-        let clearing = datasets::clear_stale(self.store.objects(), &spec.name, &config);
-        self.runtime.block_on(clearing).map_err(|error| failed(&error))?;
+        let patience = self.patience(report, cancelled);
+        patience.run(async || datasets::clear_stale(self.store.objects(), &spec.name, &config).await)?;
         let on_progress =
             |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
         // Whole shards are saved; a new attempt continues after them.
@@ -139,7 +140,12 @@ impl Pipeline {
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         let info = retry_while_busy(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
-        self.push(&datasets::key(&spec.name), datasets::LAST_FILE)?;
+        patience.run(async || {
+            self.store
+                .objects()
+                .push(&datasets::key(&spec.name), datasets::LAST_FILE)
+                .await
+        })?;
         Ok(JobResult {
             result: json!({
                 "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
@@ -154,8 +160,9 @@ impl Pipeline {
         let config = spec.config().map_err(|error| failed(&error))?;
         let run = format!("runs/{}", report.id());
         report.progress(0, 0, "reading the data set");
-        self.prepare_run(&run, report)?;
-        let dataset = self.dataset(&spec.dataset)?;
+        let patience = self.patience(report, cancelled);
+        patience.run(async || self.prepare_run(&run, report).await)?;
+        let dataset = self.dataset(&spec.dataset, &patience)?;
         let run_dir = self.store.objects().data_dir().join(&run);
         let training = Training {
             config: &config,
@@ -186,8 +193,8 @@ impl Pipeline {
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "publishing");
-                let written = self.versions.write(report.lease(), &spec.name, &model_dir);
-                let written = self.runtime.block_on(written).map_err(|error| failed(&error))?;
+                let written =
+                    patience.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
                 let (version, activates) = written.ok_or(JobFailure::Cancelled)?;
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
                 Ok(JobResult {
@@ -200,15 +207,12 @@ impl Pipeline {
     }
 
     /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
-    fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), JobFailure> {
+    async fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), StoreError> {
         let objects = self.store.objects();
-        let prepared = self.runtime.block_on(async {
-            if report.lease().token == 1 {
-                return objects.delete(run).await;
-            }
-            checkpoints::fetch_latest(objects, run).await
-        });
-        prepared.map_err(|error| failed(&error))
+        if report.lease().token == 1 {
+            return objects.delete(run).await;
+        }
+        checkpoints::fetch_latest(objects, run).await
     }
 
     fn evaluate(
@@ -217,10 +221,12 @@ impl Pipeline {
         report: &JobReporter,
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
-        let loaded = self.model(&spec.model, spec.version)?;
-        let twin = spec.twin.as_deref().map(|twin| self.model(twin, None)).transpose()?;
+        let patience = self.patience(report, cancelled);
+        let model = |name: &str, version| patience.run(async || self.model(name, version).await);
+        let loaded = model(&spec.model, spec.version)?;
+        let twin = spec.twin.as_deref().map(|twin| model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
-        let dataset = self.dataset(&spec.dataset)?;
+        let dataset = self.dataset(&spec.dataset, &patience)?;
         let config = EvaluateConfig {
             max_windows: spec.windows,
             bootstrap_samples: spec.resamples,
@@ -238,13 +244,12 @@ impl Pipeline {
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let dir = report_key(&report.id());
         // An earlier attempt may have left an incomplete report.
-        let cleared = self.runtime.block_on(self.store.objects().delete(&dir));
-        cleared.map_err(|error| failed(&error))?;
+        patience.run(async || self.store.objects().delete(&dir).await)?;
         let out = self.store.objects().data_dir().join(&dir);
         evaluation::prepare(&out)
             .and_then(|()| evaluation::write(&out, &mut found, &figures))
             .map_err(|error| failed(&error))?;
-        self.push(&dir, REPORT_FILE)?;
+        patience.run(async || self.store.objects().push(&dir, REPORT_FILE).await)?;
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .map_err(|error| failed(&error))?
             .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
@@ -264,24 +269,24 @@ impl Pipeline {
         })
     }
 
-    fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, JobFailure> {
-        let loaded: Result<LoadedModel, VersionError> = self.runtime.block_on(async {
-            match version {
-                Some(version) => self.versions.load(name, version).await,
-                None => self.versions.load_active(name).await,
-            }
-        });
-        loaded.map_err(|error| failed(&error))
+    async fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, VersionError> {
+        match version {
+            Some(version) => self.versions.load(name, version).await,
+            None => self.versions.load_active(name).await,
+        }
     }
 
-    fn dataset(&self, name: &str) -> Result<Dataset, JobFailure> {
-        let fetched = self.runtime.block_on(datasets::fetch(self.store.objects(), name));
-        Dataset::open(&fetched.map_err(|error| failed(&error))?).map_err(|error| failed(&error))
+    fn dataset(&self, name: &str, patience: &Patience<'_>) -> Result<Dataset, JobFailure> {
+        let fetched = patience.run(async || datasets::fetch(self.store.objects(), name).await)?;
+        Dataset::open(&fetched).map_err(|error| failed(&error))
     }
 
-    fn push(&self, dir: &str, last: &str) -> Result<(), JobFailure> {
-        let pushed = self.runtime.block_on(self.store.objects().push(dir, last));
-        pushed.map_err(|error| failed(&error))
+    fn patience<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> Patience<'a> {
+        Patience {
+            runtime: &self.runtime,
+            report,
+            cancelled,
+        }
     }
 }
 

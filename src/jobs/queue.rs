@@ -79,9 +79,15 @@ impl Jobs {
         })
     }
 
-    /// Enqueues a job. If a job was enqueued with the same key before, returns that job.
-    /// Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `Taken`, `Stopping`, `Invalid`, `Store`.
+    /// Enqueues a job without an API key. Errors: as [`Self::submit_as`].
     pub async fn submit(&self, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
+        self.submit_as("", spec, key).await
+    }
+
+    /// Enqueues a job of the API key with the id `submitter`. If a job was enqueued with the same idempotency key before,
+    /// returns that job. Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `ShareFull`, `Taken`, `Stopping`, `Invalid`,
+    /// `Store`.
+    pub async fn submit_as(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
         if *shared.stop.borrow() {
             return Err(JobError::Stopping);
@@ -99,6 +105,7 @@ impl Jobs {
             spec: json(&spec)?,
             progress: json(&StoredProgress::default())?,
             idempotency_key: key,
+            submitter: submitter.to_owned(),
         };
         match shared.store.enqueue(new, shared.limits.queued as i64, unix_s()).await? {
             EnqueueResult::New(row) => {
@@ -114,6 +121,7 @@ impl Jobs {
 
     fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
         match (enqueued, spec.exclusive_output()) {
+            (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull { limit: *limit },
             (EnqueueResult::Taken, Some((kind, name))) => JobError::Taken {
                 kind,
                 name: name.to_owned(),

@@ -37,6 +37,8 @@ pub struct ServerConfig {
     pub models_dir: PathBuf,
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
     pub database_url: Option<String>,
+    /// How long a starting server or worker waits for its PostgreSQL, in seconds.
+    pub database_wait_s: u64,
     /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share. Default: the data directory.
     pub objects_url: Option<String>,
     /// If true, this server accepts jobs but leaves the work to workers.
@@ -154,6 +156,7 @@ impl Default for ServerConfig {
             data_dir: PathBuf::from("data"),
             models_dir: PathBuf::from("models"),
             database_url: None,
+            database_wait_s: 60,
             objects_url: None,
             no_jobs: false,
             max_body_bytes: 8 << 20,
@@ -239,6 +242,7 @@ impl ServerConfig {
         let deadline = 1..=MAX_DEADLINE_MS;
         let count = 1..=1_000_000;
         vec![
+            ("database_wait_s", self.database_wait_s, 0..=86_400),
             ("max_body_bytes", self.max_body_bytes as u64, 1024..=1 << 30),
             ("max_job_bytes", self.max_job_bytes as u64, 1024..=16 << 20),
             ("max_frames", self.max_frames as u64, 1..=4096),

@@ -1,5 +1,6 @@
 //! HTTP itself, before any resource: connections, limits, who may call, and the one shape that errors have.
 
+pub(super) mod access;
 pub(super) mod admission;
 pub(super) mod body_budget;
 mod connection_table;
@@ -11,6 +12,7 @@ pub(super) mod multipart;
 pub(super) mod origin;
 pub(super) mod page;
 pub(super) mod problem;
+mod rate;
 pub(super) mod request_limit;
 pub(super) mod streams;
 

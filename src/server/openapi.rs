@@ -5,16 +5,18 @@ mod variants;
 
 use std::collections::BTreeMap;
 
+use axum::http::Method;
 use serde::Deserialize;
 use serde_json::Value;
 use utoipa::openapi::RefOr;
 use utoipa::openapi::path::{Parameter, ParameterBuilder};
 use utoipa::openapi::schema::{KnownFormat, Schema, SchemaFormat};
-use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::{Modify, OpenApi};
 
 use self::responses::{Responses, operations};
 use self::variants::Variants;
+use super::http::access::required_scope;
 use super::http::problem::Problem;
 
 #[derive(OpenApi)]
@@ -47,11 +49,24 @@ impl Modify for KeySecurity {
         let scheme = HttpBuilder::new()
             .scheme(HttpAuthScheme::Bearer)
             .description(Some(
-                "An API key of this server, as `foreframe keys create` prints it. Without a valid key, the answer is 401.",
+                "An API key of this server, as `foreframe keys create` prints it. Each operation names the scope that it needs; `admin` includes `jobs`, and `jobs` includes `predict`.",
             ))
             .build();
         let components = contract.components.get_or_insert_default();
         components.add_security_scheme("key", SecurityScheme::Http(scheme));
+        for (path, item) in &mut contract.paths.paths {
+            for (method, operation) in [
+                (Method::GET, &mut item.get),
+                (Method::POST, &mut item.post),
+                (Method::DELETE, &mut item.delete),
+            ] {
+                if let Some(operation) = operation.as_mut().filter(|_| path.starts_with("/v1")) {
+                    let scope = required_scope(&method, path).name();
+                    let with_key = SecurityRequirement::new("key", [scope]);
+                    operation.security = Some(vec![SecurityRequirement::default(), with_key]);
+                }
+            }
+        }
     }
 }
 

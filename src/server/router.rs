@@ -15,8 +15,8 @@ use super::http::problem::ApiError;
 use super::http::request_limit::{self, RequestLimit};
 use super::openapi;
 use super::routes::{
-    contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict, preview,
-    rollouts, sessions, streams,
+    audit, contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict,
+    preview, rollouts, sessions, streams,
 };
 use super::state::App;
 
@@ -79,6 +79,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(jobs::routes(config.max_job_bytes))
         .merge(datasets::routes())
         .merge(environments::routes())
+        .merge(audit::routes())
 }
 
 /// The routes of streams, which have limits of their own; they need an API key if authentication is on.

@@ -1,5 +1,6 @@
 //! The handlers, one resource a file. Each file declares its routes in a function `routes`.
 
+pub(super) mod audit;
 pub(super) mod contract;
 pub(super) mod dashboard;
 pub(super) mod datasets;

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
+use futures_util::future::BoxFuture;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
@@ -20,6 +21,9 @@ use crate::files::open_lock;
 const MAX_CONNECTIONS: u32 = 8;
 /// How long a statement waits for a connection or, on SQLite, for another writer.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
+/// The time limit of a statement on PostgreSQL. Without it, a server that was paused or disconnected would be waited for
+/// without end.
+const STATEMENT_LIMIT: Duration = Duration::from_secs(15);
 
 const MIGRATIONS: &[(i64, &str, &str)] = &[
     (1, "initial", include_str!("migrations/0001_initial.sql")),
@@ -27,6 +31,11 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
         2,
         "attempts and metrics",
         include_str!("migrations/0002_attempts_and_metrics.sql"),
+    ),
+    (
+        3,
+        "key scopes and audit",
+        include_str!("migrations/0003_key_scopes_and_audit.sql"),
     ),
 ];
 
@@ -213,7 +222,7 @@ impl Database {
             Ok(pool) => pool,
             // The pool's timeout hides the reason; a single connection reports it.
             Err(sqlx::Error::PoolTimedOut) => {
-                let reason = PgConnection::connect(url).await.err();
+                let reason = within_limit(PgConnection::connect(url)).await.err();
                 return Err(open_failed(reason.unwrap_or(sqlx::Error::PoolTimedOut)));
             }
             Err(error) => return Err(open_failed(error)),
@@ -231,7 +240,7 @@ impl Database {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(pool) => sqlite_rows(bind::<Sqlite>(sql, values).fetch_all(pool).await?),
-            Self::Postgres(pool) => postgres_rows(bind::<Postgres>(sql, values).fetch_all(pool).await?),
+            Self::Postgres(pool) => postgres_rows(within_limit(bind::<Postgres>(sql, values).fetch_all(pool)).await?),
         })
     }
 
@@ -240,7 +249,9 @@ impl Database {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(pool) => bind::<Sqlite>(sql, values).execute(pool).await?.rows_affected(),
-            Self::Postgres(pool) => bind::<Postgres>(sql, values).execute(pool).await?.rows_affected(),
+            Self::Postgres(pool) => within_limit(bind::<Postgres>(sql, values).execute(pool))
+                .await?
+                .rows_affected(),
         })
     }
 
@@ -248,7 +259,7 @@ impl Database {
     pub(super) async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(match self {
             Self::Sqlite(pool) => Tx::Sqlite(pool.begin_with("BEGIN IMMEDIATE").await?),
-            Self::Postgres(pool) => Tx::Postgres(pool.begin().await?),
+            Self::Postgres(pool) => Tx::Postgres(within_limit(pool.begin()).await?),
         })
     }
 }
@@ -278,7 +289,9 @@ impl Tx {
     async fn fetch_any(&mut self, sql: SqlStr, values: Vec<DatabaseValue>) -> Result<Vec<DatabaseRow>, StoreError> {
         Ok(match self {
             Self::Sqlite(tx) => sqlite_rows(bind::<Sqlite>(sql, values).fetch_all(&mut **tx).await?),
-            Self::Postgres(tx) => postgres_rows(bind::<Postgres>(sql, values).fetch_all(&mut **tx).await?),
+            Self::Postgres(tx) => {
+                postgres_rows(within_limit(bind::<Postgres>(sql, values).fetch_all(&mut **tx)).await?)
+            }
         })
     }
 
@@ -286,17 +299,30 @@ impl Tx {
         let sql = sql.into_sql_str();
         Ok(match self {
             Self::Sqlite(tx) => bind::<Sqlite>(sql, values).execute(&mut **tx).await?.rows_affected(),
-            Self::Postgres(tx) => bind::<Postgres>(sql, values).execute(&mut **tx).await?.rows_affected(),
+            Self::Postgres(tx) => within_limit(bind::<Postgres>(sql, values).execute(&mut **tx))
+                .await?
+                .rows_affected(),
         })
     }
 
     pub(super) async fn commit(self) -> Result<(), StoreError> {
         let committed = match self {
             Self::Sqlite(tx) => tx.commit().await,
-            Self::Postgres(tx) => tx.commit().await,
+            Self::Postgres(tx) => within_limit(tx.commit()).await,
         };
         committed.map_err(StoreError::Query)
     }
+}
+
+/// Errors: `PoolTimedOut` after the time limit of a statement.
+fn within_limit<'a, T: 'a>(
+    statement: impl Future<Output = Result<T, sqlx::Error>> + Send + 'a,
+) -> BoxFuture<'a, Result<T, sqlx::Error>> {
+    // On the heap, since otherwise it would make the future of every caller large.
+    Box::pin(async move {
+        let done = tokio::time::timeout(STATEMENT_LIMIT, statement).await;
+        done.unwrap_or(Err(sqlx::Error::PoolTimedOut))
+    })
 }
 
 fn sqlite_rows(rows: Vec<SqliteRow>) -> Vec<DatabaseRow> {

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::reports::{JobReport, write_report};
-use super::{ModelMetrics, Store, StoreError};
+use super::{ModelMetrics, Store, StoreError, unix_s};
 
 /// The row of a job. Structured values are JSON.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,6 +40,8 @@ pub struct JobRow {
     pub checkpoint: i64,
     /// How many attempts in a row ended abnormally without saving more.
     pub stalled_attempts: i64,
+    /// The id of the API key that submitted it; empty without a key.
+    pub submitter: String,
 }
 
 impl JobRow {
@@ -59,6 +61,7 @@ impl JobRow {
             token: row.get("token")?,
             checkpoint: row.get("checkpoint")?,
             stalled_attempts: row.get("stalled_attempts")?,
+            submitter: row.get("submitter")?,
         })
     }
 }
@@ -76,6 +79,8 @@ pub struct NewJob {
     pub progress: String,
     /// The caller's idempotency key: one key never makes two jobs.
     pub idempotency_key: Option<String>,
+    /// The id of the caller's API key; empty without a key.
+    pub submitter: String,
 }
 
 /// The result of enqueueing.
@@ -87,6 +92,8 @@ pub enum EnqueueResult {
     Same(JobRow),
     /// The queue is full.
     Full,
+    /// The submitter's share of the queue is full: so many jobs of one API key can wait.
+    ShareFull(i64),
     /// A queued or running job has the same output.
     Taken,
 }
@@ -138,10 +145,10 @@ async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
     tx.execute(sql, vec![]).await.map(drop)
 }
 
-/// Checks that the queue has room and that no queued or running job has the same output.
+/// Checks that the queue and the submitter's share of it have room, and that no queued or running job has the same output.
 async fn check_capacity(
     tx: &mut Tx,
-    makes: Option<&str>,
+    (makes, submitter): (Option<&str>, &str),
     max_queued: i64,
 ) -> Result<Option<EnqueueResult>, StoreError> {
     // In SQL nothing equals NULL, so a job without an exclusive output never conflicts.
@@ -153,7 +160,20 @@ async fn check_capacity(
         .fetch("SELECT number FROM jobs WHERE state = 'queued'", vec![])
         .await?
         .len();
-    Ok((queued as i64 >= max_queued).then_some(EnqueueResult::Full))
+    if queued as i64 >= max_queued {
+        return Ok(Some(EnqueueResult::Full));
+    }
+    if submitter.is_empty() {
+        return Ok(None);
+    }
+    let sql = "SELECT COUNT(*) AS keys, (SELECT COUNT(*) FROM jobs WHERE submitter = $1 AND state = 'queued') AS queued \
+         FROM api_keys WHERE revoked_s IS NULL AND scope <> 'predict' AND (expires_s IS NULL OR expires_s > $2)";
+    let rows = tx.fetch(sql, vec![submitter.into(), unix_s().into()]).await?;
+    let Some(row) = rows.first() else { return Ok(None) };
+    let (keys, queued): (i64, i64) = (row.get("keys")?, row.get("queued")?);
+    // Equal shares of all keys that can submit jobs, rounded up.
+    let share = (max_queued + keys - 1) / keys.max(1);
+    Ok((queued >= share.max(1)).then_some(EnqueueResult::ShareFull(share.max(1))))
 }
 
 fn first_job(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
@@ -171,13 +191,15 @@ impl Store {
                 return Ok(EnqueueResult::Same(row));
             }
         }
-        if let Some(refused) = check_capacity(&mut tx, new.exclusive_output.as_deref(), max_queued).await? {
+        if let Some(refused) =
+            check_capacity(&mut tx, (new.exclusive_output.as_deref(), &new.submitter), max_queued).await?
+        {
             return Ok(refused);
         }
         tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'job'", vec![])
             .await?;
-        let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s) \
-             SELECT value, $1, $2, 'queued', $3, $4, $5, $6 FROM counters WHERE name = 'job' RETURNING *";
+        let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s, submitter) \
+             SELECT value, $1, $2, 'queued', $3, $4, $5, $6, $7 FROM counters WHERE name = 'job' RETURNING *";
         let values: Vec<DatabaseValue> = vec![
             new.kind.into(),
             new.exclusive_output.into(),
@@ -185,6 +207,7 @@ impl Store {
             new.progress.into(),
             new.idempotency_key.into(),
             now_s.into(),
+            new.submitter.into(),
         ];
         let row = first_job(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;
@@ -196,11 +219,11 @@ impl Store {
     pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
-        let sql = "SELECT makes FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
+        let sql = "SELECT makes, submitter FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
         let rows = tx.fetch(sql, vec![number.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
-        let makes: Option<String> = row.get("makes")?;
-        if let Some(refused) = check_capacity(&mut tx, makes.as_deref(), max_queued).await? {
+        let (makes, submitter): (Option<String>, String) = (row.get("makes")?, row.get("submitter")?);
+        if let Some(refused) = check_capacity(&mut tx, (makes.as_deref(), &submitter), max_queued).await? {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
@@ -256,7 +279,8 @@ impl Store {
             .collect()
     }
 
-    /// Claims the oldest job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds.
+    /// Claims a job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest
+    /// job of the submitter with the fewest running jobs; of several, of the one whose last job was claimed longest ago.
     /// Errors: `Query`.
     pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let now_s = self.database.now_s().await?;
@@ -266,15 +290,18 @@ impl Store {
     /// As [`Self::claim`], at a given time. Errors: `Query`.
     pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
-        let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) \
-             ORDER BY number LIMIT 1";
+        let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) ORDER BY \
+             (SELECT COUNT(*) FROM jobs AS other WHERE other.submitter = jobs.submitter \
+             AND other.state = 'running' AND other.lease_until_s >= $1), \
+             (SELECT COALESCE(MAX(other.claimed_s), 0) FROM jobs AS other WHERE other.submitter = jobs.submitter), \
+             number LIMIT 1";
         let rows = tx.fetch_free(sql, vec![now_s.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let number: i64 = row.get("number")?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
              claimed_checkpoint = checkpoint, stalled_attempts = CASE \
              WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
-             started_s = COALESCE(started_s, $4) WHERE number = $1 RETURNING *";
+             started_s = COALESCE(started_s, $4), claimed_s = $4 WHERE number = $1 RETURNING *";
         let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
         let row = first_job(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;

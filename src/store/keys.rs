@@ -1,7 +1,52 @@
 //! The API keys. Only the hash of each secret is stored.
 
+use std::fmt;
+use std::str::FromStr;
+
 use super::database::DatabaseRow;
 use super::{Store, StoreError};
+
+/// What a key allows. Each scope includes those before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum KeyScope {
+    /// Predictions, sessions, streams and environments; reading the models.
+    Predict,
+    /// Also jobs and data sets.
+    Jobs,
+    /// Also activating and deleting versions, deleting data sets, and the audit trail.
+    Admin,
+}
+
+impl KeyScope {
+    /// All scopes, the smallest first.
+    pub const ALL: [Self; 3] = [Self::Predict, Self::Jobs, Self::Admin];
+
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Predict => "predict",
+            Self::Jobs => "jobs",
+            Self::Admin => "admin",
+        }
+    }
+}
+
+impl fmt::Display for KeyScope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for KeyScope {
+    type Err = String;
+
+    /// Errors: a sentence that lists the scopes.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|scope| scope.name() == text);
+        found.ok_or_else(|| format!("there is no scope {text:?}; there are: predict, jobs, admin"))
+    }
+}
 
 /// The row of an API key.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,26 +61,68 @@ pub struct KeyRow {
     pub created_s: f64,
     /// When it was revoked, in seconds since 1970.
     pub revoked_s: Option<f64>,
+    /// What it allows.
+    pub scope: KeyScope,
+    /// Until when it is valid, in seconds since 1970.
+    pub expires_s: Option<f64>,
+    /// The maximum number of requests a second.
+    pub requests_per_s: Option<f64>,
 }
 
 impl KeyRow {
     fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
+        let scope: String = row.get("scope")?;
         Ok(Self {
             id: row.get("id")?,
             name: row.get("name")?,
             hash: row.get("hash")?,
             created_s: row.get("created_s")?,
             revoked_s: row.get("revoked_s")?,
+            scope: scope
+                .parse()
+                .map_err(|error: String| StoreError::Query(sqlx::Error::Decode(error.into())))?,
+            expires_s: row.get("expires_s")?,
+            requests_per_s: row.get("requests_per_s")?,
         })
+    }
+
+    /// Whether requests with it are accepted at that time.
+    #[must_use]
+    pub fn is_valid(&self, now_s: f64) -> bool {
+        self.revoked_s.is_none() && self.expires_s.is_none_or(|expires_s| now_s < expires_s)
     }
 }
 
 impl Store {
-    /// Adds a key. Errors: `Query`, also if the id exists.
+    /// Adds a key that allows everything. Errors: `Query`, also if the id exists.
     pub async fn create_key(&self, id: &str, name: &str, hash: &str, created_s: f64) -> Result<(), StoreError> {
+        let key = KeyRow {
+            id: id.to_owned(),
+            name: name.to_owned(),
+            hash: hash.to_owned(),
+            created_s,
+            revoked_s: None,
+            scope: KeyScope::Admin,
+            expires_s: None,
+            requests_per_s: None,
+        };
+        self.add_key(key).await
+    }
+
+    /// Adds a key. Errors: `Query`, also if the id exists.
+    pub async fn add_key(&self, key: KeyRow) -> Result<(), StoreError> {
         self.mark_keys_created()?;
-        let sql = "INSERT INTO api_keys (id, name, hash, created_s) VALUES ($1, $2, $3, $4)";
-        let values = vec![id.into(), name.into(), hash.into(), created_s.into()];
+        let sql = "INSERT INTO api_keys (id, name, hash, created_s, scope, expires_s, requests_per_s) \
+             VALUES ($1, $2, $3, $4, $5, $6, $7)";
+        let values = vec![
+            key.id.into(),
+            key.name.into(),
+            key.hash.into(),
+            key.created_s.into(),
+            key.scope.name().into(),
+            key.expires_s.into(),
+            key.requests_per_s.into(),
+        ];
         self.database.execute(sql, values).await.map(drop)
     }
 

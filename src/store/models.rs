@@ -102,6 +102,15 @@ impl Store {
         rows.iter().map(version).collect()
     }
 
+    /// All versions that were deleted, by name and number. Errors: `Query`.
+    pub async fn deleted_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
+        let sql = "SELECT model, version FROM model_versions WHERE deleted_s IS NOT NULL ORDER BY model, version";
+        let rows = self.database.fetch(sql, vec![]).await?;
+        rows.iter()
+            .map(|row| Ok((row.get("model")?, version_of(row)?)))
+            .collect()
+    }
+
     /// The active version of each model that has one. Errors: `Query`.
     pub async fn active_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
         let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;

@@ -189,6 +189,20 @@ impl Objects {
         Ok(())
     }
 
+    /// Finishes the deletion of directories that were deleted before, if it was interrupted. Errors: `Io`, `Object`.
+    pub async fn sweep(&self, parent: &str, names: &[String]) -> Result<(), StoreError> {
+        let left = self.directories(parent).await?;
+        for name in names {
+            let dir = format!("{parent}/{name}");
+            if left.contains(name) {
+                self.delete(&dir).await?;
+            } else {
+                on_disk("delete", &self.data_dir.join(&dir), remove_dir).await?;
+            }
+        }
+        Ok(())
+    }
+
     async fn list(&self, dir: &str) -> Result<Vec<ObjectMeta>, StoreError> {
         let Some(shared) = &self.shared else {
             return Ok(Vec::new());

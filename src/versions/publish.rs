@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::{VersionError, Versions, key};
 use crate::registry::{self, RegistryError};
+use crate::store::audit::COMMAND_LINE;
 use crate::store::unix_s;
 
 impl Versions {
@@ -25,13 +26,21 @@ impl Versions {
         if activates {
             self.store.set_active(model, version, unix_s()).await?;
         }
+        self.record("version.publish", model, version).await;
         Ok(version)
     }
 
     /// Makes a version the active one, for servers of the store to load. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn choose(&self, model: &str, version: u32) -> Result<(), VersionError> {
         self.load(model, version).await?;
-        Ok(self.store.set_active(model, version, unix_s()).await?)
+        self.store.set_active(model, version, unix_s()).await?;
+        self.record("version.activate", model, version).await;
+        Ok(())
+    }
+
+    async fn record(&self, action: &str, model: &str, version: u32) {
+        let target = format!("{model}@{version}");
+        self.store.record_change(COMMAND_LINE, action, &target).await;
     }
 
     /// Deletes one published version that is not active, or all published versions of a model; then the shipped one is
@@ -80,6 +89,7 @@ impl Versions {
                 return Err(VersionError::Active { model, version });
             }
             self.store.objects().delete(&key(model, version)).await?;
+            self.record("version.delete", model, version).await;
         }
         Ok(doomed)
     }

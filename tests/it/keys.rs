@@ -1,11 +1,12 @@
-//! API keys: when a key is required, and what happens after it is revoked.
+//! API keys: when a key is required, what it allows, and what happens after it is revoked or has expired.
 
 use axum::body::Body;
 use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
 use foreframe::server::{App, ServerConfig};
-use foreframe::store::{Store, StoreConfig};
+use foreframe::store::{KeyRow, KeyScope, Store, StoreConfig, unix_s};
 use futures_util::{SinkExt as _, StreamExt as _};
+use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
@@ -157,4 +158,163 @@ async fn a_websocket_can_send_its_key_as_a_subprotocol() {
         .unwrap();
     assert_eq!(answer.headers()["sec-websocket-protocol"], "foreframe.v1.json");
     server.stop().await;
+}
+
+/// A key with these limits, which the server knows.
+async fn limited_key(store: &Store, keys: &Keys, limits: impl FnOnce(&mut KeyRow)) -> NewKey {
+    let key = NewKey::generate().unwrap();
+    let mut row = KeyRow {
+        id: key.id.clone(),
+        name: "limited".to_owned(),
+        hash: key.hash.clone(),
+        created_s: 1.0,
+        revoked_s: None,
+        scope: KeyScope::Admin,
+        expires_s: None,
+        requests_per_s: None,
+    };
+    limits(&mut row);
+    store.add_key(row).await.unwrap();
+    keys.refresh().await.unwrap();
+    key
+}
+
+async fn send_with(app: &App, key: &NewKey, (method, path): (&str, &str), body: &Value) -> Answer {
+    let request = Request::builder()
+        .method(method)
+        .uri(path)
+        .header(header::AUTHORIZATION, format!("Bearer {}", key.text))
+        .header(header::CONTENT_TYPE, "application/json");
+    send(app, request.body(Body::from(body.to_string())).unwrap()).await
+}
+
+#[tokio::test]
+async fn a_scope_includes_the_smaller_ones_and_no_more() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let requests = [
+        (("GET", "/v1/models"), KeyScope::Predict),
+        (("POST", "/v1/models/plain/predict"), KeyScope::Predict),
+        (("GET", "/v1/sessions"), KeyScope::Predict),
+        (("GET", "/v1/datasets"), KeyScope::Jobs),
+        (("POST", "/v1/jobs"), KeyScope::Jobs),
+        (("POST", "/v1/jobs/job-1/cancel"), KeyScope::Jobs),
+        (("DELETE", "/v1/datasets/none"), KeyScope::Admin),
+        (("POST", "/v1/models/plain/versions/1/activate"), KeyScope::Admin),
+        (("DELETE", "/v1/models/plain/versions/9"), KeyScope::Admin),
+        (("GET", "/v1/audit"), KeyScope::Admin),
+    ];
+    for scope in KeyScope::ALL {
+        let key = limited_key(&store, &keys, |row| row.scope = scope).await;
+        for (request, needed) in requests {
+            let answer = send_with(&app, &key, request, &json!({})).await;
+            if scope >= needed {
+                assert!(![401, 403].contains(&answer.status.as_u16()), "{scope} {request:?}");
+            } else {
+                let detail = answer.detail(403);
+                assert!(
+                    detail.contains(&format!("scope {needed}")),
+                    "{scope} {request:?}: {detail}"
+                );
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_expired_key_is_refused() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let valid = limited_key(&store, &keys, |row| row.expires_s = Some(unix_s() + 60.0)).await;
+    let expired = limited_key(&store, &keys, |row| row.expires_s = Some(unix_s() - 1.0)).await;
+    assert_eq!(
+        send_with(&app, &valid, ("GET", "/v1/models"), &Value::Null)
+            .await
+            .status,
+        200
+    );
+    let refused = send_with(&app, &expired, ("GET", "/v1/models"), &Value::Null).await;
+    assert!(refused.detail(401).contains("expired"));
+    // It expires between two reads of the keys, too.
+    let soon = limited_key(&store, &keys, |row| row.expires_s = Some(unix_s() + 0.2)).await;
+    tokio::time::sleep(std::time::Duration::from_millis(250)).await;
+    assert_eq!(
+        send_with(&app, &soon, ("GET", "/v1/models"), &Value::Null).await.status,
+        401
+    );
+}
+
+#[tokio::test]
+async fn a_key_over_its_rate_is_told_when_to_try_again() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let slow = limited_key(&store, &keys, |row| row.requests_per_s = Some(0.01)).await;
+    let other = limited_key(&store, &keys, |_| {}).await;
+    assert_eq!(
+        send_with(&app, &slow, ("GET", "/v1/models"), &Value::Null).await.status,
+        200
+    );
+    // Reading the keys again does not reset what was used.
+    keys.refresh().await.unwrap();
+    let refused = send_with(&app, &slow, ("GET", "/v1/models"), &Value::Null).await;
+    assert!(refused.detail(429).contains("0.01 requests a second"));
+    let retry_after: u64 = refused.headers[header::RETRY_AFTER].to_str().unwrap().parse().unwrap();
+    assert!((95..=100).contains(&retry_after), "{retry_after}");
+    assert_eq!(
+        send_with(&app, &other, ("GET", "/v1/models"), &Value::Null)
+            .await
+            .status,
+        200
+    );
+}
+
+#[tokio::test]
+async fn changes_are_audited_with_their_key() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let (one, other) = (new_key(&store, &keys).await, new_key(&store, &keys).await);
+    let job = json!({"kind": "collect", "name": "a", "scenario": "static-observer", "trials": 100_000});
+    let created = send_with(&app, &one, ("POST", "/v1/jobs"), &job).await.json();
+    assert_eq!(created["submitter"], one.id);
+    assert_eq!(
+        send_with(&app, &other, ("POST", "/v1/jobs/job-1/cancel"), &Value::Null)
+            .await
+            .status,
+        202
+    );
+    // A refused change is none.
+    assert_eq!(
+        send_with(&app, &other, ("DELETE", "/v1/datasets/none"), &Value::Null)
+            .await
+            .status,
+        404
+    );
+    let page = send_with(&app, &one, ("GET", "/v1/audit?limit=1"), &Value::Null)
+        .await
+        .json();
+    let entry = |page: &Value| {
+        let entry = &page["entries"][0];
+        ["number", "who", "name", "action", "target"].map(|field| entry[field].clone())
+    };
+    assert_eq!(
+        entry(&page),
+        [
+            json!(2),
+            json!(other.id),
+            json!("robot"),
+            json!("job.cancel"),
+            json!("job-1")
+        ]
+    );
+    assert_eq!(page["next"], 2);
+    let page = send_with(&app, &one, ("GET", "/v1/audit?before=2"), &Value::Null)
+        .await
+        .json();
+    assert_eq!(
+        entry(&page),
+        [
+            json!(1),
+            json!(one.id),
+            json!("robot"),
+            json!("job.create"),
+            json!("job-1")
+        ]
+    );
+    assert!(page["entries"][0]["unix_s"].as_f64().unwrap() > 1e9 && page["next"].is_null());
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use foreframe::store::{
-    EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, Lease, LossRow, NewJob, Store, StoreConfig,
+    EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
@@ -58,6 +58,7 @@ fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
         spec: "{}".to_owned(),
         progress: "{}".to_owned(),
         idempotency_key: key.map(str::to_owned),
+        submitter: String::new(),
     }
 }
 
@@ -409,4 +410,96 @@ async fn an_unreachable_postgresql_is_refused_with_the_reason() {
         .unwrap();
     let error = refused(format!("postgres://foreframe@{nobody}/postgres")).await;
     assert!(error.contains("Connection refused"), "{error}");
+}
+
+async fn enqueued_by(store: &Store, submitter: &str) -> EnqueueResult {
+    let new = NewJob {
+        submitter: submitter.to_owned(),
+        ..job(None, None)
+    };
+    store.enqueue(new, 8, 1.0).await.unwrap()
+}
+
+#[tokio::test]
+async fn submitters_take_turns() {
+    for (_dir, store) in stores("turns").await {
+        for submitter in ["a", "a", "a", "a", "b", "b", "c"] {
+            assert!(matches!(enqueued_by(&store, submitter).await, EnqueueResult::New(_)));
+        }
+        let mut order = String::new();
+        for time_s in 1..=7 {
+            let time_s = f64::from(time_s);
+            let (row, lease) = store.claim_at("me", time_s, 100.0).await.unwrap().unwrap();
+            order += &row.submitter;
+            assert!(store.end(lease, outcome("succeeded"), report("done")).await.unwrap());
+        }
+        assert_eq!(order, "abcabaa");
+    }
+}
+
+#[tokio::test]
+async fn a_submitter_without_running_jobs_is_first() {
+    for (_dir, store) in stores("running").await {
+        for submitter in ["a", "a", "b", "b"] {
+            enqueued_by(&store, submitter).await;
+        }
+        let mut claimed = String::new();
+        for time_s in [1.0, 2.0, 3.0] {
+            // `b` was claimed later than `a`, but has ended.
+            let (row, lease) = store.claim_at("me", time_s, 100.0).await.unwrap().unwrap();
+            claimed += &row.submitter;
+            if row.submitter == "b" {
+                store.end(lease, outcome("succeeded"), report("done")).await.unwrap();
+            }
+        }
+        assert_eq!(claimed, "abb");
+    }
+}
+
+#[tokio::test]
+async fn a_key_has_its_share_of_the_job_queue() {
+    for (_dir, store) in stores("share").await {
+        let key = |id: &str, scope| KeyRow {
+            id: id.to_owned(),
+            name: id.to_owned(),
+            hash: id.to_owned(),
+            created_s: 1.0,
+            revoked_s: None,
+            scope,
+            expires_s: None,
+            requests_per_s: None,
+        };
+        for (id, scope) in [
+            ("a", KeyScope::Jobs),
+            ("b", KeyScope::Admin),
+            ("robot", KeyScope::Predict),
+        ] {
+            store.add_key(key(id, scope)).await.unwrap();
+        }
+        for _ in 0..4 {
+            assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
+        }
+        assert_eq!(enqueued_by(&store, "a").await, EnqueueResult::ShareFull(4));
+        assert!(matches!(enqueued_by(&store, "b").await, EnqueueResult::New(_)));
+        store.revoke_key("b", 1.0).await.unwrap();
+        assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
+        let stored = store.find_key("robot").await.unwrap().unwrap();
+        assert_eq!(stored, key("robot", KeyScope::Predict));
+    }
+}
+
+#[tokio::test]
+async fn the_audit_trail_is_kept_in_order() {
+    for (_dir, store) in stores("audit").await {
+        store.create_key("k", "robot", "hash", 1.0).await.unwrap();
+        store.record_change("k", "job.create", "job-1").await;
+        store.record_change("anonymous", "job.cancel", "job-1").await;
+        let rows = store.audit(None, 10).await.unwrap();
+        let seen: Vec<_> = rows
+            .iter()
+            .map(|row| (row.number, row.name.as_deref(), row.action.as_str()))
+            .collect();
+        assert_eq!(seen, [(2, None, "job.cancel"), (1, Some("robot"), "job.create")]);
+        assert_eq!(store.audit(Some(2), 10).await.unwrap(), rows[1..]);
+    }
 }

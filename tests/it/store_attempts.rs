@@ -14,6 +14,7 @@ async fn store(dir: &std::path::Path) -> Store {
         spec: "{}".to_owned(),
         progress: "{}".to_owned(),
         idempotency_key: None,
+        submitter: String::new(),
     };
     store.enqueue(new, 10, 0.0).await.unwrap();
     store

@@ -21,6 +21,7 @@ async fn enqueue(store: &Store) -> Result<EnqueueResult, StoreError> {
         spec: "x".repeat(4096),
         progress: "{}".to_owned(),
         idempotency_key: None,
+        submitter: String::new(),
     };
     store.enqueue(new, 1_000_000, 0.0).await
 }

@@ -1,11 +1,11 @@
 //! API keys: how they are made, and which requests they allow.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
 use std::convert::Infallible;
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use axum::extract::{Request, State};
+use axum::extract::{MatchedPath, Request, State};
 use axum::http::{HeaderMap, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -16,14 +16,18 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::watch;
 use tracing::warn;
 
+use super::access::{Change, required_scope};
 use super::problem::ApiError;
-use crate::store::{KeyRow, Store, StoreError};
+use super::rate::RateLimit;
+use crate::store::{KeyRow, KeyScope, Store, StoreError, unix_s};
 use crate::telemetry::names;
 
 /// The beginning of every key, so that leaked keys are easy to find.
 const PREFIX: &str = "ffk";
 /// A browser cannot set headers of a WebSocket. It can offer the key as a sub-protocol with this prefix.
 const SUBPROTOCOL_PREFIX: &str = "foreframe.key.";
+/// Who calls while authentication is off.
+const ANONYMOUS: &str = "anonymous";
 const ID_BYTES: usize = 6;
 const SECRET_BYTES: usize = 32;
 
@@ -105,12 +109,47 @@ struct KeyCache {
 
 #[derive(Default)]
 struct KnownKeys {
-    /// The keys that are not revoked.
-    valid: HashSet<KeyHash>,
+    /// The keys that were not revoked or expired when they were read.
+    valid: HashMap<KeyHash, Arc<KnownKey>>,
     /// Whether the store has any key, revoked or not.
     exist: bool,
     /// Keys that an older version stored in a form that is no longer accepted.
     outdated: usize,
+}
+
+/// A key and what was used of its rate.
+struct KnownKey {
+    row: KeyRow,
+    rate: Option<RateLimit>,
+}
+
+impl KnownKey {
+    fn new(row: KeyRow) -> Self {
+        let rate = row.requests_per_s.map(|per_s| RateLimit::new(per_s, Instant::now()));
+        Self { row, rate }
+    }
+
+    /// Errors: `Unauthorized` if it has expired, `Forbidden` if its scope is too small, `TooMany`.
+    fn check(&self, needed: KeyScope) -> Result<(), ApiError> {
+        if !self.row.is_valid(unix_s()) {
+            return Err(ApiError::Unauthorized("the API key has expired; create a new one"));
+        }
+        if self.row.scope < needed {
+            return Err(ApiError::Forbidden(format!(
+                "this needs an API key with scope {needed}, but the scope of key {} is {}",
+                self.row.id, self.row.scope
+            )));
+        }
+        let taken = self.rate.as_ref().map_or(Ok(()), |rate| rate.take(Instant::now()));
+        taken.map_err(|wait_s| ApiError::TooMany {
+            detail: format!(
+                "key {} may send {} requests a second",
+                self.row.id,
+                self.row.requests_per_s.unwrap_or_default()
+            ),
+            retry_after_s: wait_s.ceil().max(1.0) as u64,
+        })
+    }
 }
 
 impl Keys {
@@ -149,10 +188,17 @@ impl Keys {
     pub async fn refresh(&self) -> Result<(), StoreError> {
         let Some(store) = &self.shared.store else { return Ok(()) };
         let rows = store.list_keys().await?;
-        let usable: Vec<&KeyRow> = rows.iter().filter(|row| row.revoked_s.is_none()).collect();
-        let valid: HashSet<KeyHash> = usable.iter().filter_map(|row| KeyHash::from_row(row)).collect();
-        let outdated = usable.len() - valid.len();
+        let (exist, now_s) = (!rows.is_empty() || store.keys_were_created(), unix_s());
+        let usable: Vec<KeyRow> = rows.into_iter().filter(|row| row.is_valid(now_s)).collect();
         let mut known = self.shared.known.write().unwrap_or_else(PoisonError::into_inner);
+        let (count, mut valid) = (usable.len(), HashMap::new());
+        for row in usable {
+            let Some(hash) = KeyHash::from_row(&row) else { continue };
+            // A key that has not changed keeps what was used of its rate.
+            let before = known.valid.get(&hash).filter(|before| before.row == row).cloned();
+            valid.insert(hash, before.unwrap_or_else(|| Arc::new(KnownKey::new(row))));
+        }
+        let outdated = count - valid.len();
         if outdated > known.outdated {
             warn!(
                 keys = outdated,
@@ -160,11 +206,7 @@ impl Keys {
                  keys create, and revoke the old ones"
             );
         }
-        *known = KnownKeys {
-            valid,
-            exist: !rows.is_empty() || store.keys_were_created(),
-            outdated,
-        };
+        *known = KnownKeys { valid, exist, outdated };
         drop(known);
         self.shared.refreshed.send_replace(());
         Ok(())
@@ -177,7 +219,7 @@ impl Keys {
         };
         let mut refreshed = self.shared.refreshed.subscribe();
         // The sender lives as long as these keys.
-        while self.known().valid.contains(&key) && refreshed.changed().await.is_ok() {}
+        while self.known().valid.contains_key(&key) && refreshed.changed().await.is_ok() {}
     }
 
     /// Reads the keys again and again, so that no request has to wait for the store.
@@ -196,8 +238,9 @@ impl Keys {
         self.shared.is_required || self.known().exist
     }
 
-    /// Takes the same time for every key that is not valid: the whole text is hashed, then looked up.
-    fn check(&self, presented: Option<&str>) -> Result<Caller, ApiError> {
+    /// Who calls, with a key of the needed scope. Takes the same time for every unknown key: the whole text is hashed, then
+    /// looked up.
+    fn check(&self, presented: Option<&str>, needed: KeyScope) -> Result<Caller, ApiError> {
         if !self.are_required() {
             return Ok(Caller(None));
         }
@@ -206,12 +249,32 @@ impl Keys {
              create NAME",
         ))?;
         let hash = KeyHash::of(key);
-        if self.known().valid.contains(&hash) {
-            return Ok(Caller(Some(hash)));
-        }
-        Err(ApiError::Unauthorized(
-            "the API key is not valid: it is unknown or was revoked",
-        ))
+        let known = self.known().valid.get(&hash).cloned();
+        let known = known.ok_or(ApiError::Unauthorized(
+            "the API key is not valid: it is unknown, was revoked or has expired",
+        ))?;
+        known.check(needed)?;
+        Ok(Caller(Some(hash)))
+    }
+
+    /// The id of the caller's key; empty while authentication is off.
+    pub(in crate::server) fn id_of(&self, caller: Caller) -> String {
+        let Caller(Some(hash)) = caller else {
+            return String::new();
+        };
+        let known = self.known();
+        known
+            .valid
+            .get(&hash)
+            .map_or_else(String::new, |key| key.row.id.clone())
+    }
+
+    /// Writes a change that a request made to the audit trail.
+    async fn record(&self, caller: Caller, action: &str, target: &str) {
+        let Some(store) = &self.shared.store else { return };
+        let key = self.id_of(caller);
+        let who = if key.is_empty() { ANONYMOUS } else { &key };
+        store.record_change(who, action, target).await;
     }
 
     fn known(&self) -> RwLockReadGuard<'_, KnownKeys> {
@@ -219,18 +282,26 @@ impl Keys {
     }
 }
 
-/// Refuses a request without a valid key if authentication is on. Others get their [`Caller`] as an extension.
+/// Refuses a request without a key that allows it, if authentication is on. Others get their [`Caller`] as an
+/// extension, and what they change is audited.
 pub(in crate::server) async fn check(State(keys): State<Keys>, mut request: Request, next: Next) -> Response {
-    match keys.check(presented(request.headers())) {
-        Ok(caller) => {
-            request.extensions_mut().insert(caller);
-            next.run(request).await
-        }
+    let route = request.extensions().get::<MatchedPath>().cloned();
+    let route = route.as_ref().map_or("", MatchedPath::as_str);
+    let needed = required_scope(request.method(), route);
+    let caller = match keys.check(presented(request.headers()), needed) {
+        Ok(caller) => caller,
         Err(refused) => {
             counter!(names::AUTH_REFUSED).increment(1);
-            refused.into_response()
+            return refused.into_response();
         }
+    };
+    let change = Change::of(request.method(), route, request.uri().path());
+    request.extensions_mut().insert(caller);
+    let response = next.run(request).await;
+    if let Some(change) = change.filter(|_| response.status().is_success()) {
+        keys.record(caller, change.action, &change.target(&response)).await;
     }
+    response
 }
 
 /// The key that a request presents.
@@ -259,6 +330,9 @@ mod tests {
             hash: hash.to_owned(),
             created_s: 0.0,
             revoked_s: None,
+            scope: KeyScope::Admin,
+            expires_s: None,
+            requests_per_s: None,
         }
     }
 

@@ -25,13 +25,7 @@ pub(in crate::server) struct Page {
 impl Page {
     /// The maximum number of entries. Errors: `Unprocessable` if it is out of range.
     pub(in crate::server) fn limit(&self) -> Result<usize, ApiError> {
-        let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
-        if (1..=MAX_LIMIT).contains(&limit) {
-            return Ok(limit);
-        }
-        Err(ApiError::Unprocessable(format!(
-            "limit is {limit}; it must be 1 to {MAX_LIMIT}"
-        )))
+        checked_limit(self.limit)
     }
 
     /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`Page::limit`].
@@ -46,4 +40,15 @@ impl Page {
         let next = rest.next().and_then(|_| page.last().map(|last| key(last).to_owned()));
         Ok((page, next))
     }
+}
+
+/// The maximum number of entries of a page. Errors: `Unprocessable` if it is out of range.
+pub(in crate::server) fn checked_limit(limit: Option<usize>) -> Result<usize, ApiError> {
+    let limit = limit.unwrap_or(DEFAULT_LIMIT);
+    if (1..=MAX_LIMIT).contains(&limit) {
+        return Ok(limit);
+    }
+    Err(ApiError::Unprocessable(format!(
+        "limit is {limit}; it must be 1 to {MAX_LIMIT}"
+    )))
 }

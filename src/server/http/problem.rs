@@ -45,6 +45,7 @@ pub(in crate::server) enum ApiError {
     UpgradeRequired,
     Internal(String),
     Unavailable { detail: String, retry_after_s: u64 },
+    TooMany { detail: String, retry_after_s: u64 },
 }
 
 impl ApiError {
@@ -72,6 +73,7 @@ impl ApiError {
             Self::UpgradeRequired => (StatusCode::UPGRADE_REQUIRED, "upgrade-required"),
             Self::Internal(_) => (StatusCode::INTERNAL_SERVER_ERROR, "internal"),
             Self::Unavailable { .. } => (StatusCode::SERVICE_UNAVAILABLE, "unavailable"),
+            Self::TooMany { .. } => (StatusCode::TOO_MANY_REQUESTS, "too-many"),
         }
     }
 
@@ -87,7 +89,8 @@ impl ApiError {
             | Self::TooLarge(detail)
             | Self::UnsupportedMedia(detail)
             | Self::Unprocessable(detail)
-            | Self::Unavailable { detail, .. } => detail,
+            | Self::Unavailable { detail, .. }
+            | Self::TooMany { detail, .. } => detail,
             Self::Unauthorized(detail) => detail.to_owned(),
             Self::MethodNotAllowed => "this path does not support that method; see /openapi.json".to_owned(),
             Self::UpgradeRequired => "this path is a WebSocket; connect with a WebSocket handshake".to_owned(),
@@ -107,7 +110,7 @@ impl IntoResponse for ApiError {
         let mut response = status.into_response();
         let headers = response.headers_mut();
         match &self {
-            Self::Unavailable { retry_after_s, .. } => {
+            Self::Unavailable { retry_after_s, .. } | Self::TooMany { retry_after_s, .. } => {
                 headers.insert(header::RETRY_AFTER, HeaderValue::from(*retry_after_s));
             }
             Self::Unauthorized(_) => {

@@ -33,7 +33,11 @@ pub(super) fn operations(item: &mut PathItem) -> impl Iterator<Item = &mut Opera
 
 /// Adds the errors that the operation does not list itself.
 fn add_common(operation: &mut Operation) {
-    let mut common = vec![("401", "No valid API key; only if authentication is on")];
+    let mut common = vec![
+        ("401", "No valid API key; only if authentication is on"),
+        ("403", "The API key's scope does not include this"),
+        ("429", "The API key's rate limit is reached"),
+    ];
     let parameters = || {
         operation
             .parameters
@@ -89,7 +93,7 @@ fn complete(status: &str, response: &mut Response) {
     {
         response.content.insert("application/problem+json".to_owned(), content);
     }
-    if status == "503" {
+    if ["429", "503"].contains(&status) {
         let seconds = Header::new(utoipa::schema!(u64));
         response.headers.insert("Retry-After".to_owned(), RefOr::T(seconds));
     }

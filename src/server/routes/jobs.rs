@@ -1,5 +1,6 @@
 //! Collection, training and evaluation in the background.
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -12,6 +13,7 @@ use crate::error_text::with_causes;
 use crate::jobs::pipeline::report_key;
 use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use crate::server::http::extract::{Json, Path, Query};
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::store::{LogRow, LossRow};
@@ -33,6 +35,9 @@ pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
 const DEFAULT_LIMIT: usize = 50;
 /// The maximum number of jobs on a page, or of lines of a log in an answer.
 const MAX_LIMIT: usize = 1000;
+
+/// When to try again if a key's share of the queue is full: jobs take minutes.
+const SHARE_RETRY_AFTER_S: u64 = 60;
 
 /// A page of jobs.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -145,17 +150,24 @@ impl From<LossRow> for CurvePoint {
         (status = 413, description = "The body exceeds its limit", body = Problem),
         (status = 415, description = "Content-Type is not JSON", body = Problem),
         (status = 422, description = "Not a valid job; the answer names the field", body = Problem),
+        (status = 429, description = "The key's rate limit, or its share of the job queue, is reached", body = Problem),
         (status = 503, description = "Too many jobs wait", body = Problem),
     )
 )]
-async fn create(State(app): State<App>, headers: HeaderMap, Json(spec): Json<JobSpec>) -> Result<Response, ApiError> {
+async fn create(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    headers: HeaderMap,
+    Json(spec): Json<JobSpec>,
+) -> Result<Response, ApiError> {
     let key = headers
         .get("idempotency-key")
         .map(|key| key.to_str().map(str::to_owned));
     let key = key.transpose().map_err(|_| {
         ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned())
     })?;
-    Ok(accepted(app.jobs().submit(spec, key).await?))
+    let submitter = app.keys().id_of(caller);
+    Ok(accepted(app.jobs().submit_as(&submitter, spec, key).await?))
 }
 
 /// Lists jobs, the newest first.
@@ -332,9 +344,12 @@ impl From<JobError> for ApiError {
             | JobError::Taken { .. }
             | JobError::Occupied { .. }
             | JobError::InUse { .. } => Self::Conflict(error.to_string()),
+            JobError::ShareFull { .. } => Self::TooMany {
+                detail: error.to_string(),
+                retry_after_s: SHARE_RETRY_AFTER_S,
+            },
             JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            JobError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
-            JobError::Versions(ref versions) if versions.is_unavailable() => Self::unavailable(with_causes(&error)),
+            _ if error.is_unavailable() => Self::unavailable(with_causes(&error)),
             JobError::Record { .. }
             | JobError::Instance(_)
             | JobError::Threads(_)
