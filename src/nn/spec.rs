@@ -123,6 +123,11 @@ impl PredictorOutput {
     pub(crate) fn residual() -> Self {
         Self::Residual
     }
+
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+    fn is_residual(&self) -> bool {
+        *self == Self::Residual
+    }
 }
 
 named_enum!(
@@ -195,7 +200,10 @@ pub struct ModelSpec {
     /// How the context frames are reconstructed.
     pub reconstruction: Reconstruction,
     /// What the predictor gives at each step; not used by the flow network.
-    #[serde(default = "PredictorOutput::residual")]
+    #[serde(
+        default = "PredictorOutput::residual",
+        skip_serializing_if = "PredictorOutput::is_residual"
+    )]
     pub predictor_output: PredictorOutput,
     /// The inputs of a prediction besides the context frames.
     pub conditioning: Conditioning,
