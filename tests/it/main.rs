@@ -6,6 +6,7 @@ mod architecture;
 mod asyncapi;
 mod backup;
 mod browser;
+mod calibration;
 mod cli;
 mod client;
 mod config;
