@@ -39,7 +39,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
 
     std::fs::create_dir_all(&out)?;
-    for (number, frame) in (1..).zip(predict(&model, &[&input])?.concat()) {
+    let rollout = predict(&model, &[&input])?.remove(0);
+    for (number, frame) in (1..).zip(rollout.frames) {
         let path = out.join(format!("predicted-{number}.png"));
         std::fs::write(&path, codec::encode_png(&frame)?)?;
         println!("{}", path.display());

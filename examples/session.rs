@@ -37,7 +37,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let plan = vec![recording.actions[i].clone(); horizon];
         let conditioning = ConditioningInput::for_model(&model, Some(&plan), Some(&recording.states[i]))?;
         let prediction = session.predict_next(&model, frame, &conditioning)?;
-        predicted = prediction.and_then(|frames| frames.into_iter().next());
+        predicted = prediction.and_then(|rollout| rollout.frames.into_iter().next());
     }
     println!(
         "the session holds {} frames of context",

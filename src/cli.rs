@@ -2,6 +2,7 @@
 //! code 1: it failed. Exit code 130: it was interrupted.
 
 mod backup;
+mod calibrate;
 mod collect;
 mod config;
 mod error;
@@ -58,6 +59,8 @@ enum Command {
     Train(train::TrainArgs),
     /// Measure a model on trials that it was not trained on
     Evaluate(evaluate::EvaluateArgs),
+    /// Measure which errors to expect of a model's predictions
+    Calibrate(calibrate::CalibrateArgs),
     /// Predict the frames that follow the images in a directory
     Predict(predict::PredictArgs),
     /// Serve models over HTTP and WebSocket (the default command)
@@ -105,6 +108,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Predict(args) => predict::run(&args),
         Command::Serve(args) => serve::run(&args),
         Command::Publish(args) => publish::run(&args),

@@ -6,9 +6,12 @@
 pub mod actions;
 pub mod baselines;
 pub mod bootstrap;
+mod calibrate;
+mod cholesky;
 pub mod compatible;
 mod error;
 pub mod figures;
+mod forecast;
 pub mod inference;
 mod markdown;
 pub mod metrics;
@@ -18,12 +21,14 @@ pub mod report;
 mod samples;
 pub mod score;
 pub mod skill;
+pub mod uncertainty;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::calibrate::{calibrate, calibrate_trained};
 pub use self::error::EvaluationError;
 pub use self::output::{prepare, write};
 pub use self::report::EvaluationReport;
@@ -32,6 +37,7 @@ pub use self::samples::figure_inputs;
 use self::baselines::{Baselines, Method};
 use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
+use self::uncertainty::NoveltyScores;
 use crate::dataset::Dataset;
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::nn::{Architecture, ModelSpec};
@@ -79,6 +85,8 @@ pub struct EvaluateConfig<'a> {
     pub batch: usize,
     /// Models trained with the same budget without the action, without the state or without both, for the action table.
     pub twins: Vec<&'a LoadedModel>,
+    /// Other data sets, which the model's novelty must tell from the scored windows.
+    pub novel: Vec<&'a Dataset>,
     /// The command line, for the stamp.
     pub command: String,
     /// Set by another thread to stop the evaluation.
@@ -96,6 +104,7 @@ impl Default for EvaluateConfig<'_> {
             seed: Seed(0),
             batch: 64,
             twins: Vec::new(),
+            novel: Vec::new(),
             command: String::new(),
             cancelled: None,
         }
@@ -117,6 +126,24 @@ impl EvaluateConfig<'_> {
         }
         Ok(())
     }
+
+    /// What a pass over this split needs besides its windows.
+    fn watched<'a>(
+        &'a self,
+        split: Split,
+        on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
+    ) -> EvaluationContext<'a> {
+        EvaluationContext {
+            split,
+            batch: self.batch,
+            bootstrap: Bootstrap {
+                samples: self.bootstrap_samples,
+                seed: self.seed,
+            },
+            on_progress,
+            cancelled: self.cancelled,
+        }
+    }
 }
 
 /// What is being computed.
@@ -128,6 +155,8 @@ pub enum EvaluationStage {
     Actions,
     /// Plan identification.
     Plans,
+    /// Expected errors and novelty.
+    Calibration,
 }
 
 impl EvaluationStage {
@@ -138,6 +167,7 @@ impl EvaluationStage {
             Self::Scores => "scores",
             Self::Actions => "actions",
             Self::Plans => "plans",
+            Self::Calibration => "calibration",
         }
     }
 }
@@ -212,30 +242,47 @@ pub fn run(
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
     }
-    let mut sets = Vec::new();
+    let (mut sets, mut own_novelty) = (Vec::new(), Vec::new());
     for &split in tests {
-        let watched = EvaluationContext {
-            split,
-            batch: config.batch,
-            bootstrap: Bootstrap {
-                samples: config.bootstrap_samples,
-                seed: config.seed,
-            },
-            on_progress,
-            cancelled: config.cancelled,
-        };
-        let outcome = score_split(loaded, (dataset, &splits), config, &baselines, &watched)?;
+        let watched = config.watched(split, on_progress);
+        let (outcome, novelty) = score_split(loaded, (dataset, &splits), config, &baselines, &watched)?;
         sets.push(SetReport {
             split: split.name().to_owned(),
             outcome,
         });
+        // Other data sets are compared with the first set that was scored.
+        if own_novelty.is_empty() {
+            own_novelty = novelty;
+        }
     }
     Ok(EvaluationReport {
+        novelty: compare_novelty(loaded, config, &own_novelty, on_progress)?,
         stamp: ReportStamp::new(loaded, dataset, split_seed, config, started.elapsed()),
         model: ModelSummary::of(loaded),
         sets,
         figures: Vec::new(),
     })
+}
+
+/// How well novelty tells the other data sets from the windows with the novelty `own`.
+fn compare_novelty(
+    loaded: &LoadedModel,
+    config: &EvaluateConfig,
+    own: &[f64],
+    on_progress: &(dyn Fn(EvaluationProgress) + Sync),
+) -> Result<Vec<NoveltyScores>, EvaluationError> {
+    let Some(calibration) = &loaded.manifest.calibration else {
+        return match config.novel.first() {
+            Some(_) => Err(EvaluationError::NotCalibrated {
+                model: loaded.manifest.name.clone(),
+            }),
+            None => Ok(Vec::new()),
+        };
+    };
+    let watched = config.watched(Split::Test, on_progress);
+    let compare =
+        |other: &&Dataset| uncertainty::compare(loaded, calibration, (other, own, config.max_windows), &watched);
+    config.novel.iter().map(compare).collect()
 }
 
 /// The windows that a model of that specification takes.
@@ -246,13 +293,14 @@ fn window_shape(spec: &ModelSpec) -> WindowShape {
     }
 }
 
+/// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
     loaded: &LoadedModel,
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
     baselines: &Baselines,
     watched: &EvaluationContext,
-) -> Result<SetOutcome, EvaluationError> {
+) -> Result<(SetOutcome, Vec<f64>), EvaluationError> {
     let spec = loaded.model.spec();
     let available = splits.windows(dataset, watched.split, window_shape(spec), config.stride)?;
     if available.is_empty() {
@@ -261,9 +309,8 @@ fn score_split(
             Split::UnseenGains => "the data set has no trials with held-out gains",
             _ => "the split has no trials; collect more",
         };
-        return Ok(SetOutcome::Skipped {
-            reason: reason.to_owned(),
-        });
+        let reason = reason.to_owned();
+        return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
     let windows = score::evenly(&available, config.max_windows);
     let scores = score::score(loaded, dataset, &windows, baselines, watched)?;
@@ -279,5 +326,11 @@ fn score_split(
         scores.actions = Some(actions::table(&errors, &group_of, &watched.bootstrap));
         scores.plans = Some(plans::identify(loaded, dataset, &windows, watched)?);
     }
-    Ok(SetOutcome::Scored(Box::new(scores)))
+    let mut novelty = Vec::new();
+    if let Some(calibration) = &loaded.manifest.calibration {
+        let (measured, found) = uncertainty::measure(loaded, calibration, (dataset, &windows), watched)?;
+        scores.uncertainty = Some(measured);
+        novelty = found;
+    }
+    Ok((SetOutcome::Scored(Box::new(scores)), novelty))
 }

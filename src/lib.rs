@@ -27,7 +27,7 @@
 //!     ..PredictionInput::default()
 //! };
 //! let predictions = predict(&model, &[&input])?;
-//! assert_eq!(predictions[0].len(), model.model.spec().horizon);
+//! assert_eq!(predictions[0].frames.len(), model.model.spec().horizon);
 //! # Ok(())
 //! # }
 //! ```
@@ -93,6 +93,7 @@ pub use nn::{Model, ModelSpec, NnError};
 pub use registry::{LoadedModel, Manifest, RegistryError, load};
 pub use serving::session::{MemoryError, SessionMemory, SessionState};
 pub use serving::{
-    ConditioningInput, InputError, Prediction, PredictionInput, Predictor, PredictorConfig, ServingError, predict,
+    ConditioningInput, InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError,
+    predict,
 };
 pub use types::{Action, RobotState, Seed};

@@ -27,6 +27,7 @@ mod gates;
 #[cfg(test)]
 mod gradient_check;
 pub mod init;
+mod long_futures;
 pub mod loss;
 pub mod lstm;
 pub mod lstm_cell;

@@ -2,11 +2,14 @@
 //! (description and origin). In a directory of models, the name of a model's directory is its name, whatever the manifest
 //! says. [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds and publishes models.
 
+pub mod calibration;
+mod embedded;
 pub mod loader;
 pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
+pub use self::calibration::Calibration;
 pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp};
 use crate::error_text::existing;
@@ -93,8 +96,8 @@ pub fn is_valid_name(name: &str) -> bool {
         && bytes.iter().all(|b| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'-'))
 }
 
-/// Names and directories of the models in a directory, sorted by name. A missing directory contains none. Errors: `Io` if
-/// the directory cannot be listed.
+/// Names and directories of the models in a directory, sorted by name. A missing directory contains none; if it is the
+/// default one, the embedded model stands in for it. Errors: `Io` if the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
     let named = directories(models_dir)?
         .into_iter()
@@ -102,6 +105,7 @@ pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> 
     let mut models: Vec<_> = named
         .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
         .collect();
+    models.extend(embedded::in_place_of(models_dir));
     models.sort();
     Ok(models)
 }
@@ -141,6 +145,9 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     }
     let path = models_dir.join(name);
     if path.join(MANIFEST_FILE).is_file() {
+        return Ok(path);
+    }
+    if let Some((_, path)) = embedded::in_place_of(models_dir).filter(|(embedded, _)| embedded == name) {
         return Ok(path);
     }
     let known = list(models_dir)?.into_iter().map(|(name, _)| name).collect();
@@ -195,6 +202,13 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
 pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
     let mut manifest = manifest::read(model_dir)?;
     merge(&mut manifest.metrics, metrics);
+    write_manifest(model_dir, &manifest)
+}
+
+/// Writes a calibration into a model's manifest, in place of an earlier one. Errors: `Manifest`, `Io`.
+pub fn record_calibration(model_dir: &Path, calibration: Calibration) -> Result<(), RegistryError> {
+    let mut manifest = manifest::read(model_dir)?;
+    manifest.calibration = Some(calibration);
     write_manifest(model_dir, &manifest)
 }
 

@@ -8,6 +8,7 @@ mod input;
 mod local;
 mod meter;
 mod queue;
+mod ranges;
 mod task;
 mod worker;
 
@@ -20,15 +21,16 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use crate::frame::{Frame, FrameError};
+use crate::frame::FrameError;
 use crate::nn::NnError;
 use crate::registry::{LoadedModel, Manifest};
 
 use catalog::Catalog;
-pub use compute::{Features, predict};
+pub use compute::{Features, Rollout, predict};
 pub(crate) use input::check_size;
 pub use input::{InputError, PredictionInput};
 use queue::{ModelLoad, Queue, QueuedTask};
+use ranges::range_warnings;
 pub use session::{SessionMemory, SessionState};
 pub use task::{ConditioningInput, Task};
 pub(crate) use task::{RawConditioning, STEP_FIELDS};
@@ -120,15 +122,17 @@ impl Default for PredictorConfig {
 }
 
 /// Predicted frames and how long they took.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct Prediction {
     /// The model's name.
     pub model: String,
     /// The model's version.
     pub version: u32,
-    /// t+1, t+2, …: as many as the model's horizon.
-    pub frames: Vec<Frame>,
+    /// The predicted frames, with what is known of their errors.
+    pub rollout: Rollout,
+    /// Actions and states out of the range of the training.
+    pub warnings: Vec<String>,
     /// Microseconds in the queue.
     pub queue_us: u64,
     /// Microseconds of computation, of the whole batch.
@@ -141,8 +145,10 @@ pub struct Prediction {
 pub struct TaskOutput {
     /// The features of the task's frames, in order.
     pub features: Vec<Features>,
-    /// The predicted frames, one sequence for each conditioning input of the task, in order.
-    pub predictions: Vec<Vec<Frame>>,
+    /// The predicted frames, one rollout for each conditioning input of the task, in order.
+    pub predictions: Vec<Rollout>,
+    /// Actions and states out of the range of the training.
+    pub warnings: Vec<String>,
     /// Microseconds in the queue.
     pub queue_us: u64,
     /// Microseconds of computation, of whole batches.
@@ -239,7 +245,8 @@ impl Predictor {
         Ok(Prediction {
             model: manifest.name.clone(),
             version: manifest.version,
-            frames: computed.predictions.into_iter().next().unwrap_or_default(),
+            rollout: computed.predictions.into_iter().next().unwrap_or_default(),
+            warnings: computed.warnings,
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
         })
@@ -255,7 +262,10 @@ impl Predictor {
         session: Option<u64>,
     ) -> Result<TaskOutput, ServingError> {
         let deadline = Instant::now() + self.shared.deadline;
-        let mut whole = TaskOutput::default();
+        let mut whole = TaskOutput {
+            warnings: range_warnings(&model.manifest, &task.conditioning_inputs),
+            ..TaskOutput::default()
+        };
         loop {
             let part = task.next_part(self.shared.part_limit);
             let computed = self.compute_part(model, part, session, deadline).await?;

@@ -30,9 +30,11 @@ pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::stage::{StageEnd, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
+use crate::error_text::comma_separated;
 use crate::files::write_atomically;
 use crate::frame::FrameError;
-use crate::nn::{Architecture, ModelSpec, NnError, Parameters};
+use crate::nn::spec::MIN_CHANNEL_STD;
+use crate::nn::{Architecture, Conditioning, ModelSpec, NnError, Parameters};
 use crate::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError, StoredWeights};
 
 /// Largest number of frames from which the codec's initial weights are computed.
@@ -81,6 +83,21 @@ pub enum TrainError {
         /// Frames of a window.
         frames: usize,
     },
+    /// The model takes actions, but the data set has none that change.
+    #[error(
+        "data set \"{dataset}\" has {}; a model with conditioning \"{conditioning}\" learns nothing from them: use a preset \
+         for a standing camera, or model.conditioning=none{}",
+        if *has_actions { "actions that never change (its camera stands still)" } else { "no actions" },
+        if *has_actions { ", or allow it with data.constant_actions=true" } else { "" }
+    )]
+    ConstantActions {
+        /// The data set's name.
+        dataset: String,
+        /// Whether it has actions at all.
+        has_actions: bool,
+        /// What the model takes.
+        conditioning: Conditioning,
+    },
     /// The loss or a gradient became NaN or infinite, or the loss became very large.
     #[error(
         "training diverged in {stage} at step {step}: {what}; the last checkpoint is from step {checkpoint_step}; \
@@ -105,6 +122,21 @@ pub enum TrainError {
         model: String,
         /// The first difference.
         source: NnError,
+    },
+    /// The model to start from takes other units.
+    #[error(
+        "the training cannot start from the model {model:?}: it takes the {kind} [{found}], and the data set has [{expected}]; \
+         the units must be the same"
+    )]
+    OtherUnits {
+        /// The model.
+        model: String,
+        /// `action` or `state`.
+        kind: &'static str,
+        /// What the model takes, with units.
+        found: String,
+        /// What the data set has, with units.
+        expected: String,
     },
     /// A file of the run could not be read or written.
     #[error("could not {action} {}: {source}", path.display())]
@@ -283,8 +315,27 @@ fn initial_parameters(
     Ok(Some(parameters))
 }
 
-/// The weights of another model. Errors: `OtherNetwork` if they do not fit this training's network.
+/// The weights of another model. Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 fn start_parameters(plan: &TrainingPlan<'_>, start: &StoredWeights) -> Result<Parameters, TrainError> {
+    let (from, to) = (&start.manifest.spec, &plan.spec);
+    let used = [
+        ("action", to.action_inputs(), &from.actions, &to.actions),
+        ("state", to.state_inputs(), &from.states, &to.states),
+    ];
+    for (kind, inputs, found, expected) in used {
+        let differ = found
+            .iter()
+            .zip(expected)
+            .any(|(found, expected)| found.unit != expected.unit);
+        if inputs.is_some() && differ {
+            return Err(TrainError::OtherUnits {
+                model: start.manifest.name.clone(),
+                kind,
+                found: comma_separated(found),
+                expected: comma_separated(expected),
+            });
+        }
+    }
     let tensors = start.parameters.snapshot()?;
     Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
         model: start.manifest.name.clone(),
@@ -334,6 +385,7 @@ impl<'a> TrainingPlan<'a> {
         let validation = validation.into_iter().step_by(stride).collect();
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
+        check_actions(config, dataset, &spec)?;
         spec.validate()?;
         let augmentation = Augmentation::new(&config.data, dataset.info(), config.seed)?;
         Ok(Self {
@@ -372,11 +424,26 @@ impl<'a> TrainingPlan<'a> {
             metrics: serde_json::json!({
                 "validation": { "mse": state.best_loss, "step": state.best_step }
             }),
+            calibration: None,
             parameters: self.spec.parameter_count(),
             multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),
             program: ProgramStamp::current(),
         })
     }
+}
+
+/// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.
+fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+    let never_change =
+        spec.action_inputs().is_some() && spec.actions.iter().all(|action| action.std <= MIN_CHANNEL_STD);
+    if !never_change || config.data.constant_actions {
+        return Ok(());
+    }
+    Err(TrainError::ConstantActions {
+        dataset: dataset.info().name.clone(),
+        has_actions: !spec.actions.is_empty(),
+        conditioning: spec.conditioning,
+    })
 }
 
 /// The distinct frames of windows of `length` frames, in increasing order.

@@ -53,6 +53,7 @@ impl Workload {
     /// The stream message with frame `seq`.
     pub(crate) fn frame(&self, seq: u64) -> Message {
         message(&ClientMessage::Frame(FrameMessage {
+            steps: None,
             seq,
             timestamp_us: 0,
             image: ImageBytes(self.images[seq as usize % FRAMES].clone()),

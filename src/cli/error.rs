@@ -118,6 +118,8 @@ impl UsageError for TrainError {
             | Self::Config(_)
             | Self::NotARun(_)
             | Self::OtherRun { .. }
+            | Self::ConstantActions { .. }
+            | Self::OtherUnits { .. }
             | Self::NoWindows { .. } => true,
             Self::Dataset(error) => error.is_usage(),
             Self::Registry(error) => error.is_usage(),
@@ -138,8 +140,11 @@ impl UsageError for EvaluationError {
             | Self::Twin { .. }
             | Self::Setting { .. }
             | Self::NothingHeldOut { .. }
+            | Self::NotCalibrated { .. }
+            | Self::NoContext { .. }
             | Self::OutputExists(_) => true,
             Self::Dataset(error) => error.is_usage(),
+            Self::Registry(error) => error.is_usage(),
             _ => false,
         }
     }

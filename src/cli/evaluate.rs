@@ -6,6 +6,7 @@ use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, print_line, progress::ProgressLine};
+use crate::dataset::Dataset;
 use crate::evaluation::{self, EvaluateConfig, EvaluationReport, Purpose};
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
@@ -34,6 +35,10 @@ pub(super) struct EvaluateArgs {
     /// input is worth; may be given several times
     #[arg(long, value_name = "MODEL")]
     twin: Vec<String>,
+    /// A data set whose frames are unlike those of the training, to test the model's novelty; frames of another size are cropped
+    /// and resized; may be given several times
+    #[arg(long, value_name = "DATASET")]
+    novel_dataset: Vec<PathBuf>,
     /// What to score: the validation split, or the test sets
     #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
     split: SplitChoice,
@@ -79,6 +84,11 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         .unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
     let dataset = args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?;
     let (_, dataset) = workspace.open_dataset(&dataset)?;
+    let novel = args
+        .novel_dataset
+        .iter()
+        .map(|novel| Ok(workspace.open_dataset(novel)?.1))
+        .collect::<Result<Vec<Dataset>, CliError>>()?;
     let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
         purpose: match args.split {
@@ -89,6 +99,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         bootstrap_samples: args.resamples,
         seed: Seed(args.seed),
         twins: twins.iter().collect(),
+        novel: novel.iter().collect(),
         command: command_line(),
         ..EvaluateConfig::default()
     };
@@ -113,6 +124,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     for (split, score) in report.headline().as_object().into_iter().flatten() {
         print_line(format!("{split}: {score}"))?;
     }
+    for other in &report.novelty {
+        print_line(format!("novelty of {}: AUROC {:.3}", other.dataset, other.auroc))?;
+    }
     print_line(out.join("report.md").display())?;
     args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
 }
@@ -132,7 +146,7 @@ fn require_skill(report: &EvaluationReport, least: f64) -> Result<(), CliError> 
 }
 
 /// The scenario that the model was trained on: the default name of its data set.
-fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
+pub(super) fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
     let manifest = &loaded.manifest;
     manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
         CliError::Usage(format!(

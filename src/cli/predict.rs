@@ -16,8 +16,7 @@ use crate::evaluation::figures::{animation, montage};
 use crate::frame::fit::Fit;
 use crate::frame::{Frame, FrameError, codec};
 use crate::nn::ModelSpec;
-use crate::registry::LoadedModel;
-use crate::serving::{self, PredictionInput};
+use crate::serving::{self, PredictionInput, Rollout};
 
 /// Predict the frames that follow the images in a directory.
 ///
@@ -52,6 +51,9 @@ pub(super) struct PredictArgs {
     /// The robot's states and actions; needed by models that take them
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
+    /// How many frames to predict; more than the model's horizon are beyond what it was trained for [default: the horizon]
+    #[arg(long, value_name = "N")]
+    steps: Option<usize>,
     /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
     #[arg(long, value_name = "FIT")]
     fit: Option<Fit>,
@@ -73,23 +75,60 @@ struct Selected {
 pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (_, loaded) = workspace.load_model(&args.model)?;
-    let selected = select(args, &loaded)?;
-    let input = input(args, &loaded, &selected)?;
-    let predicted = serving::predict(&loaded, &[&input])?.remove(0);
+    let spec = loaded.model.spec();
+    let most = workspace.config().server.max_steps.max(spec.horizon);
+    let steps = args.steps.unwrap_or(spec.horizon);
+    if !(1..=most).contains(&steps) {
+        return Err(CliError::Usage(format!(
+            "--steps is {steps}; it must be 1 to {most} (setting max_steps)"
+        )));
+    }
+    let asked = ModelSpec {
+        horizon: steps,
+        ..spec.clone()
+    };
+    let name = &loaded.manifest.name;
+    let selected = select(args, name, &asked)?;
+    let input = input(args, (name, &asked), &selected)?;
+    let rollout = serving::predict(&loaded, &[&input])?.remove(0);
     let output = OutputDirectory::create(&args.out)?;
-    write(&output, loaded.model.spec(), &selected, &predicted)?;
+    write(&output, spec, &selected, &rollout.frames)?;
     output.finish()?;
+    for warning in input.warnings(&loaded.manifest).map_err(CliError::failed)? {
+        print_line(format!("warning: {warning}"))?;
+    }
+    print_trust(&rollout, spec.horizon)?;
     print_line(format!(
-        "{}: {} frames predicted after frame {}, contact-sheet.png, prediction.gif",
+        "{}: {steps} frames predicted after frame {}, contact-sheet.png, prediction.gif",
         args.out.display(),
-        predicted.len(),
         selected.last
     ))
 }
 
-/// Reads the frames up to the last that the model sees, and the true frames after it.
-fn select(args: &PredictArgs, loaded: &LoadedModel) -> Result<Selected, CliError> {
-    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
+/// What is known of the errors of the predicted frames.
+fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
+    if let Some(novelty) = rollout.novelty {
+        print_line(format!(
+            "novelty {novelty:.2} (0: like the training data, 1: unlike all of it)"
+        ))?;
+    }
+    for (step, error) in (1..).zip(&rollout.errors) {
+        print_line(format!(
+            "t+{step}: expected MSE {:.5}, 90 % between {:.5} and {:.5}",
+            error.mse, error.low, error.high
+        ))?;
+    }
+    if rollout.frames.len() > horizon {
+        print_line(format!(
+            "from t+{} on, the frames are beyond what the model was trained for",
+            horizon + 1
+        ))?;
+    }
+    Ok(())
+}
+
+/// `spec` has the frames to predict as its horizon. Reads the frames up to the last that the model sees, and the true frames after it.
+fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, CliError> {
     let mut images = ImageFiles::list(&args.frames, args.fit)?;
     let count = images.count();
     if count < spec.context {
@@ -117,10 +156,15 @@ fn select(args: &PredictArgs, loaded: &LoadedModel) -> Result<Selected, CliError
     })
 }
 
-fn input(args: &PredictArgs, loaded: &LoadedModel, selected: &Selected) -> Result<PredictionInput, CliError> {
-    let (name, spec) = (&loaded.manifest.name, loaded.model.spec());
+/// `spec` has the frames to predict as its horizon.
+fn input(
+    args: &PredictArgs,
+    (name, spec): (&str, &ModelSpec),
+    selected: &Selected,
+) -> Result<PredictionInput, CliError> {
     let mut input = PredictionInput {
         frames: selected.seen.clone(),
+        steps: Some(spec.horizon),
         ..PredictionInput::default()
     };
     if let Some(path) = &args.actions {

@@ -2,9 +2,11 @@
 
 use std::path::PathBuf;
 
+use super::calibrate::not_calibrated;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, interrupt, print_line, progress::ProgressLine};
+use crate::evaluation;
 use crate::registry::StoredWeights;
 use crate::settings::SettingsLayer;
 use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
@@ -12,7 +14,7 @@ use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcom
 /// Train a model on a data set.
 ///
 /// Training has two stages: pretrain (the frame codec alone) and fit (the recurrent network). The weights with the lowest
-/// validation error are kept. A checkpoint is written every few hundred steps and on Ctrl-C; the same command continues from it,
+/// validation error are kept, and the model is calibrated (see `foreframe calibrate`). A checkpoint is written every few hundred steps and on Ctrl-C; the same command continues from it,
 /// and ends with the same weights as without the interruption.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
@@ -88,15 +90,18 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     );
     progress.finish();
     match outcome? {
-        TrainingOutcome::Finished { model_dir, manifest } => print_line(format!(
-            "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
-            model_dir.display(),
-            manifest.parameters,
-            manifest.metrics["validation"],
-            model_dir.display(),
-            dataset_dir.display(),
-            run_dir.display(),
-        )),
+        TrainingOutcome::Finished { model_dir, manifest } => {
+            evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(not_calibrated)?;
+            print_line(format!(
+                "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
+                model_dir.display(),
+                manifest.parameters,
+                manifest.metrics["validation"],
+                model_dir.display(),
+                dataset_dir.display(),
+                run_dir.display(),
+            ))
+        }
         TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
             "stopped in {stage} after step {step}; the checkpoint is in {}, and the same command continues from it",
             run_dir.display()

@@ -2,6 +2,7 @@
 
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use crate::frame::MAX_SIDE_PX;
+use crate::frame::warp::CameraModel;
 
 /// Errors: `Description`.
 pub(super) fn check_description(info: &DatasetInfo) -> Result<(), DatasetError> {
@@ -17,6 +18,9 @@ pub(super) fn check_description(info: &DatasetInfo) -> Result<(), DatasetError> 
             "the frame period is {} s; it must be a finite number above 0",
             info.frame_period_s
         )));
+    }
+    if let Some(Err(error)) = info.camera.as_ref().map(CameraModel::validate) {
+        return Err(DatasetError::Description(error.to_string()));
     }
     Ok(())
 }

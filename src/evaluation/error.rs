@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use crate::dataset::DatasetError;
 use crate::frame::FrameError;
 use crate::nn::NnError;
+use crate::registry::RegistryError;
 use crate::sim::SimError;
 use crate::types::ValueError;
 
@@ -108,6 +109,20 @@ pub enum EvaluationError {
         /// First frame of the window.
         frame: usize,
     },
+    /// The model has no calibration, which the comparison needs.
+    #[error("model \"{model}\" is not calibrated, so it has no novelty; run `foreframe calibrate` first")]
+    NotCalibrated {
+        /// The model's name.
+        model: String,
+    },
+    /// No recording is as long as the model's context.
+    #[error("data set \"{dataset}\" has no recording of {context} frames or more, which the model's context takes")]
+    NoContext {
+        /// The data set's name.
+        dataset: String,
+        /// Frames of the context.
+        context: usize,
+    },
     /// Another thread stopped it.
     #[error("the evaluation was cancelled")]
     Cancelled,
@@ -142,6 +157,9 @@ pub enum EvaluationError {
     /// An action of the data set is no action.
     #[error(transparent)]
     Action(ValueError),
+    /// The model's files are not usable.
+    #[error(transparent)]
+    Registry(#[from] RegistryError),
     /// The network refused its input.
     #[error(transparent)]
     Network(#[from] NnError),

@@ -6,8 +6,9 @@ use rayon::prelude::*;
 use super::EvaluationError;
 use crate::dataset::{Dataset, Window};
 use crate::frame::Frame;
+use crate::frame::fit::{Fit, fit};
 use crate::frame::preprocess::Preprocess;
-use crate::nn::{ConditioningTensors, ModelSpec};
+use crate::nn::{ConditioningTensors, Feedback, ModelSpec};
 use crate::registry::LoadedModel;
 
 /// Which future actions the model gets.
@@ -100,6 +101,68 @@ pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) 
         return Ok(Vec::new());
     };
     values(&model.decode_frames(&features.reshape((batch * context, spec.code_len()))?)?)
+}
+
+/// A batch of windows with the codes behind the frames, one window after another.
+pub(super) struct PredictedCodes {
+    /// Codes of the frames seen.
+    pub(super) seen: Vec<f32>,
+    /// Codes of the predicted frames.
+    pub(super) codes: Vec<f32>,
+    /// The predicted frames in the model's space, not clamped.
+    pub(super) frames: Vec<f32>,
+    /// The actions in their own units; empty if the model takes none.
+    pub(super) actions: Vec<f32>,
+}
+
+/// As [`predict`], with the codes. Errors: those of the network.
+pub(super) fn predict_with_codes(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    source: ActionSource,
+) -> Result<PredictedCodes, EvaluationError> {
+    let (model, spec) = (&loaded.model, loaded.model.spec());
+    let (batch, code) = (windows.len(), spec.code_len());
+    let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
+    let seen = encode(loaded, &inputs)?;
+    let condition = condition(spec, dataset, windows, source)?;
+    let contexts = Tensor::from_slice(&seen, (batch, spec.context, code), &Device::Cpu)?;
+    let codes = model.predict(&contexts, &condition, Feedback::Prediction)?;
+    let frames = model.decode_frames(&codes.reshape((batch * spec.horizon, code))?)?;
+    Ok(PredictedCodes {
+        seen,
+        codes: values(&codes)?,
+        frames: values(&frames)?,
+        actions: condition.actions.as_ref().map(values).transpose()?.unwrap_or_default(),
+    })
+}
+
+/// Codes of frames in the model's space, both one after another. Errors: those of the network.
+pub(super) fn encode(loaded: &LoadedModel, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
+    let pixels = loaded.model.spec().pixels();
+    let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
+    values(&loaded.model.encode_frames(&frames)?)
+}
+
+/// Frames of a data set of any size in the model's space, one after another. Another size is cropped and resized.
+pub(super) fn fitted_frames(
+    dataset: &Dataset,
+    spec: &ModelSpec,
+    frames: &[usize],
+) -> Result<Vec<f32>, EvaluationError> {
+    let info = dataset.info();
+    let mut all = Vec::with_capacity(frames.len() * spec.pixels());
+    for &frame in frames {
+        let frame = Frame::new(
+            info.frame_width_px,
+            info.frame_height_px,
+            dataset.pixels(frame).to_vec(),
+        )?;
+        let frame = fit(&frame, spec.frame_width_px, spec.frame_height_px, Fit::Crop)?;
+        all.extend(spec.preprocess.forward(&frame));
+    }
+    Ok(all)
 }
 
 fn values(tensor: &Tensor) -> Result<Vec<f32>, EvaluationError> {

@@ -1,5 +1,7 @@
 //! The report in Markdown.
 
+mod uncertainty;
+
 use std::fmt::Write;
 
 use super::Purpose;
@@ -33,6 +35,7 @@ fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result
             set_section(out, scores)?;
         }
     }
+    uncertainty::novelty_section(out, &report.novelty)?;
     figures(out, report)?;
     how(out)?;
     model(out, &report.model)?;
@@ -168,7 +171,9 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
         Some(table) => action_table(out, table)?,
         None => writeln!(out, "\nThe model takes no actions, so there is no action table.")?,
     }
-    scores.plans.as_ref().map_or(Ok(()), |plans| plan_section(out, plans))
+    scores.plans.as_ref().map_or(Ok(()), |plans| plan_section(out, plans))?;
+    let uncertainty = scores.uncertainty.as_ref();
+    uncertainty.map_or(Ok(()), |scores| uncertainty::section(out, scores))
 }
 
 fn plan_section(out: &mut String, plans: &PlanOutcome) -> std::fmt::Result {

@@ -12,6 +12,7 @@ use super::figures::FigureFile;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
 use super::skill::{Skill, skill};
+use super::uncertainty::{NoveltyScores, UncertaintyScores};
 use super::{EvaluateConfig, Purpose, markdown};
 use crate::dataset::{Dataset, Window};
 use crate::registry::{DatasetStamp, LoadedModel, ProgramStamp};
@@ -26,6 +27,9 @@ pub struct EvaluationReport {
     pub model: ModelSummary,
     /// The test sets, or the validation split.
     pub sets: Vec<SetReport>,
+    /// How well the model's novelty tells other data sets from its own; empty if none were given.
+    #[serde(default)]
+    pub novelty: Vec<NoveltyScores>,
     /// The pictures in the same directory; filled in when they are written.
     pub figures: Vec<FigureFile>,
 }
@@ -60,6 +64,7 @@ impl EvaluationReport {
                 "ssim": model.ssim.mean,
                 "mover_mse": model.mover_mse.as_ref().map(|mse| mse.mean),
                 "plan_identification": scores.plan_rate(),
+                "band_90_coverage": scores.uncertainty.as_ref().map(|scores| scores.coverage.mean),
                 "windows": scores.windows,
                 "trials": scores.trials,
                 "dataset_content_hash": self.stamp.dataset_content_hash,
@@ -247,6 +252,9 @@ pub struct SetScores {
     /// How often plans are identified by their predictions. Absent for a model that takes no actions.
     #[serde(default)]
     pub plans: Option<PlanOutcome>,
+    /// How well the expected errors fit. Absent for a model without calibration.
+    #[serde(default)]
+    pub uncertainty: Option<UncertaintyScores>,
     /// The windows that the figures show.
     pub samples: Vec<SampleWindow>,
 }
@@ -267,6 +275,7 @@ impl SetScores {
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
             actions: None,
             plans: None,
+            uncertainty: None,
             samples: SampleWindow::choose(windows),
         }
     }

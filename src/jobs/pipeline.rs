@@ -192,6 +192,8 @@ impl Pipeline {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
+                report.progress(steps, steps, "calibrating");
+                evaluation::calibrate_trained(&model_dir, &dataset, cancelled).map_err(|error| failed(&error))?;
                 report.progress(steps, steps, "publishing");
                 let written =
                     patience.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;

@@ -78,6 +78,15 @@ impl DenseModel {
         })
     }
 
+    /// The same network for another number of steps.
+    pub(super) fn with_horizon(&self, horizon: usize) -> Self {
+        let spec = ModelSpec {
+            horizon,
+            ..self.spec.clone()
+        };
+        Self { spec, ..self.clone() }
+    }
+
     /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`. Errors: `Shape`.
     pub(super) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;

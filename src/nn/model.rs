@@ -5,6 +5,7 @@ use candle_core::Tensor;
 use super::autoencoder::{DenseModel, Feedback};
 use super::conditioned::ConditioningTensors;
 use super::flow::{FlowModel, FlowPrediction, Layers};
+use super::long_futures;
 use super::{Architecture, ModelSpec, NnError, Parameters};
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
@@ -137,6 +138,27 @@ impl Model {
         match &self.network {
             Network::Dense(dense) => dense.predict_futures(codes, windows, conditioning),
             Network::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
+        }
+    }
+
+    /// As [`Model::predict_futures`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
+    /// horizon the frames are those of [`Model::predict_futures`] with the last action held. Beyond it, which no training saw,
+    /// the dense network goes on step by step; the flow network starts again from the frames that it predicted.
+    /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    pub fn predict_steps(
+        &self,
+        codes: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<Tensor, NnError> {
+        if steps == self.spec.horizon {
+            return self.predict_futures(codes, windows, conditioning);
+        }
+        self.check_windows(codes)?;
+        match &self.network {
+            Network::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
+            Network::Flow(flow) => long_futures::predict(flow, &self.spec, (codes, windows, conditioning), steps),
         }
     }
 

@@ -73,6 +73,21 @@ impl StateChannels {
         self.measured[1].map(|channel| state[channel])
     }
 
+    /// Moves a state on: its pose by the motion, its speeds to those of the last action. Other channels stay.
+    pub(super) fn advance(self, state: &mut [f32], motion: [f32; 3], action: &[f32]) {
+        if let Some([x, y, cos, sin]) = self.pose {
+            let pose = self.pose_in(state).moved(motion);
+            state[x] = pose.x;
+            state[y] = pose.y;
+            (state[sin], state[cos]) = pose.heading.sin_cos();
+        }
+        for (measured, commanded) in self.measured.into_iter().zip(self.commanded) {
+            if let (Some(measured), Some(commanded)) = (measured, commanded) {
+                state[measured] = action[commanded];
+            }
+        }
+    }
+
     /// Yaw, ahead and left at each step, from the plain integral of the speeds.
     fn integral(self, rows: &FutureRows, row: usize, period_s: f32) -> Vec<f32> {
         let (state, actions) = (rows.state(row), rows.actions(row));

@@ -1,6 +1,7 @@
 //! Loads a model from its files. Hash, tensor names and shapes are checked before the model is built. Other programs that
 //! read safetensors can load the same file; `models/README.md` lists the tensors.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
@@ -8,7 +9,7 @@ use std::sync::Arc;
 use candle_core::{DType, Device, Tensor};
 
 use super::manifest::{self, Manifest};
-use super::{RegistryError, WEIGHTS_FILE};
+use super::{RegistryError, WEIGHTS_FILE, embedded};
 use crate::files::sha256_hex;
 use crate::nn::{Model, NnError, Parameters};
 
@@ -50,18 +51,10 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
 pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let manifest = manifest::read(model_dir)?;
     let path = model_dir.join(WEIGHTS_FILE);
-    let read_failed = |source| RegistryError::Io {
-        action: "read",
-        path: path.clone(),
-        source,
+    let bytes = match embedded::weights(model_dir) {
+        Some(bytes) => Cow::Borrowed(bytes),
+        None => Cow::Owned(read_weights(&path)?),
     };
-    let size = std::fs::metadata(&path).map_err(read_failed)?.len();
-    if size > MAX_WEIGHTS_BYTES {
-        return Err(read_failed(std::io::Error::other(format!(
-            "the file has {size} bytes; at most {MAX_WEIGHTS_BYTES} are allowed"
-        ))));
-    }
-    let bytes = std::fs::read(&path).map_err(read_failed)?;
     let found = sha256_hex(&bytes);
     if found != manifest.weights_sha256 {
         return Err(RegistryError::Hash {
@@ -78,6 +71,22 @@ pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect())
         .map_err(|source| RegistryError::Weights { path, source })?;
     Ok(StoredWeights { manifest, parameters })
+}
+
+/// The bytes of a weights file. Errors: `Io`, also if it is too large.
+fn read_weights(path: &Path) -> Result<Vec<u8>, RegistryError> {
+    let read_failed = |source| RegistryError::Io {
+        action: "read",
+        path: path.to_owned(),
+        source,
+    };
+    let size = std::fs::metadata(path).map_err(read_failed)?.len();
+    if size > MAX_WEIGHTS_BYTES {
+        return Err(read_failed(std::io::Error::other(format!(
+            "the file has {size} bytes; at most {MAX_WEIGHTS_BYTES} are allowed"
+        ))));
+    }
+    std::fs::read(path).map_err(read_failed)
 }
 
 /// As [`load`], under another name than the manifest's. Errors: as [`load`].

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{MANIFEST_FILE, RegistryError};
+use super::{Calibration, MANIFEST_FILE, RegistryError, embedded};
 use crate::nn::ModelSpec;
 use crate::types::Seed;
 
@@ -33,6 +33,9 @@ pub struct Manifest {
     pub training: serde_json::Value,
     /// Scores by name: of the validation split after training, of the test splits after an evaluation.
     pub metrics: serde_json::Value,
+    /// What the validation split says about the errors of its predictions; absent if the model was never calibrated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<Calibration>,
     /// Number of trained parameters.
     pub parameters: u64,
     /// Multiply–add operations per predicted frame. The cost of encoding the context is divided by the horizon.
@@ -82,6 +85,9 @@ impl ProgramStamp {
 /// Reads the manifest in a model's directory. Errors: `Io`, `Manifest`.
 pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
     let path = model_dir.join(MANIFEST_FILE);
+    if let Some(text) = embedded::manifest(model_dir) {
+        return serde_json::from_slice(text).map_err(|source| RegistryError::Manifest { path, source });
+    }
     let failed = |source| RegistryError::Io {
         action: "read",
         path: path.clone(),

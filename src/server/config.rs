@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::jobs::JobLimits;
 use crate::jobs::child::JobProcess;
+use crate::nn::spec::MAX_STEPS;
 use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
 
@@ -87,6 +88,8 @@ pub struct ServerConfig {
     pub max_candidates: usize,
     /// Maximum size of the predicted images of one rollout request, in bytes before encoding.
     pub max_rollout_bytes: usize,
+    /// Maximum number of frames that a request can ask to predict, if that is more than the model's horizon.
+    pub max_steps: usize,
     /// Maximum number of jobs that wait; more are refused with 503.
     pub max_queued_jobs: usize,
     /// Maximum number of ended jobs in the list; older ones are removed.
@@ -178,6 +181,7 @@ impl Default for ServerConfig {
             max_stream_buffer_bytes: 4 << 20,
             max_candidates: 512,
             max_rollout_bytes: 64 << 20,
+            max_steps: 50,
             max_queued_jobs: 16,
             max_ended_jobs: 100,
             max_job_log_lines: 1000,
@@ -281,6 +285,7 @@ impl ServerConfig {
                 1024..=1 << 30,
             ),
             ("max_candidates", self.max_candidates as u64, 1..=100_000),
+            ("max_steps", self.max_steps as u64, 1..=MAX_STEPS as u64),
             ("max_rollout_bytes", self.max_rollout_bytes as u64, 1024..=1 << 32),
             ("max_queued_jobs", self.max_queued_jobs as u64, 1..=10_000),
             ("max_ended_jobs", self.max_ended_jobs as u64, 1..=10_000),
@@ -376,11 +381,12 @@ mod tests {
     #[test]
     fn no_bound_of_a_session_may_be_zero() {
         type Field = fn(&mut ServerConfig);
-        let fields: [(&str, Field); 6] = [
+        let fields: [(&str, Field); 7] = [
             ("max_sessions", |config| config.max_sessions = 0),
             ("max_pipelined_frames", |config| config.max_pipelined_frames = 0),
             ("max_stream_buffer_bytes", |config| config.max_stream_buffer_bytes = 0),
             ("max_candidates", |config| config.max_candidates = 0),
+            ("max_steps", |config| config.max_steps = 0),
             ("max_rollout_bytes", |config| config.max_rollout_bytes = 0),
             ("session_grace_ms", |config| config.session_grace_ms = 0),
         ];

@@ -1,5 +1,6 @@
 //! The computation: frames to tensors, through the model, and back to frames. Blocks; runs on the inference thread.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
@@ -9,6 +10,7 @@ use crate::frame::Frame;
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
+use crate::registry::calibration::{ContextStatistics, ExpectedError, PredictedFuture};
 use crate::types::{Action, RobotState};
 
 /// The features of one frame, `[F]`.
@@ -22,13 +24,40 @@ const DECODED_FRAMES: usize = 1024;
 pub(super) struct BatchOutput {
     /// The features of the task's frames, in order.
     pub(super) features: Vec<Features>,
-    /// The predicted frames, one sequence for each conditioning input of the task, in order.
-    pub(super) predictions: Vec<Vec<Frame>>,
+    /// The rollouts, one for each conditioning input of the task, in order.
+    pub(super) predictions: Vec<Rollout>,
+}
+
+/// One predicted future.
+#[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub struct Rollout {
+    /// t+1, t+2, …
+    pub frames: Vec<Frame>,
+    /// The errors to expect of the frames up to the model's horizon; empty if the model is not calibrated.
+    pub errors: Vec<ExpectedError>,
+    /// How unlike the training data the context is, 0…1: the share of validation contexts that are nearer to it; `None` if the
+    /// model is not calibrated.
+    pub novelty: Option<f32>,
+}
+
+impl Rollout {
+    /// The error to expect of each frame that the calibration covers.
+    #[must_use]
+    pub fn expected_mse(&self) -> Vec<f32> {
+        self.errors.iter().map(|error| error.mse).collect()
+    }
+
+    /// The lower and the upper end of each 90 % band.
+    #[must_use]
+    pub fn mse_bands(&self) -> Vec<[f32; 2]> {
+        self.errors.iter().map(|error| [error.low, error.high]).collect()
+    }
 }
 
 /// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
 /// `Model`, `Tensor`, `Frame`.
-pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Vec<Frame>>, ServingError> {
+pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
         .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
@@ -102,27 +131,113 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
     .map_err(tensor_error)
 }
 
-/// The predicted frames for each conditioning input. `values` holds the features of all windows, one after the other;
-/// `window_of` is the index of the window of each conditioning input.
+/// The rollout of each conditioning input. `values` holds the features of all windows, one after the other; `window_of` is the
+/// index of the window of each conditioning input. Rollouts of the same number of steps are computed together.
 fn predict_windows(
     loaded: &LoadedModel,
     values: Vec<f32>,
     window_of: &[u32],
     conditioning_inputs: &[&ConditioningInput],
-) -> Result<Vec<Vec<Frame>>, ServingError> {
+) -> Result<Vec<Rollout>, ServingError> {
     let spec = loaded.model.spec();
-    let count = values.len() / (spec.context * spec.code_len());
-    let features =
-        Tensor::from_vec(values, (count, spec.context, spec.code_len()), &Device::Cpu).map_err(tensor_error)?;
-    let predicted = loaded
-        .model
-        .predict_futures(&features, window_of, &condition(spec, conditioning_inputs)?)
-        .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
-        .map_err(|source| model_error(loaded, source))?;
-    let total = conditioning_inputs.len() * spec.horizon;
+    let contexts = match &loaded.manifest.calibration {
+        Some(_) => ContextStatistics::of_codes(&loaded.model, &values, spec.context)
+            .map_err(|source| model_error(loaded, source))?,
+        None => Vec::new(),
+    };
+    let windows = Windows {
+        loaded,
+        contexts,
+        values,
+    };
+    let mut rollouts = vec![Rollout::default(); conditioning_inputs.len()];
+    let steps: BTreeSet<usize> = conditioning_inputs.iter().map(|input| input.steps(spec)).collect();
+    for steps in steps {
+        let same = |place: &usize| conditioning_inputs[*place].steps(spec) == steps;
+        let places: Vec<usize> = (0..conditioning_inputs.len()).filter(same).collect();
+        let rows: Vec<(u32, &ConditioningInput)> = places
+            .iter()
+            .map(|&place| (window_of[place], conditioning_inputs[place]))
+            .collect();
+        for (place, rollout) in places.into_iter().zip(windows.rollouts(&rows, steps)?) {
+            rollouts[place] = rollout;
+        }
+    }
+    Ok(rollouts)
+}
+
+/// The contexts of a batch.
+struct Windows<'a> {
+    loaded: &'a LoadedModel,
+    /// Empty if the model is not calibrated.
+    contexts: Vec<ContextStatistics>,
+    /// The features of all windows `[windows, context, F]`.
+    values: Vec<f32>,
+}
+
+impl Windows<'_> {
+    /// Rollouts of so many steps: the window and the conditioning input of each.
+    fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
+        let (loaded, spec) = (self.loaded, self.loaded.model.spec());
+        let (context, code) = (spec.context, spec.code_len());
+        let count = self.values.len() / (context * code);
+        let features = Tensor::from_slice(&self.values, (count, context, code), &Device::Cpu).map_err(tensor_error)?;
+        let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
+        let codes = loaded
+            .model
+            .predict_steps(&features, &window_of, &condition(spec, &inputs, steps)?, steps)
+            .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
+            .map_err(|source| model_error(loaded, source))?;
+        let mut frames = decode(loaded, &codes, rows.len() * steps)?.into_iter();
+        let frames = rows.iter().map(|_| frames.by_ref().take(steps).collect());
+        let frames: Vec<Vec<Frame>> = frames.collect();
+        with_values(&codes, |codes| {
+            let codes = codes.chunks_exact(steps * code);
+            let futures = rows.iter().zip(codes).zip(frames);
+            futures
+                .map(|((row, codes), frames)| self.rollout(*row, codes, frames))
+                .collect()
+        })
+        .map_err(tensor_error)
+    }
+
+    /// A rollout with what its calibration says of it.
+    fn rollout(&self, (window, input): (u32, &ConditioningInput), codes: &[f32], frames: Vec<Frame>) -> Rollout {
+        let spec = self.loaded.model.spec();
+        let (Some(calibration), Some(context)) =
+            (&self.loaded.manifest.calibration, self.contexts.get(window as usize))
+        else {
+            return Rollout {
+                frames,
+                ..Rollout::default()
+            };
+        };
+        let code = |back: usize| {
+            let place = window as usize * spec.context + spec.context - back.min(spec.context);
+            &self.values[place * spec.code_len()..(place + 1) * spec.code_len()]
+        };
+        let actions: Vec<f32> = input.actions.iter().flat_map(Action::as_slice).copied().collect();
+        let future = PredictedFuture {
+            spec,
+            context,
+            seen: [code(1), code(2)],
+            codes,
+            frames: &frames,
+            actions: &actions,
+        };
+        Rollout {
+            errors: future.expected_errors(calibration),
+            novelty: Some(calibration.novelty.novelty(context)),
+            frames,
+        }
+    }
+}
+
+/// The frames of `total` predicted codes.
+fn decode(loaded: &LoadedModel, codes: &Tensor, total: usize) -> Result<Vec<Frame>, ServingError> {
     let mut frames = Vec::with_capacity(total);
     for first in (0..total).step_by(DECODED_FRAMES) {
-        let part = predicted
+        let part = codes
             .narrow(0, first, DECODED_FRAMES.min(total - first))
             .map_err(tensor_error)?;
         let pixels = loaded
@@ -131,11 +246,7 @@ fn predict_windows(
             .map_err(|source| model_error(loaded, source))?;
         frames.extend(with_values(&pixels, |values| images(loaded, values)).map_err(tensor_error)??);
     }
-    let mut frames = frames.into_iter();
-    Ok(conditioning_inputs
-        .iter()
-        .map(|_| frames.by_ref().take(spec.horizon).collect())
-        .collect())
+    Ok(frames)
 }
 
 fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
@@ -151,10 +262,11 @@ fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingErr
     })
 }
 
-/// Actions `[N, horizon, A]` and states `[N, S]` in physical units, if the model takes them.
+/// Actions `[N, steps, A]` and states `[N, S]` in physical units, if the model takes them.
 fn condition(
     spec: &ModelSpec,
     conditioning_inputs: &[&ConditioningInput],
+    steps: usize,
 ) -> Result<ConditioningTensors, ServingError> {
     let actions = conditioning_inputs
         .iter()
@@ -173,7 +285,7 @@ fn condition(
     Ok(ConditioningTensors {
         actions: tensor(
             actions.copied().collect(),
-            &[conditioning_inputs.len(), spec.horizon, spec.actions.len()],
+            &[conditioning_inputs.len(), steps, spec.actions.len()],
         )?,
         state: tensor(
             states.copied().collect(),

@@ -1,8 +1,10 @@
 //! The input of a prediction, and the check that it fits a model.
 
+use super::ranges::range_warnings;
 use super::task::{ConditioningInput, REQUEST_FIELDS, RawConditioning, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
+use crate::registry::Manifest;
 use crate::types::{Action, RobotState};
 
 /// Why an input does not fit a model. Names the field.
@@ -55,6 +57,12 @@ pub enum InputError {
         /// Actions needed.
         expected: usize,
     },
+    /// No or too many frames to predict.
+    #[error("steps is {found}; it must be 1 to {most}", most = crate::nn::spec::MAX_STEPS)]
+    Steps {
+        /// Frames asked for.
+        found: usize,
+    },
     /// A vector has the wrong length.
     #[error("{field} holds {found} numbers; model \"{model}\" takes {expected}: {channels}")]
     Dimension {
@@ -99,6 +107,8 @@ pub struct PredictionInput {
     pub state: Option<RobotState>,
     /// The plan: the first action acts from the last frame to the first predicted one.
     pub future_actions: Option<Vec<Action>>,
+    /// Frames to predict; the model's horizon if absent. More are beyond what the model was trained for.
+    pub steps: Option<usize>,
 }
 
 impl PredictionInput {
@@ -139,8 +149,16 @@ impl PredictionInput {
             past: &self.actions,
             future: self.future_actions.as_deref(),
             state: self.state.as_ref(),
+            steps: self.steps,
         };
         ConditioningInput::new(raw, &REQUEST_FIELDS, model, spec)
+    }
+
+    /// What in the input is out of the range that the model saw in training; nothing if the manifest has no ranges.
+    /// Errors: as [`PredictionInput::check`].
+    pub fn warnings(&self, manifest: &Manifest) -> Result<Vec<String>, InputError> {
+        let conditioning = self.conditioning(&manifest.name, &manifest.spec)?;
+        Ok(range_warnings(manifest, &[conditioning]))
     }
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].

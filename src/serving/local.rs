@@ -1,10 +1,11 @@
 //! Predictions on the caller's own thread, for a program that has one camera and one model and needs no [`super::Predictor`].
 
 use super::input::check_size;
+use super::ranges::range_warnings;
 use super::task::{REQUEST_FIELDS, RawConditioning};
-use super::{ConditioningInput, InputError, ServingError, SessionState, compute};
+use super::{ConditioningInput, InputError, Rollout, ServingError, SessionState, compute};
 use crate::frame::Frame;
-use crate::registry::LoadedModel;
+use crate::registry::{LoadedModel, Manifest};
 use crate::types::{Action, RobotState};
 
 impl ConditioningInput {
@@ -20,8 +21,15 @@ impl ConditioningInput {
             past: &[],
             future: future_actions,
             state,
+            steps: None,
         };
         Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.model.spec())
+    }
+
+    /// What is out of the range that the model saw in training; nothing if its manifest has no ranges.
+    #[must_use]
+    pub fn warnings(&self, manifest: &Manifest) -> Vec<String> {
+        range_warnings(manifest, std::slice::from_ref(self))
     }
 }
 
@@ -34,7 +42,7 @@ impl SessionState {
         loaded: &LoadedModel,
         frame: Frame,
         conditioning: &ConditioningInput,
-    ) -> Result<Option<Vec<Frame>>, ServingError> {
+    ) -> Result<Option<Rollout>, ServingError> {
         let spec = loaded.model.spec();
         check_size("frame", &loaded.manifest.name, spec, (frame.width(), frame.height()))?;
         let task = self.step(frame, Some(conditioning.clone()), spec);

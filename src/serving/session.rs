@@ -72,6 +72,9 @@ pub struct SessionMemory {
     /// The robot's state at the last frame; absent if the model takes none.
     #[cfg_attr(feature = "server", schema(value_type = Option<Vec<f32>>))]
     pub state: Option<RobotState>,
+    /// How many frames the last prediction had; absent: the model's horizon.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
 }
 
 /// The state of a session with one model.
@@ -108,6 +111,7 @@ impl SessionState {
                     past: &[],
                     future: Some(&memory.actions),
                     state: memory.state.as_ref(),
+                    steps: memory.steps,
                 },
                 &MEMORY_FIELDS,
                 model,
@@ -129,6 +133,7 @@ impl SessionState {
             features: self.features.iter().map(|features| features.to_vec()).collect(),
             actions: self.conditioning.actions.clone(),
             state: self.conditioning.state.clone(),
+            steps: self.conditioning.steps,
         }
     }
 
@@ -235,6 +240,7 @@ mod tests {
         ConditioningInput {
             actions: vec![action(value); 2],
             state: RobotState::try_from(vec![value]).ok(),
+            steps: None,
         }
     }
 
@@ -268,6 +274,7 @@ mod tests {
                 actions: vec![action(f32::from(seq))],
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
                 future_actions: None,
+                steps: None,
             };
             assert_eq!(computed.predictions, predict(model, &[&input]).unwrap());
             let repeated = state.repeat_task(spec).unwrap();
@@ -293,6 +300,7 @@ mod tests {
                 features,
                 actions: actions.into_iter().map(action).collect(),
                 state: state.and_then(|value| RobotState::try_from(vec![value]).ok()),
+                steps: None,
             };
             let is_sound = memory.features.len() <= 3
                 && memory.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
@@ -318,6 +326,7 @@ mod tests {
             features: vec![vec![0.0; 5]],
             actions: vec![action(0.0); 2],
             state: RobotState::try_from(vec![0.0]).ok(),
+            steps: None,
         };
         memory.features[0][3] = f32::NAN;
         let error = SessionState::restore(memory, "test", &spec).unwrap_err();

@@ -3,6 +3,7 @@
 use super::compute::Features;
 use super::input::{InputError, PredictionInput};
 use crate::frame::Frame;
+use crate::nn::spec::MAX_STEPS;
 use crate::nn::{ChannelScale, Conditioning, ModelSpec};
 use crate::types::{Action, RobotState};
 
@@ -11,6 +12,8 @@ use crate::types::{Action, RobotState};
 pub struct ConditioningInput {
     pub(super) actions: Vec<Action>,
     pub(super) state: Option<RobotState>,
+    /// Frames to predict; the model's horizon if absent.
+    pub(super) steps: Option<usize>,
 }
 
 /// Actions and state as the client sent them.
@@ -22,6 +25,8 @@ pub(crate) struct RawConditioning<'a> {
     pub(crate) future: Option<&'a [Action]>,
     /// The robot's state at the last frame.
     pub(crate) state: Option<&'a RobotState>,
+    /// Frames to predict; the model's horizon if absent.
+    pub(crate) steps: Option<usize>,
 }
 
 /// The names of the fields in error messages.
@@ -52,8 +57,15 @@ impl ConditioningInput {
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {
+        let steps = raw.steps.unwrap_or(spec.horizon);
+        if !(1..=MAX_STEPS).contains(&steps) {
+            return Err(InputError::Steps { found: steps });
+        }
         if spec.conditioning == Conditioning::None {
-            return Ok(Self::default());
+            return Ok(Self {
+                steps: raw.steps,
+                ..Self::default()
+            });
         }
         for (index, action) in raw.past.iter().enumerate() {
             check_length(|| (fields.past)(index), model, action.as_slice(), &spec.actions)?;
@@ -61,10 +73,10 @@ impl ConditioningInput {
         let actions = match (raw.future, raw.past.last()) {
             _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
-                check_actions(fields.future, model, spec, actions)?;
+                check_actions(fields.future, (model, steps), spec, actions)?;
                 actions.to_vec()
             }
-            (None, Some(held)) => vec![held.clone(); spec.horizon],
+            (None, Some(held)) => vec![held.clone(); steps],
             (None, None) => {
                 return Err(InputError::Missing {
                     field: fields.missing,
@@ -76,6 +88,7 @@ impl ConditioningInput {
         Ok(Self {
             actions,
             state: check_state(model, spec, raw.state.cloned())?,
+            steps: raw.steps,
         })
     }
 
@@ -83,7 +96,7 @@ impl ConditioningInput {
     /// Errors: `Unconditioned` if the model takes no actions, and the errors of the values.
     pub(crate) fn candidates(
         candidates: Vec<Vec<Action>>,
-        state: Option<RobotState>,
+        (state, steps): (Option<RobotState>, Option<usize>),
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Vec<Self>, InputError> {
@@ -94,11 +107,19 @@ impl ConditioningInput {
         }
         let state = check_state(model, spec, state)?;
         let conditioning = |(index, actions): (usize, Vec<Action>)| {
-            check_actions(&format!("candidates[{index}]"), model, spec, &actions)?;
+            let wanted = (model, steps.unwrap_or(spec.horizon));
+            check_actions(&format!("candidates[{index}]"), wanted, spec, &actions)?;
             let state = state.clone();
-            Ok(Self { actions, state })
+            Ok(Self { actions, state, steps })
         };
         candidates.into_iter().enumerate().map(conditioning).collect()
+    }
+}
+
+impl ConditioningInput {
+    /// Frames to predict.
+    pub(super) fn steps(&self, spec: &ModelSpec) -> usize {
+        self.steps.unwrap_or(spec.horizon)
     }
 }
 
@@ -146,14 +167,19 @@ impl Task {
     }
 }
 
-/// Checks that there is an action for each predicted frame and that each action has all channels.
-fn check_actions(field: &str, model: &str, spec: &ModelSpec, actions: &[Action]) -> Result<(), InputError> {
-    if actions.len() != spec.horizon {
+/// Checks that there are as many actions as steps and that each action has all channels.
+fn check_actions(
+    field: &str,
+    (model, steps): (&str, usize),
+    spec: &ModelSpec,
+    actions: &[Action],
+) -> Result<(), InputError> {
+    if actions.len() != steps {
         return Err(InputError::FutureActionCount {
             field: field.to_owned(),
             model: model.to_owned(),
             found: actions.len(),
-            expected: spec.horizon,
+            expected: steps,
         });
     }
     for (index, action) in actions.iter().enumerate() {

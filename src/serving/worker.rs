@@ -100,6 +100,7 @@ fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),
         state: RobotState::try_from(vec![0.0; spec.states.len()]).ok(),
         future_actions: None,
+        steps: None,
     })
 }
 
@@ -117,6 +118,7 @@ fn answer(batch: Vec<QueuedTask>) {
                 let computed = TaskOutput {
                     features: computation.features,
                     predictions: computation.predictions,
+                    warnings: Vec::new(),
                     queue_us: micros(started.saturating_duration_since(waiting.accepted)),
                     compute_us,
                 };

@@ -95,6 +95,9 @@ pub struct DataConfig {
     /// Each training window is made brighter or darker by up to this share, 0 to 0.9.
     #[serde(default)]
     pub brightness: f32,
+    /// Whether a model may be conditioned on actions that never change in the training windows.
+    #[serde(default)]
+    pub constant_actions: bool,
 }
 
 /// A number of windows, or all windows.

@@ -15,10 +15,19 @@ const MAY_USE: &[(&str, &[&str])] = &[
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "error_text", "frame", "sim"]),
     ("inspection", &["types", "frame", "dataset"]),
-    ("registry", &["types", "files", "error_text", "nn"]),
+    ("registry", &["types", "files", "error_text", "frame", "nn"]),
     (
         "training",
-        &["types", "files", "settings", "frame", "nn", "dataset", "registry"],
+        &[
+            "types",
+            "files",
+            "settings",
+            "error_text",
+            "frame",
+            "nn",
+            "dataset",
+            "registry",
+        ],
     ),
     (
         "evaluation",

@@ -122,6 +122,7 @@ impl Client {
 pub(crate) fn numbered_frame(seq: u64) -> FrameMessage {
     let value = (seq % 7) as f32 - 3.0;
     FrameMessage {
+        steps: None,
         seq,
         timestamp_us: seq as i64 * 1000,
         image: ImageBytes(frame((seq * 37) as u8).pixels().to_vec()),

@@ -60,6 +60,7 @@ pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: D
         command: "a test".to_owned(),
         training: serde_json::json!({}),
         metrics: serde_json::json!({}),
+        calibration: None,
         parameters: spec.parameter_count(),
         multiply_adds_per_frame: spec.multiply_adds_per_frame(),
         program: ProgramStamp::current(),

@@ -96,8 +96,9 @@ impl ServerWithRobot {
             actions: vec![Action::try_from(numbered_frame(seq).action.unwrap()).unwrap()],
             state: RobotState::try_from(numbered_frame(seq).state.unwrap()).ok(),
             future_actions: None,
+            steps: None,
         };
-        let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0);
+        let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0).frames;
         let found: Vec<&[u8]> = frames.iter().map(|frame| frame.0.as_slice()).collect();
         let expected: Vec<&[u8]> = expected.iter().map(Frame::pixels).collect();
         assert_eq!(found, expected, "frame {seq}");

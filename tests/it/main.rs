@@ -8,6 +8,7 @@ mod backup;
 mod bag_files;
 mod bags;
 mod browser;
+mod calibration;
 mod cli;
 mod client;
 mod config;

@@ -40,6 +40,7 @@ async fn a_message_over_the_limit_closes_with_1009() {
             let image = ImageBytes(vec![0; 3 << 20]);
             client
                 .send(&ClientMessage::Frame(FrameMessage {
+                    steps: None,
                     image,
                     ..numbered_frame(9)
                 }))

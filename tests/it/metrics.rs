@@ -145,6 +145,7 @@ async fn a_slow_reader(server: &RunningServer) {
     let path = "/v1/models/large/stream";
     let mut client = Client::connect(server.address, path, Codec::Msgpack).await.unwrap();
     let frame = ClientMessage::Frame(foreframe::server::protocol::FrameMessage {
+        steps: None,
         image: ImageBytes(vec![7; (SIDE * SIDE) as usize]),
         format: ImageFormat::Raw,
         action: None,

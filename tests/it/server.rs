@@ -28,7 +28,7 @@ async fn http_predictions_equal_library_predictions() {
         frames: (0..CONTEXT as u8).map(|i| frame(i * 10)).collect(),
         ..PredictionInput::default()
     };
-    let expected = serving::predict(&loaded, &[&input]).unwrap().remove(0);
+    let expected = serving::predict(&loaded, &[&input]).unwrap().remove(0).frames;
 
     let answer = post(&app, PLAIN, &json!({"frames": context()})).await.json();
     assert_eq!((&answer["model"], &answer["version"]), (&json!("plain"), &json!(1)));

@@ -77,6 +77,7 @@ fn frame(seq: u64) -> ClientMessage {
     let recorded: Value = serde_json::from_slice(&std::fs::read(dir.join("actions.json")).unwrap()).unwrap();
     let numbers = |field: &str| serde_json::from_value(recorded[field][seq as usize].clone()).unwrap();
     ClientMessage::Frame(FrameMessage {
+        steps: None,
         seq,
         timestamp_us: 0,
         image: ImageBytes(codec::decode(&image).unwrap().pixels().to_vec()),

@@ -37,6 +37,7 @@ async fn connect(server: &InProcessServer) -> Client {
 
 fn frame(seq: u64) -> ClientMessage {
     ClientMessage::Frame(FrameMessage {
+        steps: None,
         seq,
         timestamp_us: 0,
         image: ImageBytes(vec![seq as u8; (SIDE * SIDE) as usize]),

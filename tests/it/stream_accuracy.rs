@@ -64,6 +64,7 @@ impl Recording {
 
     fn message(&self, seq: usize) -> ClientMessage {
         ClientMessage::Frame(FrameMessage {
+            steps: None,
             seq: seq as u64,
             timestamp_us: seq as i64,
             image: ImageBytes(self.frames[seq].pixels().to_vec()),
@@ -81,8 +82,9 @@ impl Recording {
             actions: Action::try_from(self.actions[seq].clone()).into_iter().collect(),
             state: RobotState::try_from(self.states[seq].clone()).ok(),
             future_actions: None,
+            steps: None,
         };
-        serving::predict(model, &[&input]).unwrap().remove(0)
+        serving::predict(model, &[&input]).unwrap().remove(0).frames
     }
 
     /// Checks a prediction against the stateless one. They differ by at most 1e-5, so by at most one intensity after rounding.

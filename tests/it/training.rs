@@ -4,12 +4,13 @@ use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
+use foreframe::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, Split, Splits, collect};
+use foreframe::frame::warp::CameraModel;
 use foreframe::registry::{self, StoredWeights};
 use foreframe::settings::SettingsLayer;
 use foreframe::sim::{Scenario, TrialParameters, WorldConfig};
 use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
-use foreframe::types::Seed;
+use foreframe::types::{Channel, Seed};
 
 use crate::fixtures::moving_squares;
 
@@ -231,6 +232,21 @@ fn a_fine_tuned_model_names_its_origin_and_can_be_tuned_again() {
 }
 
 #[test]
+fn weights_for_other_units_are_refused() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train(&small_config(&["fit.steps=2"]), &dataset, dir.path()).unwrap();
+    let mut start = registry::load_weights(&dir.path().join("model")).unwrap();
+    start.manifest.spec.actions[0].unit = "km/h".to_owned();
+    let message = first_loss(&small_config(&[]), &dataset, Some(&start))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("takes the action [speed km/h], and the data set has [speed px/frame]"),
+        "{message}"
+    );
+}
+
+#[test]
 fn weights_of_another_network_are_refused() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     train(&small_config(&[]), &dataset, dir.path()).unwrap();
@@ -363,6 +379,55 @@ fn a_truncated_checkpoint_is_not_used() {
     train(&config, &dataset, resumed.path()).unwrap();
     let weights = |dir: &Path| std::fs::read(dir.join("model/model.safetensors")).unwrap();
     assert!(weights(whole.path()) == weights(resumed.path()));
+}
+
+/// Recordings of a camera that stands still: the actions are always 0.
+fn standing(episodes: usize) -> Dataset {
+    let data = |episode: usize| EpisodeData {
+        pixels: (0..14 * 144).map(|at| ((at * 7 + episode * 13) % 251) as u8).collect(),
+        actions: vec![0.0; 14],
+        timestamps_s: (0..14).map(|frame| f64::from(frame) * 0.2).collect(),
+        ..EpisodeData::default()
+    };
+    let info = DatasetInfo {
+        name: "standing".to_owned(),
+        frame_width_px: 12,
+        frame_height_px: 12,
+        frame_period_s: 0.2,
+        action_channels: vec![Channel::new("speed", "m/s")],
+        ..DatasetInfo::default()
+    };
+    Dataset::from_episodes(info, (0..episodes).map(data).collect()).unwrap()
+}
+
+#[test]
+fn actions_that_never_change_are_refused_unless_allowed() {
+    let dir = tempfile::tempdir().unwrap();
+    let refused = train(&small_config(&["model.conditioning=action"]), &standing(20), dir.path()).unwrap_err();
+    assert_eq!(
+        refused.to_string(),
+        "data set \"standing\" has actions that never change (its camera stands still); a model with conditioning \"action\" \
+         learns nothing from them: use a preset for a standing camera, or model.conditioning=none, or allow it with \
+         data.constant_actions=true"
+    );
+    let allowed = small_config(&["model.conditioning=action", "data.constant_actions=true", "fit.steps=2"]);
+    train(&allowed, &standing(20), dir.path()).unwrap();
+}
+
+#[test]
+fn an_impossible_camera_model_is_refused() {
+    let info = DatasetInfo {
+        frame_width_px: 12,
+        frame_height_px: 12,
+        frame_period_s: 0.2,
+        camera: Some(CameraModel {
+            horizontal_fov_rad: 4.0,
+            tilt_down_rad: 0.0,
+        }),
+        ..DatasetInfo::default()
+    };
+    let error = Dataset::from_episodes(info, Vec::new()).unwrap_err().to_string();
+    assert!(error.contains("a field of view of 4 rad"), "{error}");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::{BaselineInput, evenly};
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
+use crate::evaluation::cholesky;
 use crate::frame::Frame;
 use crate::frame::preprocess::Preprocess;
 use crate::frame::warp::sample;
@@ -258,31 +259,8 @@ impl NormalEquations {
         for i in 0..size {
             self.matrix[i * size + i] += RIDGE * trace / size as f64;
         }
-        let mut factor = vec![0.0; size * size];
-        for i in 0..size {
-            for j in 0..=i {
-                let dot: f64 = (0..j).map(|k| factor[i * size + k] * factor[j * size + k]).sum();
-                let rest = self.matrix[i * size + j] - dot;
-                if i == j {
-                    if rest <= 0.0 {
-                        return None;
-                    }
-                    factor[i * size + i] = rest.sqrt();
-                } else {
-                    factor[i * size + j] = rest / factor[j * size + j];
-                }
-            }
-        }
-        let mut solution = self.right_side;
-        for i in 0..size {
-            let dot: f64 = (0..i).map(|k| factor[i * size + k] * solution[k]).sum();
-            solution[i] = (solution[i] - dot) / factor[i * size + i];
-        }
-        for i in (0..size).rev() {
-            let dot: f64 = (i + 1..size).map(|k| factor[k * size + i] * solution[k]).sum();
-            solution[i] = (solution[i] - dot) / factor[i * size + i];
-        }
-        Some(solution)
+        let factor = cholesky::factor(&self.matrix, size)?;
+        Some(cholesky::solve(&factor, self.right_side))
     }
 }
 

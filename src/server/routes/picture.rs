@@ -56,12 +56,12 @@ pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, Pictur
 
 /// The context, if it is known, and a row for each rollout; small and without labels if there are many.
 /// Errors: `Size` if there are too many.
-pub(super) fn rollout_sheet(seen: &[Frame], futures: &[Vec<Frame>]) -> Result<Frame, FrameError> {
+pub(super) fn rollout_sheet(seen: &[Frame], futures: &[impl AsRef<[Frame]>]) -> Result<Frame, FrameError> {
     let inputs = MontageRow::in_time("inputs", seen, 1 - seen.len() as i64);
     let rows = futures
         .iter()
         .enumerate()
-        .map(|(index, frames)| MontageRow::in_time(&format!("candidate {index}"), frames, 1));
+        .map(|(index, frames)| MontageRow::in_time(&format!("candidate {index}"), frames.as_ref(), 1));
     let mut rows: Vec<MontageRow> = Some(inputs)
         .filter(|_| !seen.is_empty())
         .into_iter()
@@ -79,9 +79,13 @@ pub(super) fn rollout_sheet(seen: &[Frame], futures: &[Vec<Frame>]) -> Result<Fr
 }
 
 /// All rollouts side by side, from the last context frame on if it is known. Errors: `Size` if there are too many.
-pub(super) fn rollout_animation(seen: &[Frame], futures: &[Vec<Frame>], period_s: f64) -> Result<Vec<u8>, FrameError> {
+pub(super) fn rollout_animation(
+    seen: &[Frame],
+    futures: &[impl AsRef<[Frame]>],
+    period_s: f64,
+) -> Result<Vec<u8>, FrameError> {
     let columns = (futures.len() as f64).sqrt().ceil().max(1.0) as usize;
-    let steps = futures.iter().map(Vec::len).max().unwrap_or(0);
+    let steps = futures.iter().map(|frames| frames.as_ref().len()).max().unwrap_or(0);
     let grid = |cells: Vec<(String, Frame)>| {
         let rows = cells.chunks(columns).map(|cells| MontageRow {
             label: String::new(),
@@ -97,7 +101,7 @@ pub(super) fn rollout_animation(seen: &[Frame], futures: &[Vec<Frame>], period_s
     let later = (0..steps).map(|step| {
         futures
             .iter()
-            .filter_map(|future| future.get(step))
+            .filter_map(|future| future.as_ref().get(step))
             .enumerate()
             .map(named)
             .collect()
@@ -117,8 +121,8 @@ const SMALL: Style = Style {
     grid_lines: 0,
 };
 
-fn style(futures: &[Vec<Frame>]) -> Style {
-    let width = futures.iter().flatten().next().map_or(1, Frame::width);
+fn style(futures: &[impl AsRef<[Frame]>]) -> Style {
+    let width = futures.iter().flat_map(AsRef::as_ref).next().map_or(1, Frame::width);
     Style {
         grid_lines: 0,
         ..Style::for_frames_of(width)

@@ -13,13 +13,15 @@ use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
+use crate::nn::ModelSpec;
 use crate::registry::Manifest;
+use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
 use crate::server::http::multipart::{JsonOrForm, TooManyError, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::server::stream::protocol::Timing;
+use crate::server::stream::protocol::{Timing, beyond_training};
 use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
 use crate::types::{Action, RobotState, ValueError};
 
@@ -49,9 +51,15 @@ struct PredictRequest {
     /// The robot's state at each frame, instead of `state`.
     #[serde(default)]
     states: Option<Vec<Vec<f32>>>,
-    /// The future actions, as many as the model's horizon. The first acts from the last frame on.
+    /// The future actions, as many as `steps`. The first acts from the last frame on.
     #[serde(default)]
     future_actions: Option<Vec<Vec<f32>>>,
+    /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[serde(default)]
+    steps: Option<usize>,
+    /// The units of actions and state as the client has them: other units than the model's are an error.
+    #[serde(default)]
+    units: Option<Units>,
 }
 
 /// The same request as a form.
@@ -76,6 +84,23 @@ struct PredictResponse {
     frames: Vec<ImageBytes>,
     /// How they are encoded.
     format: ImageFormat,
+    /// The mean squared error to expect of each frame up to the model's horizon, intensities 0…1; absent if the model is not
+    /// calibrated.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    expected_mse: Vec<f32>,
+    /// The 90 % band of each of these errors: 5 % of the errors are below it, 5 % above; absent if the model is not calibrated.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    mse_band_90: Vec<[f32; 2]>,
+    /// How unlike the training data the context is, 0…1: the share of validation contexts that are nearer to it; absent if the
+    /// model is not calibrated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    novelty: Option<f32>,
+    /// For each frame, whether it is beyond what the model was trained for; absent if none is.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    beyond_training: Vec<bool>,
+    /// Actions and states out of the range of the training; absent if there are none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    warnings: Vec<String>,
     /// How long it took.
     timing: Timing,
 }
@@ -91,6 +116,15 @@ pub(super) enum PredictError {
     NoCandidates,
     #[error("the session has {have} of the {need} frames that a prediction takes; send more frames")]
     Buffering { have: usize, need: usize },
+    #[error("steps is {found}; this server predicts 1 to {limit}")]
+    Steps { found: usize, limit: usize },
+    #[error("units.{field} is [{found}]; model \"{model}\" takes [{expected}]")]
+    Units {
+        field: &'static str,
+        found: String,
+        model: String,
+        expected: String,
+    },
     #[error("{field}: {source}")]
     Value { field: String, source: ValueError },
     #[error("state and states are both given; give one")]
@@ -139,21 +173,21 @@ async fn predict(
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let _place = app.admission().enter()?;
-    let (manifest, format) = (Arc::clone(&model.manifest), request.format);
-    let max_frames = app.config().max_frames;
-    let decode = move || request.into_input(&manifest, max_frames);
+    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
+    let decode = move || request.into_input(&manifest, &config);
     let input = app.predictions().run(decode).await??;
     let seen = input.frames.clone();
     let prediction = app.predictor().predict_by(&model, input).await?;
-    let period_s = model.manifest.spec.frame_period_s;
-    let encode = move || answer(wanted, format, &seen, prediction, period_s);
+    let encode = move || answer(wanted, format, &seen, prediction, &model.manifest.spec);
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
 impl PredictRequest {
-    fn into_input(self, manifest: &Manifest, max_frames: usize) -> Result<PredictionInput, PredictError> {
+    fn into_input(self, manifest: &Manifest, config: &ServerConfig) -> Result<PredictionInput, PredictError> {
         let (format, fit) = (self.format, self.fit);
-        let frames = decode_frames(self.frames, ImageInput { format, fit }, manifest, max_frames)?;
+        check_steps(self.steps, manifest, config)?;
+        self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
+        let frames = decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
         Ok(PredictionInput {
             state: last_state(self.state, self.states, frames.len())?,
             actions: actions("actions", self.actions)?,
@@ -161,8 +195,57 @@ impl PredictRequest {
                 .future_actions
                 .map(|values| actions("future_actions", values))
                 .transpose()?,
+            steps: self.steps,
             frames,
         })
+    }
+}
+
+/// Units of actions and state, in the model's order.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Units {
+    /// Of the components of an action.
+    #[serde(default)]
+    actions: Option<Vec<String>>,
+    /// Of the components of a state.
+    #[serde(default)]
+    state: Option<Vec<String>>,
+}
+
+impl Units {
+    /// Errors: `Units` where they differ from the model's.
+    pub(super) fn check(&self, manifest: &Manifest) -> Result<(), PredictError> {
+        let spec = &manifest.spec;
+        let given = [
+            ("actions", &self.actions, &spec.actions),
+            ("state", &self.state, &spec.states),
+        ];
+        for (field, found, channels) in given {
+            let expected: Vec<&str> = channels.iter().map(|channel| channel.unit.as_str()).collect();
+            if let Some(found) = found.as_ref().filter(|found| **found != expected) {
+                return Err(PredictError::Units {
+                    field,
+                    found: found.join(", "),
+                    model: manifest.name.clone(),
+                    expected: expected.join(", "),
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Errors: `Steps` if a request asks for more than this server predicts. The model's own horizon is always allowed.
+pub(super) fn check_steps(
+    steps: Option<usize>,
+    manifest: &Manifest,
+    config: &ServerConfig,
+) -> Result<(), PredictError> {
+    let limit = config.max_steps.max(manifest.spec.horizon);
+    match steps {
+        Some(found) if !(1..=limit).contains(&found) => Err(PredictError::Steps { found, limit }),
+        _ => Ok(()),
     }
 }
 
@@ -246,7 +329,9 @@ impl From<PredictError> for ApiError {
             PredictError::Image(image) => image.into(),
             PredictError::Serving(serving) => serving.into(),
             PredictError::Buffering { .. } => Self::Conflict(error.to_string()),
-            PredictError::Value { .. }
+            PredictError::Steps { .. }
+            | PredictError::Units { .. }
+            | PredictError::Value { .. }
             | PredictError::BothStates
             | PredictError::StateCount { .. }
             | PredictError::NoCandidates
@@ -260,12 +345,12 @@ fn answer(
     format: ImageFormat,
     seen: &[Frame],
     prediction: Prediction,
-    period_s: f64,
+    spec: &ModelSpec,
 ) -> Result<Response, ApiError> {
-    let predicted = &prediction.frames;
+    let predicted = &prediction.rollout.frames;
     match wanted {
         ResponseFormat::Png => Ok(picture::png(prediction_sheet(seen, predicted, &[]))?),
-        ResponseFormat::Gif => Ok(picture::gif(picture::animation(seen, predicted, period_s))?),
+        ResponseFormat::Gif => Ok(picture::gif(picture::animation(seen, predicted, spec.frame_period_s))?),
         ResponseFormat::Json => {
             let format = format.answer();
             Ok(axum::Json(PredictResponse {
@@ -273,6 +358,11 @@ fn answer(
                 version: prediction.version,
                 frames: images::encode(predicted, format)?,
                 format,
+                expected_mse: prediction.rollout.expected_mse(),
+                mse_band_90: prediction.rollout.mse_bands(),
+                novelty: prediction.rollout.novelty,
+                beyond_training: beyond_training(predicted.len(), spec),
+                warnings: prediction.warnings,
                 timing: Timing {
                     queue_us: prediction.queue_us,
                     compute_us: prediction.compute_us,

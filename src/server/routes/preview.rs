@@ -59,7 +59,7 @@ async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, 
     let simulated = app.pictures().threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
-    let predicted = app.predictor().predict_by(&model, input).await?.frames;
+    let predicted = app.predictor().predict_by(&model, input).await?.rollout.frames;
     let draw = move || Ok::<_, ApiError>(picture::png_file(prediction_sheet(&seen, &predicted, &truth))?);
     app.pictures().get_or_make(key, draw).await
 }
@@ -89,6 +89,7 @@ fn simulate(manifest: &Manifest) -> Result<(PredictionInput, Vec<Frame>), SimErr
         actions: Vec::new(),
         state: Some(states[now].clone()),
         future_actions: Some(actions[now..now + horizon].to_vec()),
+        steps: None,
     };
     Ok((input, frames.split_off(now + 1)))
 }

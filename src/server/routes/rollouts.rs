@@ -20,8 +20,8 @@ use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::server::stream::protocol::Timing;
-use crate::serving::{ConditioningInput, Task, TaskOutput};
+use crate::server::stream::protocol::{Timing, beyond_training};
+use crate::serving::{ConditioningInput, Rollout, Task, TaskOutput};
 use crate::types::RobotState;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -49,9 +49,11 @@ struct RolloutRequest {
     /// The robot's state at each frame, instead of `state`.
     #[serde(default)]
     states: Option<Vec<Vec<f32>>>,
-    /// Plans: sequences of future actions, each as long as the model's horizon. The first action acts from the last frame
-    /// on.
+    /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     candidates: Vec<Vec<Vec<f32>>>,
+    /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[serde(default)]
+    steps: Option<usize>,
 }
 
 /// Plans to compare from the last frame of a session.
@@ -64,9 +66,11 @@ struct SessionRolloutRequest {
     /// The robot's state. Default: its state at the session's last frame.
     #[serde(default)]
     state: Option<Vec<f32>>,
-    /// Plans: sequences of future actions, each as long as the model's horizon. The first action acts from the last frame
-    /// on.
+    /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     candidates: Vec<Vec<Vec<f32>>>,
+    /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[serde(default)]
+    steps: Option<usize>,
 }
 
 /// The rollouts.
@@ -80,6 +84,22 @@ struct RolloutResponse {
     futures: Vec<Vec<ImageBytes>>,
     /// How they are encoded.
     format: ImageFormat,
+    /// For each candidate, the mean squared error to expect of each frame up to the model's horizon, intensities 0…1; absent if
+    /// the model is not calibrated.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    expected_mse: Vec<Vec<f32>>,
+    /// The 90 % band of each of these errors; absent if the model is not calibrated.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    mse_band_90: Vec<Vec<[f32; 2]>>,
+    /// How unlike the training data the context is, 0…1; absent if the model is not calibrated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    novelty: Option<f32>,
+    /// For each step, whether it is beyond what the model was trained for; absent if none is.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    beyond_training: Vec<bool>,
+    /// Actions and states out of the range of the training; absent if there are none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    warnings: Vec<String>,
     /// How long it took.
     timing: Timing,
 }
@@ -156,12 +176,8 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let task = state.rollout_task(conditioning(
-        request.candidates,
-        robot_state,
-        &model.manifest,
-        app.config(),
-    )?);
+    let plans = (request.candidates, request.steps);
+    let task = state.rollout_task(conditioning(plans, robot_state, &model.manifest, app.config())?);
     let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &model, &[], &computed);
     picture::threads_for(&app, wanted).run(encode).await?
@@ -172,15 +188,15 @@ impl RolloutRequest {
         let (format, fit) = (self.format, self.fit);
         let seen = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, seen.len())?;
-        let conditioning = conditioning(self.candidates, state, manifest, config)?;
+        let conditioning = conditioning((self.candidates, self.steps), state, manifest, config)?;
         let task = Task::rollout(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
     }
 }
 
-/// The conditioning input of each plan.
+/// The conditioning input of each plan of so many steps.
 fn conditioning(
-    candidates: Vec<Vec<Vec<f32>>>,
+    (candidates, steps): (Vec<Vec<Vec<f32>>>, Option<usize>),
     state: Option<RobotState>,
     manifest: &Manifest,
     config: &ServerConfig,
@@ -190,7 +206,8 @@ fn conditioning(
     if candidates.is_empty() {
         return Err(PredictError::NoCandidates);
     }
-    let found = candidates.len() as u64 * spec.horizon as u64 * spec.pixels() as u64;
+    predict::check_steps(steps, manifest, config)?;
+    let found = candidates.len() as u64 * steps.unwrap_or(spec.horizon) as u64 * spec.pixels() as u64;
     if found > config.max_rollout_bytes as u64 {
         return Err(PredictError::TooLarge {
             found,
@@ -202,7 +219,12 @@ fn conditioning(
         .enumerate()
         .map(|(index, values)| predict::actions(&format!("candidates[{index}]"), values))
         .collect::<Result<_, _>>()?;
-    Ok(ConditioningInput::candidates(candidates, state, &manifest.name, spec)?)
+    Ok(ConditioningInput::candidates(
+        candidates,
+        (state, steps),
+        &manifest.name,
+        spec,
+    )?)
 }
 
 fn answer(
@@ -212,7 +234,10 @@ fn answer(
     seen: &[Frame],
     computed: &TaskOutput,
 ) -> Result<Response, ApiError> {
-    let futures = &computed.predictions;
+    let rollouts = &computed.predictions;
+    let futures: Vec<&[Frame]> = rollouts.iter().map(|rollout| rollout.frames.as_slice()).collect();
+    let is_calibrated = rollouts.iter().any(|rollout| !rollout.errors.is_empty());
+    let calibrated = || rollouts.iter().filter(|_| is_calibrated);
     let encoded = |format| {
         futures
             .iter()
@@ -220,10 +245,10 @@ fn answer(
             .collect::<Result<_, _>>()
     };
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, futures))?),
+        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &futures))?),
         ResponseFormat::Gif => {
             let period_s = model.manifest.spec.frame_period_s;
-            Ok(picture::gif(picture::rollout_animation(seen, futures, period_s))?)
+            Ok(picture::gif(picture::rollout_animation(seen, &futures, period_s))?)
         }
         ResponseFormat::Json => {
             let format = format.answer();
@@ -232,6 +257,14 @@ fn answer(
                 version: model.manifest.version,
                 futures: encoded(format)?,
                 format,
+                expected_mse: calibrated().map(Rollout::expected_mse).collect(),
+                mse_band_90: calibrated().map(Rollout::mse_bands).collect(),
+                novelty: rollouts.first().and_then(|rollout| rollout.novelty),
+                beyond_training: beyond_training(
+                    futures.first().map_or(0, |frames| frames.len()),
+                    &model.manifest.spec,
+                ),
+                warnings: computed.warnings.clone(),
                 timing: Timing {
                     queue_us: computed.queue_us,
                     compute_us: computed.compute_us,

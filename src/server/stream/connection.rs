@@ -240,10 +240,11 @@ impl StreamConnection {
     /// The frame, if it fits the model. Raw pixels need no other thread; an image file does.
     async fn checked(&self, message: FrameMessage, fit: Option<Fit>) -> Result<FrameStep, StepError> {
         let manifest = Arc::clone(&self.ownership.session().model().manifest);
+        let max_steps = self.services.config.max_steps;
         if message.format == ImageFormat::Raw {
-            return FrameStep::new(message, fit, &manifest);
+            return FrameStep::new(message, fit, &manifest, max_steps);
         }
-        let check = move || FrameStep::new(message, fit, &manifest);
+        let check = move || FrameStep::new(message, fit, &manifest, max_steps);
         self.services.blocking.run(check).await?
     }
 

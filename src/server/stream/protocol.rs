@@ -48,9 +48,12 @@ pub struct FrameMessage {
     /// The robot's state at this frame. Required if the model is conditioned on it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<Vec<f32>>,
-    /// The future actions, as many as the model's horizon. Default: `action`, repeated.
+    /// The future actions, as many as `steps`. Default: `action`, repeated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<Vec<Vec<f32>>>,
+    /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
 }
 
 /// Changes of a session's settings; absent settings stay as they are.
@@ -167,6 +170,21 @@ pub enum ServerMessage {
         frames: Vec<ImageBytes>,
         /// How they are encoded.
         format: ImageFormat,
+        /// The mean squared error to expect of each frame up to the model's horizon; absent if the model is not calibrated.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        expected_mse: Vec<f32>,
+        /// The 90 % band of each of these errors; absent if the model is not calibrated.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        mse_band_90: Vec<[f32; 2]>,
+        /// How unlike the training data the context is, 0…1; absent if the model is not calibrated.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        novelty: Option<f32>,
+        /// For each frame, whether it is beyond what the model was trained for; absent if none is.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        beyond_training: Vec<bool>,
+        /// Actions and states out of the range of the training; absent if there are none.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        warnings: Vec<String>,
         /// How long it took.
         timing: Timing,
         /// Predictions dropped since the last one that was sent, because the client did not read them in time.
@@ -240,6 +258,14 @@ impl StreamLimits {
             grace_ms: if is_kept { config.session_grace_ms } else { 0 },
         }
     }
+}
+
+/// For each of so many predicted frames, whether it is beyond the model's horizon; empty if none is.
+pub(in crate::server) fn beyond_training(frames: usize, spec: &ModelSpec) -> Vec<bool> {
+    if frames <= spec.horizon {
+        return Vec::new();
+    }
+    (0..frames).map(|step| step >= spec.horizon).collect()
 }
 
 /// How long a prediction took.

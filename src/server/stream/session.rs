@@ -207,11 +207,11 @@ impl Ownership {
                 self.inner()?.core.cache(step.timestamp_us, 0, computed)
             }
         };
-        let context = spec.context;
         if answer.must_compress(format) {
-            return blocking.run(move || answer.message(format, context)).await?;
+            let model = Arc::clone(model);
+            return blocking.run(move || answer.message(format, model.model.spec())).await?;
         }
-        answer.message(format, context)
+        answer.message(format, spec)
     }
 
     /// The session's state, if this is still its owner. Errors: `NotOwner`.

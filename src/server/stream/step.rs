@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings, Timing};
+use super::protocol::{
+    ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings, Timing, beyond_training,
+};
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
 use crate::nn::ModelSpec;
@@ -10,7 +12,7 @@ use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
 use crate::serving::{
-    ConditioningInput, InputError, RawConditioning, STEP_FIELDS, ServingError, SessionState, Task, TaskOutput,
+    ConditioningInput, InputError, RawConditioning, Rollout, STEP_FIELDS, ServingError, SessionState, Task, TaskOutput,
 };
 use crate::types::{Action, RobotState, ValueError};
 
@@ -32,7 +34,12 @@ impl FrameStep {
         message: FrameMessage,
         fit: Option<Fit>,
         manifest: &Manifest,
+        max_steps: usize,
     ) -> Result<Self, StepError> {
+        let limit = max_steps.max(manifest.spec.horizon);
+        if let Some(found) = message.steps.filter(|steps| *steps > limit) {
+            return Err(StepError::Steps { found, limit });
+        }
         let action = |field| {
             move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
         };
@@ -47,6 +54,7 @@ impl FrameStep {
             past: past.as_slice(),
             future: plan.as_deref(),
             state: state.as_ref(),
+            steps: message.steps,
         };
         let format = message.format;
         Ok(Self {
@@ -67,6 +75,8 @@ pub(in crate::server) enum StepError {
     Gap { found: u64, expected: u64 },
     #[error("seq is {0}; the greatest is one less")]
     Seq(u64),
+    #[error("steps is {found}; this server predicts 1 to {limit}")]
+    Steps { found: usize, limit: usize },
     #[error(transparent)]
     Image(#[from] ImageError),
     #[error("{field}: {source}")]
@@ -91,6 +101,7 @@ impl StepError {
             }
             Self::Serving(ServingError::Input(_))
             | Self::Seq(_)
+            | Self::Steps { .. }
             | Self::Image(_)
             | Self::Value { .. }
             | Self::Input(_)
@@ -116,7 +127,14 @@ pub(super) struct CachedAnswer {
     skipped: u64,
     have: usize,
     /// `None` while the context is not full, and for a frame that was overtaken.
-    prediction: Option<(Arc<[Frame]>, Timing)>,
+    prediction: Option<Arc<StepPrediction>>,
+}
+
+/// A prediction, and how long it took.
+pub(super) struct StepPrediction {
+    rollout: Rollout,
+    warnings: Vec<String>,
+    timing: Timing,
 }
 
 /// What a frame needs.
@@ -189,14 +207,21 @@ impl SessionCore {
             queue_us: computed.queue_us,
             compute_us: computed.compute_us,
         };
-        let future = computed.predictions.into_iter().next();
-        let prediction = future.map(|frames| (frames.into(), timing));
+        let warnings = computed.warnings;
+        let rollout = computed.predictions.into_iter().next();
+        let prediction = rollout.map(|rollout| {
+            Arc::new(StepPrediction {
+                rollout,
+                warnings,
+                timing,
+            })
+        });
         let answer = self.answer(timestamp_us, skipped, prediction);
         self.last_answer = Some(answer.clone());
         answer
     }
 
-    fn answer(&self, timestamp_us: i64, skipped: u64, prediction: Option<(Arc<[Frame]>, Timing)>) -> CachedAnswer {
+    fn answer(&self, timestamp_us: i64, skipped: u64, prediction: Option<Arc<StepPrediction>>) -> CachedAnswer {
         CachedAnswer {
             seq: self.state.next_seq().saturating_sub(1),
             timestamp_us,
@@ -213,8 +238,8 @@ impl CachedAnswer {
         self.prediction.is_some() && format.answer() != ImageFormat::Raw
     }
 
-    /// The message to the client; encodes the frames. `context`: the model's.
-    pub(super) fn message(self, format: ImageFormat, context: usize) -> Result<ServerMessage, StepError> {
+    /// The message to the client; encodes the frames.
+    pub(super) fn message(self, format: ImageFormat, spec: &ModelSpec) -> Result<ServerMessage, StepError> {
         let Self {
             seq,
             timestamp_us,
@@ -222,8 +247,8 @@ impl CachedAnswer {
             have,
             prediction,
         } = self;
-        let Some((frames, timing)) = prediction else {
-            if have == context {
+        let Some(prediction) = prediction else {
+            if have == spec.context {
                 return Ok(ServerMessage::Overtaken {
                     seq,
                     timestamp_us,
@@ -234,7 +259,7 @@ impl CachedAnswer {
                 seq,
                 timestamp_us,
                 have,
-                need: context,
+                need: spec.context,
                 skipped,
             });
         };
@@ -242,9 +267,14 @@ impl CachedAnswer {
         Ok(ServerMessage::Prediction {
             seq,
             timestamp_us,
-            frames: images::encode(&frames, format)?,
+            frames: images::encode(&prediction.rollout.frames, format)?,
             format,
-            timing,
+            expected_mse: prediction.rollout.expected_mse(),
+            mse_band_90: prediction.rollout.mse_bands(),
+            novelty: prediction.rollout.novelty,
+            beyond_training: beyond_training(prediction.rollout.frames.len(), spec),
+            warnings: prediction.warnings.clone(),
+            timing: prediction.timing,
             dropped: 0,
             skipped,
         })

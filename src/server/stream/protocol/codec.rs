@@ -122,6 +122,7 @@ mod tests {
             image: ImageBytes(image),
             format: ImageFormat::Raw,
             state: action.clone(),
+            steps: action.as_ref().map(Vec::len),
             plan: action.clone().map(|action| vec![action; 2]),
             action,
         })
@@ -227,6 +228,11 @@ mod tests {
             timestamp_us: 9,
             frames: vec![ImageBytes(vec![0; 3])],
             format: ImageFormat::Raw,
+            expected_mse: vec![0.5],
+            mse_band_90: vec![[0.25, 0.75]],
+            novelty: Some(0.5),
+            beyond_training: Vec::new(),
+            warnings: Vec::new(),
             timing: Timing {
                 queue_us: 1,
                 compute_us: 2,
@@ -234,7 +240,7 @@ mod tests {
             dropped: 0,
             skipped: 0,
         };
-        insta::assert_snapshot!(text(prediction), @r#"{"type":"prediction","seq":7,"timestamp_us":9,"frames":["AAAA"],"format":"raw","timing":{"queue_us":1,"compute_us":2},"dropped":0,"skipped":0}"#);
+        insta::assert_snapshot!(text(prediction), @r#"{"type":"prediction","seq":7,"timestamp_us":9,"frames":["AAAA"],"format":"raw","expected_mse":[0.5],"mse_band_90":[[0.25,0.75]],"novelty":0.5,"timing":{"queue_us":1,"compute_us":2},"dropped":0,"skipped":0}"#);
         let gap = ServerMessage::Error {
             code: ErrorCode::Gap,
             detail: "seq is 9; seq 7 is next".to_owned(),

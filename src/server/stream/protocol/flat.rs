@@ -23,6 +23,7 @@ pub(super) struct AnyMessage {
     action: Option<List<f64>>,
     state: Option<List<f64>>,
     plan: Option<List<List<f64>>>,
+    steps: Option<usize>,
     on_gap: Option<OnGap>,
     on_late: Option<OnLate>,
     fit: Option<Fit>,
@@ -82,6 +83,7 @@ impl TryFrom<AnyMessage> for ClientMessage {
                 action: any.action.take().map(numbers),
                 state: any.state.take().map(numbers),
                 plan: any.plan.take().map(|plan| plan.0.into_iter().map(numbers).collect()),
+                steps: any.steps.take(),
             }),
             MessageKind::Configure => Self::Configure(ConfigureMessage {
                 on_gap: any.on_gap.take(),
@@ -111,6 +113,7 @@ impl AnyMessage {
             ("action", self.action.is_some()),
             ("state", self.state.is_some()),
             ("plan", self.plan.is_some()),
+            ("steps", self.steps.is_some()),
             ("on_gap", self.on_gap.is_some()),
             ("on_late", self.on_late.is_some()),
             ("fit", self.fit.is_some()),

@@ -1,0 +1,263 @@
+//! Expected errors, novelty, warnings and other numbers of steps: from the calibration to the answers.
+
+use std::time::Instant;
+
+use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe::evaluation::{self, EvaluateConfig};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
+use foreframe::registry::{self, DatasetStamp, LoadedModel};
+use foreframe::server::ServerConfig;
+use foreframe::serving::{self, PredictionInput};
+use foreframe::types::{Action, RobotState, Seed};
+use foreframe::{Frame, SessionState};
+use serde_json::{Value, json};
+
+use crate::fixtures::{self, moving_squares};
+use crate::process::{output, text};
+use crate::service::{HORIZON, TIMEOUT, app, context, png, post, start, with_data};
+
+const SIDE: u32 = 16;
+
+fn spec() -> ModelSpec {
+    let channel = |name: &str, unit: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 1.0,
+        std: 0.8,
+    };
+    ModelSpec {
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        features: 8,
+        hidden: 12,
+        context: 3,
+        horizon: 2,
+        conditioning: Conditioning::StateAction,
+        actions: vec![channel("speed", "px/frame")],
+        states: vec![channel("phase", "")],
+        ..ModelSpec::default()
+    }
+}
+
+/// An untrained model below `dir/models`, calibrated on the squares.
+fn calibrated(dir: &std::path::Path, dataset: &Dataset) -> LoadedModel {
+    let trained_on = DatasetStamp {
+        name: dataset.info().name.clone(),
+        content_hash: dataset.info().content_hash.clone(),
+        scenario: None,
+        windows: 0,
+        split_seed: Seed(7),
+    };
+    let model_dir = dir.join("models/squares");
+    fixtures::model(&model_dir, "squares", spec(), trained_on);
+    evaluation::calibrate_trained(&model_dir, dataset, &false.into()).unwrap();
+    registry::load(&model_dir).unwrap()
+}
+
+fn input(dataset: &Dataset, speed: f32, steps: Option<usize>) -> PredictionInput {
+    let frame = |index| Frame::new(SIDE, SIDE, dataset.pixels(index).to_vec()).unwrap();
+    PredictionInput {
+        frames: (0..3).map(frame).collect(),
+        state: RobotState::try_from(vec![0.5]).ok(),
+        actions: vec![Action::try_from(vec![speed]).unwrap()],
+        steps,
+        ..PredictionInput::default()
+    }
+}
+
+/// Frames of noise.
+fn noise() -> Dataset {
+    let pixels = (0..20 * SIDE * SIDE)
+        .map(|at| (at.wrapping_mul(2_654_435_761) >> 13) as u8)
+        .collect();
+    let data = EpisodeData {
+        pixels,
+        timestamps_s: (0..20).map(|frame| f64::from(frame) * 0.2).collect(),
+        ..EpisodeData::default()
+    };
+    let info = DatasetInfo {
+        name: "noise".to_owned(),
+        frame_width_px: SIDE,
+        frame_height_px: SIDE,
+        frame_period_s: 0.2,
+        ..DatasetInfo::default()
+    };
+    Dataset::from_episodes(info, vec![data]).unwrap()
+}
+
+#[test]
+fn a_calibrated_model_tells_what_to_expect() {
+    let (dir, dataset) = (tempfile::tempdir().unwrap(), moving_squares(40, SIDE, 0.2));
+    let model = calibrated(dir.path(), &dataset);
+    let known = input(&dataset, 1.0, None);
+    let rollout = serving::predict(&model, &[&known]).unwrap().remove(0);
+    assert_eq!(rollout.errors.len(), 2);
+    for error in &rollout.errors {
+        assert!(0.0 < error.low && error.low <= error.mse && error.mse <= error.high && error.high <= 1.0);
+    }
+    assert!(rollout.novelty.is_some());
+    let mut strange = known.clone();
+    strange.frames = (0..3)
+        .map(|index| Frame::new(SIDE, SIDE, noise().pixels(index).to_vec()).unwrap())
+        .collect();
+    assert_eq!(serving::predict(&model, &[&strange]).unwrap()[0].novelty, Some(1.0));
+}
+
+#[test]
+fn the_report_has_coverage_and_tells_other_data_apart() {
+    let (dir, dataset) = (tempfile::tempdir().unwrap(), moving_squares(60, SIDE, 0.2));
+    let model = calibrated(dir.path(), &dataset);
+    let other = noise();
+    let config = EvaluateConfig {
+        bootstrap_samples: 100,
+        novel: vec![&other],
+        ..EvaluateConfig::default()
+    };
+    let report = evaluation::run(&model, &dataset, &config, &|_| {}).unwrap();
+    let scores = report.scores("test").unwrap().uncertainty.as_ref().unwrap();
+    assert!(scores.coverage.mean > 0.6, "{scores:?}");
+    assert_eq!(report.novelty[0].dataset, "noise");
+    assert!(report.novelty[0].auroc > 0.95, "{:?}", report.novelty);
+    let text = report.to_markdown();
+    assert!(
+        text.contains("coverage of the 90 % band") && text.contains("| noise | 18 | "),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_session_expects_the_same_as_a_request() {
+    let (dir, dataset) = (tempfile::tempdir().unwrap(), moving_squares(40, SIDE, 0.2));
+    let model = calibrated(dir.path(), &dataset);
+    let known = input(&dataset, 1.0, None);
+    let held = vec![known.actions[0].clone(); 2];
+    let conditioning = serving::ConditioningInput::for_model(&model, Some(&held), known.state.as_ref()).unwrap();
+    let (mut session, mut last) = (SessionState::default(), None);
+    for frame in known.frames.clone() {
+        last = session.predict_next(&model, frame, &conditioning).unwrap();
+    }
+    let (stepped, whole) = (last.unwrap(), serving::predict(&model, &[&known]).unwrap().remove(0));
+    assert_eq!(stepped.frames, whole.frames);
+    for (stepped, whole) in stepped.errors.iter().zip(&whole.errors) {
+        assert!((stepped.mse / whole.mse - 1.0).abs() < 1e-3, "{stepped:?} {whole:?}");
+    }
+    assert!((stepped.novelty.unwrap() - whole.novelty.unwrap()).abs() < 0.01);
+}
+
+#[tokio::test]
+async fn answers_carry_expected_errors_and_warnings() {
+    let (dir, dataset) = (tempfile::tempdir().unwrap(), moving_squares(40, SIDE, 0.2));
+    let model = calibrated(dir.path(), &dataset);
+    let app = start(with_data(dir.path(), ServerConfig::default()), vec![model]);
+    let frames: Vec<String> = input(&dataset, 1.0, None).frames.iter().map(png).collect();
+    let request = json!({"frames": frames, "state": [0.5], "actions": [[1.0]]});
+    let answer = post(&app, "/v1/models/squares/predict", &request).await.json();
+    assert_eq!(answer["expected_mse"].as_array().unwrap().len(), 2);
+    assert_eq!(answer["mse_band_90"][1].as_array().unwrap().len(), 2);
+    assert!(answer["novelty"].is_number());
+    assert_eq!(
+        (&answer["warnings"], &answer["beyond_training"]),
+        (&Value::Null, &Value::Null)
+    );
+
+    let plans = json!([[[0.5], [9.0]], [[-4.0], [1.0]]]);
+    let request = json!({"frames": frames, "state": [0.75], "candidates": plans});
+    let answer = post(&app, "/v1/models/squares/rollouts", &request).await.json();
+    assert_eq!(answer["expected_mse"][1].as_array().unwrap().len(), 2);
+    let expected = [
+        "state phase is 0.75; in training it was 0.5 to 0.5",
+        "action speed is 9 px/frame; in training it was 0 to 2 px/frame",
+    ];
+    assert_eq!(answer["warnings"], json!(expected));
+}
+
+#[tokio::test]
+async fn fewer_and_more_steps_than_the_horizon() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let ask = |steps: usize| json!({"frames": context(), "state": [0.5], "actions": [[0.5, 0.0]], "steps": steps});
+    let whole = post(&app, "/v1/models/moving/predict", &ask(HORIZON)).await.json();
+    let fewer = post(&app, "/v1/models/moving/predict", &ask(1)).await.json();
+    assert_eq!(fewer["frames"], json!([whole["frames"][0]]));
+    let more = post(&app, "/v1/models/moving/predict", &ask(5)).await.json();
+    assert_eq!(more["beyond_training"], json!([false, false, true, true, true]));
+    assert_eq!(
+        more["frames"].as_array().unwrap()[..2],
+        whole["frames"].as_array().unwrap()[..]
+    );
+    for steps in [0, 51] {
+        let refused = post(&app, "/v1/models/moving/predict", &ask(steps)).await;
+        assert_eq!(
+            refused.detail(422),
+            format!("steps is {steps}; this server predicts 1 to 50")
+        );
+    }
+    let rollouts = json!({"frames": context(), "state": [0.5], "candidates": [[[0.5, 0.0]]], "steps": 1});
+    let answer = post(&app, "/v1/models/moving/rollouts", &rollouts).await.json();
+    assert_eq!(answer["futures"][0].as_array().unwrap().len(), 1);
+}
+
+#[tokio::test]
+async fn other_units_than_the_models_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let units = json!({"actions": ["km/h", "rad/s"]});
+    let request = json!({"frames": context(), "state": [0.5], "actions": [[0.5, 0.0]], "units": units});
+    let refused = post(&app, "/v1/models/moving/predict", &request).await;
+    assert_eq!(
+        refused.detail(422),
+        "units.actions is [km/h, rad/s]; model \"moving\" takes [m/s, rad/s]"
+    );
+}
+
+#[test]
+fn a_copied_program_predicts_in_an_empty_directory() {
+    let (dir, frames) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let listed = output(dir.path(), &["models", "list"]);
+    assert!(text(&listed.stdout).starts_with("moving-flow@1"), "{listed:?}");
+    let examples = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/frames");
+    let out = frames.path().join("out");
+    let arguments = [
+        "predict",
+        "--model",
+        "moving-flow",
+        "--frames",
+        examples,
+        "--actions",
+        &format!("{examples}/actions.json"),
+        "--at",
+        "4",
+        "--steps",
+        "7",
+        "--out",
+        out.to_str().unwrap(),
+    ];
+    let predicted = output(dir.path(), &arguments);
+    assert!(predicted.status.success(), "{predicted:?}");
+    assert!(out.join("predicted-7.png").is_file());
+    assert!(text(&predicted.stdout).contains("from t+6 on, the frames are beyond"));
+}
+
+#[test]
+fn a_copied_program_serves_in_an_empty_directory() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = crate::process::Program::start(dir.path(), &["serve", "--port", "0"]);
+    let address = server
+        .first_line()
+        .split("http://")
+        .nth(1)
+        .unwrap()
+        .split('/')
+        .next()
+        .unwrap()
+        .to_owned();
+    let url = format!("http://{address}/readyz");
+    let is_ready = || output(dir.path(), &["healthcheck", "--url", &url]).status.success();
+    let deadline = Instant::now() + TIMEOUT;
+    while !is_ready() {
+        assert!(Instant::now() < deadline, "the server is not ready");
+    }
+    server.terminate();
+    let log = server.wait_for_exit();
+    assert!(log.contains("moving-flow"), "{log}");
+}
