@@ -35,6 +35,7 @@ pub mod model;
 mod modulation;
 mod motion;
 pub mod parameters;
+mod predictor_output;
 mod rays;
 mod recurrence;
 mod room;
@@ -51,7 +52,8 @@ pub use flow_spec::FlowLayers;
 pub use loss::Loss;
 pub use model::Model;
 pub use parameters::Parameters;
-pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, PredictorOutput, Reconstruction};
+pub use predictor_output::PredictorOutput;
+pub use spec::{Architecture, ChannelScale, Conditioning, ModelSpec, Reconstruction};
 
 /// Why the network refused a specification, weights or an input.
 #[derive(Debug, thiserror::Error)]

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::motion::StateChannels;
 use super::sampling::ImageSize;
-use super::{FlowLayers, NnError};
+use super::{FlowLayers, NnError, PredictorOutput};
 use crate::frame::preprocess::Preprocess;
 use crate::frame::warp::CameraModel;
 use crate::types::Channel;
@@ -107,28 +107,6 @@ named_enum!(
         Stepwise = "stepwise",
     }
 );
-
-named_enum!(
-    /// What the dense network's predictor gives at each step.
-    PredictorOutput, "predictor output", "\"residual\" and \"absolute\"", {
-        /// The change of the features since the previous frame.
-        Residual = "residual",
-        /// The features themselves, as in the paper.
-        Absolute = "absolute",
-    }
-);
-
-impl PredictorOutput {
-    /// That of specifications that name none.
-    pub(crate) fn residual() -> Self {
-        Self::Residual
-    }
-
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
-    fn is_residual(&self) -> bool {
-        *self == Self::Residual
-    }
-}
 
 named_enum!(
     /// The inputs of a prediction besides the context frames.

@@ -230,7 +230,8 @@ fn invalid_directories_are_refused_at_startup() {
         );
     }
     // Without models the server starts, and the log says what to do.
-    let server = RunningServer::start(dir.path(), &[]);
+    std::fs::create_dir(dir.path().join("empty")).unwrap();
+    let server = RunningServer::start(dir.path(), &["--models-dir", "empty"]);
     assert!(server.get("/v1/models").contains("{\"models\":[]"));
     server.terminate();
     assert!(
