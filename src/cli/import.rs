@@ -6,7 +6,7 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
-use crate::dataset::is_finished;
+use crate::dataset::{DatasetInfo, is_finished};
 use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
 use crate::registry::is_valid_name;
@@ -149,17 +149,21 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         }
     }
     print_line(format!("next: foreframe inspect {}", out.display()))?;
-    let (has_actions, has_states) = (!info.action_channels.is_empty(), !info.state_channels.is_empty());
-    let conditioning = match (has_actions, has_states) {
-        (true, true) => " --set model.conditioning=state-action",
-        (true, false) => "",
-        (false, true) => " --set model.conditioning=state",
-        (false, false) => " --set model.conditioning=none",
-    };
     print_line(format!(
-        "      foreframe train --preset recording --dataset {}{conditioning}",
-        out.display()
+        "      foreframe train --preset recording --dataset {}{}",
+        out.display(),
+        conditioning(info)
     ))
+}
+
+/// The setting that makes the preset for recordings fit the data set's channels.
+fn conditioning(info: &DatasetInfo) -> &'static str {
+    match (info.action_channels.is_empty(), info.state_channels.is_empty()) {
+        (false, false) => " --set model.conditioning=state-action",
+        (false, true) => "",
+        (true, false) => " --set model.conditioning=state",
+        (true, true) => " --set model.conditioning=none",
+    }
 }
 
 /// The data set's name: the one given, or one made of the source's. Errors: `Usage` if the given name is not valid.
