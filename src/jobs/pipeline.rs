@@ -163,11 +163,10 @@ impl Pipeline {
         let patience = self.patience(report, cancelled);
         patience.run(async || self.prepare_run(&run, report).await)?;
         let dataset = self.dataset(&spec.dataset, &patience)?;
-        let run_dir = self.store.objects().data_dir().join(&run);
         let training = Training {
             config: &config,
             dataset: &dataset,
-            run_dir: &run_dir,
+            run_dir: &self.store.objects().data_dir().join(&run),
             command: &command(spec),
             start: None,
         };
@@ -180,10 +179,8 @@ impl Pipeline {
         let mut observer = |event: TrainingEvent| {
             reporter.on_event(event);
             if matches!(event, TrainingEvent::Checkpointed { .. }) {
-                let pushing = self.store.objects().push(&run, CHECKPOINT_FILE);
-                if let Some(line) = sync.record(self.runtime.block_on(pushing)) {
-                    report.line(line);
-                }
+                let pushed = self.runtime.block_on(self.store.objects().push(&run, CHECKPOINT_FILE));
+                sync.record(pushed).into_iter().for_each(|line| report.line(line));
             }
         };
         let train = || training::run(&training, &mut observer, cancelled);
