@@ -352,6 +352,7 @@ impl McapFile {
                 let message = records.get(start..).and_then(|rest| rest.get(..bytes));
                 message.map(<[u8]>::to_vec).ok_or_else(|| changed(chunk))
             }
+            #[cfg(feature = "server")]
             Position::Row(_) => Err(changed(0)),
         }
     }
