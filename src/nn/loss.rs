@@ -26,13 +26,7 @@ named_enum!(
 impl Loss {
     /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
     pub fn between(self, prediction: &Tensor, target: &Tensor) -> Result<Tensor, NnError> {
-        if prediction.dims() != target.dims() {
-            return Err(NnError::shape(
-                "prediction",
-                prediction,
-                format!("the target's shape {:?}", target.dims()),
-            ));
-        }
+        check_same_shape(prediction, target)?;
         if prediction.dtype() == DType::F32 {
             return Ok(prediction
                 .contiguous()?
@@ -44,6 +38,15 @@ impl Loss {
             Self::L1 => difference.abs()?.mean_all()?,
         })
     }
+}
+
+/// Errors: `Shape` if the shapes differ.
+pub(super) fn check_same_shape(prediction: &Tensor, target: &Tensor) -> Result<(), NnError> {
+    if prediction.dims() == target.dims() {
+        return Ok(());
+    }
+    let expected = format!("the target's shape {:?}", target.dims());
+    Err(NnError::shape("prediction", prediction, expected))
 }
 
 /// The f32 implementation: one pass over memory forward and one backward.

@@ -65,6 +65,14 @@ impl Parameters {
         self.0.get(name)
     }
 
+    /// The tensor with this name, which the caller cannot do without. Errors: `TensorMissing`.
+    pub fn require(&self, name: &str) -> Result<&Var, NnError> {
+        self.get(name).ok_or_else(|| NnError::TensorMissing {
+            name: name.to_owned(),
+            expected: Vec::new(),
+        })
+    }
+
     /// Copies of the current tensors. Later updates do not change the copies.
     pub fn snapshot(&self) -> Result<BTreeMap<String, Tensor>, NnError> {
         self.0

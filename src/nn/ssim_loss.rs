@@ -7,16 +7,14 @@ use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
 use rayon::prelude::*;
 
 use super::NnError;
+use super::loss::check_same_shape;
 use super::tensors::{slice, with_values};
 use crate::frame::quality::SsimTerms;
 
 /// 1 minus the mean structural similarity of the frames `[…, P]`, as a scalar; `width` is a row's length in pixels.
 /// Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
 pub fn ssim_loss(prediction: &Tensor, target: &Tensor, width: usize) -> std::result::Result<Tensor, NnError> {
-    if prediction.dims() != target.dims() {
-        let expected = format!("the target's shape {:?}", target.dims());
-        return Err(NnError::shape("prediction", prediction, expected));
-    }
+    check_same_shape(prediction, target)?;
     let frame = prediction.dims().last().copied().unwrap_or(0);
     let operation = SsimLoss { frame, width };
     Ok(prediction

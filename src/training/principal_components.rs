@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::TrainError;
-use crate::nn::{NnError, Parameters};
+use crate::nn::Parameters;
 use crate::types::Seed;
 
 /// Additional directions in the iteration, so that the last requested ones converge too (Halko et al. 2011).
@@ -34,7 +34,7 @@ pub(super) fn set_codec(
     cancelled: &AtomicBool,
 ) -> Result<bool, TrainError> {
     let (count, pixels) = frames.dims2()?;
-    let features = named(parameters, "frame_encoder.bias")?.elem_count();
+    let features = parameters.require("frame_encoder.bias")?.elem_count();
     let mean = frames.mean(0)?;
     let centered = frames.broadcast_sub(&mean)?;
     let transposed = centered.t()?.contiguous()?;
@@ -79,16 +79,9 @@ pub(super) fn set_codec(
         ("frame_decoder.weight", decoder),
         ("frame_decoder.bias", target_mean),
     ] {
-        named(parameters, name)?.set(&tensor)?;
+        parameters.require(name)?.set(&tensor)?;
     }
     Ok(true)
-}
-
-fn named<'a>(parameters: &'a Parameters, name: &str) -> Result<&'a candle_core::Var, NnError> {
-    parameters.get(name).ok_or_else(|| NnError::TensorMissing {
-        name: name.to_owned(),
-        expected: Vec::new(),
-    })
 }
 
 fn random_directions(pixels: usize, width: usize, seed: Seed) -> Vec<Vec<f32>> {

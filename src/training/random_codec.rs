@@ -5,26 +5,19 @@
 use candle_core::Tensor;
 
 use super::TrainError;
-use crate::nn::{NnError, Parameters};
+use crate::nn::Parameters;
 
 /// Sets the codec's biases for `frames` and `targets` `[N, P]`. Errors: `Network` if the shapes do not match.
 pub(super) fn centre(parameters: &Parameters, frames: &Tensor, targets: &Tensor) -> Result<(), TrainError> {
-    let weight = named(parameters, "frame_encoder.weight")?;
+    let weight = parameters.require("frame_encoder.weight")?;
     let bias = frames
         .mean_keepdim(0)?
         .matmul(weight.as_tensor())?
         .neg()?
         .flatten_all()?;
-    named(parameters, "frame_encoder.bias")?.set(&bias)?;
-    named(parameters, "frame_decoder.bias")?.set(&targets.mean(0)?)?;
+    parameters.require("frame_encoder.bias")?.set(&bias)?;
+    parameters.require("frame_decoder.bias")?.set(&targets.mean(0)?)?;
     Ok(())
-}
-
-fn named<'a>(parameters: &'a Parameters, name: &str) -> Result<&'a candle_core::Var, NnError> {
-    parameters.get(name).ok_or_else(|| NnError::TensorMissing {
-        name: name.to_owned(),
-        expected: Vec::new(),
-    })
 }
 
 #[cfg(test)]

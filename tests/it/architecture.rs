@@ -182,6 +182,24 @@ fn no_file_is_longer_than_460_lines() {
 }
 
 #[test]
+fn no_two_types_have_the_same_name() {
+    let mut known = std::collections::BTreeMap::new();
+    for (file, text) in sources() {
+        for line in code(&text) {
+            let words: Vec<&str> = line
+                .split(|c: char| !c.is_alphanumeric() && c != '_')
+                .filter(|word| !word.is_empty() && !["pub", "crate", "super"].contains(word))
+                .collect();
+            let &[kind, name, ..] = words.as_slice() else { continue };
+            if ["struct", "enum", "trait"].contains(&kind) {
+                let first = known.insert(name.to_owned(), file.clone());
+                assert!(first.is_none(), "{name} is in {file} and in {}", first.unwrap());
+            }
+        }
+    }
+}
+
+#[test]
 fn every_expect_says_that_its_failure_is_a_bug() {
     for (file, text) in sources() {
         let code: String = code(&text).collect();

@@ -21,7 +21,7 @@ use std::path::Path;
 
 use self::collector::{Collector, Content, Position};
 use self::mcap::McapFile;
-use self::messages::MessageKind;
+use self::messages::RosType;
 #[cfg(feature = "server")]
 use self::sqlite::SqliteFile;
 use super::recording::{Images, Recording};
@@ -38,7 +38,7 @@ pub(super) struct BagImages {
     files: Vec<BagFile>,
     /// File and position of each.
     positions: Vec<(usize, Position)>,
-    kind: MessageKind,
+    kind: RosType,
 }
 
 /// A file of messages.
@@ -135,7 +135,7 @@ impl BagImages {
         let message = self.files[file].message(position)?;
         let wrong = |error: &dyn std::fmt::Display| ImportError::record(place, error.to_string());
         let message = compression::message(&message).map_err(|error| wrong(&error))?;
-        if self.kind == MessageKind::Image {
+        if self.kind == RosType::Image {
             let (_, image) = messages::image(&message).map_err(|error| wrong(&error))?;
             return image.gray().map_err(|error| wrong(&error));
         }

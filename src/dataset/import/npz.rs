@@ -51,7 +51,7 @@ pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<R
     for sequence in 0..layout.sequences {
         for frame in 0..layout.frames {
             let at = layout.position(sequence, frame);
-            let of = |arrays: &[Rows]| arrays.iter().flat_map(|rows| rows.at(at)).collect();
+            let of = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.at(at)).collect();
             records.push(Record {
                 timestamp_s: times.at(at, frame),
                 session: sequence.to_string(),
@@ -86,12 +86,12 @@ pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<R
 }
 
 /// An array of one row of numbers per frame.
-struct Rows {
+struct ArrayRows {
     values: Vec<f64>,
     width: usize,
 }
 
-impl Rows {
+impl ArrayRows {
     fn at(&self, frame: usize) -> Vec<f32> {
         let row = &self.values[frame * self.width..(frame + 1) * self.width];
         row.iter().map(|&value| value as f32).collect()
@@ -101,7 +101,7 @@ impl Rows {
 /// When each frame was taken.
 enum FrameTimes {
     /// An array, and its unit in seconds.
-    Array(Rows, f64),
+    Array(ArrayRows, f64),
     /// Frames per second.
     Rate(f64),
 }
@@ -115,7 +115,7 @@ impl FrameTimes {
     }
 }
 
-fn channels(names: &[String], arrays: &[Rows], options: &ImportOptions) -> Vec<Channel> {
+fn channels(names: &[String], arrays: &[ArrayRows], options: &ImportOptions) -> Vec<Channel> {
     let mut channels = Vec::new();
     for (name, rows) in names.iter().zip(arrays) {
         for component in 0..rows.width {
@@ -206,7 +206,7 @@ impl Npz {
     }
 
     /// Reads an array with as many rows as there are frames. Errors: `Record`.
-    fn rows(&mut self, name: &str, layout: &FrameLayout) -> Result<Rows, ImportError> {
+    fn rows(&mut self, name: &str, layout: &FrameLayout) -> Result<ArrayRows, ImportError> {
         let place = self.place(name);
         let wrong = |reason: String| ImportError::record(&place, reason);
         let entry = self.archive.by_name(&format!("{name}.npy"));
@@ -241,7 +241,7 @@ impl Npz {
                 "value {at} is {}; it must be a finite number",
                 values[at]
             ))),
-            None => Ok(Rows { values, width }),
+            None => Ok(ArrayRows { values, width }),
         }
     }
 

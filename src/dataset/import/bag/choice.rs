@@ -1,7 +1,7 @@
 //! Which topics become image, action and state: those named by the options, else the only one of its type.
 
 use super::collector::{Collector, Content, Topic, ValueStream};
-use super::messages::{MessageKind, Projection};
+use super::messages::{Projection, RosType};
 use crate::dataset::import::{ImportError, ImportOptions};
 use crate::types::Channel;
 
@@ -30,26 +30,26 @@ struct Role {
     what: &'static str,
     option: &'static str,
     types: &'static str,
-    is_of: fn(MessageKind) -> bool,
+    is_of: fn(RosType) -> bool,
 }
 
 const IMAGE: Role = Role {
     what: "image",
     option: "--image",
     types: "sensor_msgs/msg/Image or CompressedImage",
-    is_of: MessageKind::is_image,
+    is_of: RosType::is_image,
 };
 const ACTION: Role = Role {
     what: "action",
     option: "--action",
     types: "geometry_msgs/msg/Twist, TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState",
-    is_of: MessageKind::is_command,
+    is_of: RosType::is_command,
 };
 const STATE: Role = Role {
     what: "state",
     option: "--state",
     types: "nav_msgs/msg/Odometry, sensor_msgs/msg/JointState, geometry_msgs/msg/Twist or TwistStamped",
-    is_of: MessageKind::is_measurement,
+    is_of: RosType::is_measurement,
 };
 
 /// Chooses the topics. Errors: `Option`; it lists the topics that there are.

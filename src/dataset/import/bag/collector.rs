@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use super::compression;
-use super::messages::{self, FieldValue, MessageKind, Projection};
+use super::messages::{self, FieldValue, Projection, RosType};
 use crate::dataset::import::{ImportError, ImportOptions, SkippedItem};
 
 /// Where a message lies in its file.
@@ -95,7 +95,7 @@ pub(super) enum Content {
 pub(super) struct Topic {
     pub(super) name: String,
     pub(super) type_name: String,
-    pub(super) kind: MessageKind,
+    pub(super) kind: RosType,
     /// How its messages are encoded; only `cdr` can be read.
     pub(super) encoding: String,
     pub(super) messages: u64,
@@ -148,7 +148,7 @@ impl<'a> Collector<'a> {
             return known;
         }
         let (name, type_name) = key.clone();
-        let kind = MessageKind::of(&type_name);
+        let kind = RosType::of(&type_name);
         let is_wanted = |names: &[String], by_default: bool| match names {
             [] => by_default,
             names => names.iter().any(|given| given.split(':').next() == Some(&name)),
@@ -158,7 +158,7 @@ impl<'a> Collector<'a> {
             is_wanted(&options.actions, kind.is_command()) || is_wanted(&options.states, kind.is_measurement());
         let content = match kind {
             _ if encoding != "cdr" => Content::Unused,
-            MessageKind::CameraInfo => Content::Camera(None),
+            RosType::CameraInfo => Content::Camera(None),
             _ if kind.is_image() && options.image.as_ref().is_none_or(|image| *image == name) => {
                 Content::Images(Vec::new())
             }
@@ -237,7 +237,7 @@ fn take(
             }
         }
         Content::Images(images) => {
-            let stamp = if topic.kind == MessageKind::Image {
+            let stamp = if topic.kind == RosType::Image {
                 let (stamp, image) = messages::image(message).map_err(|error| error.to_string())?;
                 image.check().map_err(|error| error.to_string())?;
                 stamp

@@ -143,7 +143,7 @@ enum Origin {
 }
 
 /// One pass over a file.
-struct Scan<'a, 'b> {
+struct McapScan<'a, 'b> {
     path: &'a Path,
     reader: BufReader<&'a File>,
     length: u64,
@@ -155,7 +155,7 @@ struct Scan<'a, 'b> {
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let file = File::open(path).map_err(ImportError::io("read", path))?;
     let length = file.metadata().map_err(ImportError::io("read", path))?.len();
-    let mut scan = Scan {
+    let mut scan = McapScan {
         path,
         reader: BufReader::new(&file),
         length,
@@ -172,7 +172,7 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
     scan.records()
 }
 
-impl Scan<'_, '_> {
+impl McapScan<'_, '_> {
     fn fault(&mut self, offset: u64, reason: impl Into<String>) -> Result<(), ImportError> {
         self.collector
             .fault(format!("{} byte {offset}", self.path.display()), reason.into())

@@ -7,7 +7,7 @@ use super::pixels::RawImage;
 
 /// What a topic's messages are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum MessageKind {
+pub(super) enum RosType {
     Image,
     CompressedImage,
     Twist,
@@ -19,7 +19,7 @@ pub(super) enum MessageKind {
     Other,
 }
 
-impl MessageKind {
+impl RosType {
     /// The kind of a type's name, with or without `/msg/`.
     pub(super) fn of(type_name: &str) -> Self {
         match type_name.replace("/msg/", "/").as_str() {
@@ -109,15 +109,15 @@ pub(super) fn compressed_image(message: &[u8]) -> Result<(i64, &str, &[u8]), Cdr
 
 /// Time (`None` without a header) and values of a message that is an action or a state. A value that is not finite is one
 /// that the robot does not measure in a `JointState`, and is left out there. Errors: `CdrError`.
-pub(super) fn values(kind: MessageKind, message: &[u8]) -> Result<(Option<i64>, Vec<FieldValue>), CdrError> {
+pub(super) fn values(kind: RosType, message: &[u8]) -> Result<(Option<i64>, Vec<FieldValue>), CdrError> {
     let mut reader = CdrReader::new(message)?;
     let stamp = match kind {
-        MessageKind::Twist => None,
+        RosType::Twist => None,
         _ => Some(header_stamp(&mut reader)?),
     };
     let values = match kind {
-        MessageKind::Odometry => odometry(&mut reader)?,
-        MessageKind::JointState => joint_state(&mut reader)?,
+        RosType::Odometry => odometry(&mut reader)?,
+        RosType::JointState => joint_state(&mut reader)?,
         _ => twist(&mut reader)?,
     };
     Ok((stamp, values))
@@ -227,7 +227,7 @@ mod tests {
             let _ = image(&message).map(|(_, image)| image.gray());
             let _ = compressed_image(&message);
             let _ = camera_info(&message);
-            for kind in [MessageKind::Twist, MessageKind::TwistStamped, MessageKind::Odometry, MessageKind::JointState] {
+            for kind in [RosType::Twist, RosType::TwistStamped, RosType::Odometry, RosType::JointState] {
                 let _ = values(kind, &message);
             }
         }
@@ -235,8 +235,8 @@ mod tests {
 
     #[test]
     fn type_names_of_both_forms_are_known() {
-        assert_eq!(MessageKind::of("sensor_msgs/msg/Image"), MessageKind::Image);
-        assert_eq!(MessageKind::of("sensor_msgs/Image"), MessageKind::Image);
-        assert_eq!(MessageKind::of("sensor_msgs/msg/Imu"), MessageKind::Other);
+        assert_eq!(RosType::of("sensor_msgs/msg/Image"), RosType::Image);
+        assert_eq!(RosType::of("sensor_msgs/Image"), RosType::Image);
+        assert_eq!(RosType::of("sensor_msgs/msg/Imu"), RosType::Other);
     }
 }
