@@ -13,6 +13,8 @@ use crate::report::Bounds;
 
 /// How long the server may take to become ready.
 const START_LIMIT: Duration = Duration::from_mins(1);
+/// Connections that the server takes from one address. All of this program's come from one.
+const CONNECTIONS: &str = "max_connections_per_address=100000";
 
 /// The server and model under load.
 #[derive(clap::Args, Clone)]
@@ -48,7 +50,7 @@ impl Server {
         };
         let log = data.path().join("log");
         let mut child = command
-            .args(["serve", "--bind", "127.0.0.1:0", "--data-dir"])
+            .args(["serve", "--bind", "127.0.0.1:0", "--set", CONNECTIONS, "--data-dir"])
             .arg(data.path())
             .args(
                 settings

@@ -31,7 +31,10 @@ struct RequestCounts {
 }
 
 pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
-    let mut server = Server::start(&args.target, &[("max_queued_predictions", args.queue)]).await;
+    // Those of one phase may still be open when the next begins.
+    let connections = args.connections + LEVELS.iter().sum::<usize>();
+    let settings = [("max_queued_predictions", args.queue), ("max_connections", connections)];
+    let mut server = Server::start(&args.target, &settings).await;
     let request = Workload::of(&args.target.model).predict_json();
     let mut peak_hz: f64 = 0.0;
     for level in LEVELS {
