@@ -1,9 +1,9 @@
 //! Time of predictions and of training steps with the default model: 64×64 px, 128 features, 256 hidden units, 5 frames of
-//! context, 5 predicted frames.
+//! context, 5 predicted frames. All on one thread, as the server predicts.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use candle_core::{DType, Device, Tensor};
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::{Criterion, criterion_group};
 use foreframe::frame::warp::CameraModel;
 use foreframe::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters,
@@ -118,4 +118,15 @@ criterion_group! {
     config = Criterion::default().sample_size(20).measurement_time(std::time::Duration::from_secs(3));
     targets = prediction, training
 }
-criterion_main!(model);
+
+fn main() {
+    for variable in ["RAYON_NUM_THREADS", "CANDLE_NUM_THREADS"] {
+        #[expect(unsafe_code, reason = "no safe call changes the environment")]
+        // SAFETY: no other thread runs yet. Without these, candle counts the cores before every product.
+        unsafe {
+            std::env::set_var(variable, "1");
+        }
+    }
+    model();
+    Criterion::default().configure_from_args().final_summary();
+}
