@@ -341,17 +341,20 @@ impl CustomOp1 for PixelShuffle {
         } else {
             (2 * height, 2 * width, channels / 4)
         };
-        for fine in 0..count * rows * columns {
-            let (column, row) = (fine % columns, fine / columns % rows);
-            let block = (fine / (columns * rows) * (rows / 2) + row / 2) * (columns / 2) + column / 2;
-            let coarse = (block * 4 + row % 2 * 2 + column % 2) * depth;
-            let fine = fine * depth;
-            let (from, to) = if self.is_inverse {
-                (fine, coarse)
-            } else {
-                (coarse, fine)
-            };
-            out[to..to + depth].copy_from_slice(&values[from..from + depth]);
+        let half = columns / 2 * 4 * depth;
+        for row in 0..count * rows {
+            // Both rows of a block lie in the same row of blocks; sides are even, so items need no care.
+            let blocks = row / 2 * half + row % 2 * 2 * depth;
+            for column in 0..columns {
+                let coarse = blocks + column / 2 * 4 * depth + column % 2 * depth;
+                let fine = (row * columns + column) * depth;
+                let (from, to) = if self.is_inverse {
+                    (fine, coarse)
+                } else {
+                    (coarse, fine)
+                };
+                out[to..to + depth].copy_from_slice(&values[from..from + depth]);
+            }
         }
         let shape = if self.is_inverse {
             (count, height / 2, width / 2, 4 * channels)

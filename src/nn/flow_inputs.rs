@@ -254,10 +254,13 @@ pub(super) fn centred(at: usize, side: usize) -> f32 {
 fn write_blocks(frame: &[f32], size: ImageSize, places: &[f32], out: &mut [f32], first: usize) {
     let half = size.shrunk(2);
     let channels = out.len() / half.pixels();
-    for (pixel, place) in places.chunks_exact(2).enumerate() {
-        let (row, column) = (pixel / size.width, pixel % size.width);
-        let block = row / 2 * half.width + column / 2;
-        out[block * channels + first + row % 2 * 2 + column % 2] = size.around(place[0], place[1]).sample(frame);
+    for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
+        let out = &mut out[row / 2 * half.width * channels..][..half.width * channels];
+        for (out, pair) in out.chunks_exact_mut(channels).zip(places.chunks_exact(4)) {
+            let out = &mut out[first + row % 2 * 2..][..2];
+            out[0] = size.around(pair[0], pair[1]).sample(frame);
+            out[1] = size.around(pair[2], pair[3]).sample(frame);
+        }
     }
 }
 
@@ -272,12 +275,14 @@ pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], s
         .zip(places.chunks_exact(pixels * 2));
     for ((out, places), &frame) in items.zip(frame_of) {
         write_blocks(&frames[frame as usize * pixels..], size, places, out, 0);
-        for (pixel, place) in places.chunks_exact(2).enumerate() {
-            let is_inside = (0.0..=size.width as f32 - 1.0).contains(&place[0])
-                && (0.0..=size.height as f32 - 1.0).contains(&place[1]);
-            if is_inside {
-                let block = pixel / size.width / 2 * half.width + pixel % size.width / 2;
-                out[block * CHANNELS + CHANNELS - 1] += 0.25;
+        for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
+            let out = &mut out[row / 2 * half.width * CHANNELS..][..half.width * CHANNELS];
+            for (out, pair) in out.chunks_exact_mut(CHANNELS).zip(places.chunks_exact(4)) {
+                let inside = pair.chunks_exact(2).filter(|place| {
+                    (0.0..=size.width as f32 - 1.0).contains(&place[0])
+                        && (0.0..=size.height as f32 - 1.0).contains(&place[1])
+                });
+                out[CHANNELS - 1] += 0.25 * inside.count() as f32;
             }
         }
     }

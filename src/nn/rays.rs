@@ -2,8 +2,11 @@
 //! where a moving one did.
 //!
 //! Axes as in ROS: x ahead, y to the left, z up. Places are columns and rows, 0 at the first pixel's middle.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use pulp::Arch;
 
 use super::sampling::ImageSize;
 use super::tensors::{slice, with_values};
@@ -83,6 +86,7 @@ impl Viewer {
     }
 
     /// Depth of a point in the robot's axes, and how far it lies below the camera's axis.
+    #[inline(always)]
     fn depth_and_down(self, [ahead, _, up]: [f32; 3]) -> [f32; 2] {
         [
             self.tilt_cos * ahead - self.tilt_sin * up,
@@ -91,6 +95,7 @@ impl Viewer {
     }
 
     /// The place of a point in the robot's axes.
+    #[inline(always)]
     pub(super) fn project(self, point: [f32; 3]) -> [f32; 2] {
         let [depth, down] = self.depth_and_down(point);
         let scale = 1.0 / (depth.max(MIN_DEPTH) * self.pixel);
@@ -102,14 +107,27 @@ impl Viewer {
 
     /// Where each pixel was before the camera turned by `yaw`, `[P, 2]`.
     pub(super) fn turned(self, rays: &[[f32; 3]], yaw: f32) -> Vec<f32> {
+        let mut places = vec![0.0; 2 * rays.len()];
+        self.write_turned(rays, yaw, &mut places);
+        places
+    }
+
+    /// As [`Viewer::turned`], into `places`.
+    fn write_turned(self, rays: &[[f32; 3]], yaw: f32, places: &mut [f32]) {
         let (sin, cos) = yaw.sin_cos();
-        rays.iter()
-            .flat_map(|&ray| self.project(rotated(ray, sin, cos)))
-            .collect()
+        Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for (place, &ray) in places.chunks_exact_mut(2).zip(rays) {
+                    place.copy_from_slice(&self.project(rotated(ray, sin, cos)));
+                }
+            },
+        );
     }
 }
 
 /// A direction turned counter-clockwise about the vertical.
+#[inline(always)]
 pub(super) fn rotated([ahead, left, up]: [f32; 3], sin: f32, cos: f32) -> [f32; 3] {
     [cos * ahead - sin * left, sin * ahead + cos * left, up]
 }
@@ -143,10 +161,11 @@ impl CustomOp1 for Turning {
         if layout.dims().len() != 1 {
             bail!("yaw has shape {:?}; it must be [M]", layout.dims());
         }
-        let places: Vec<f32> = yaw
-            .iter()
-            .flat_map(|&yaw| self.viewer.turned(&self.rays, yaw))
-            .collect();
+        let of_item = 2 * self.rays.len();
+        let mut places = vec![0.0; yaw.len() * of_item];
+        for (places, &yaw) in places.chunks_exact_mut(of_item).zip(yaw) {
+            self.viewer.write_turned(&self.rays, yaw, places);
+        }
         Ok((CpuStorage::F32(places), Shape::from((yaw.len(), self.rays.len(), 2))))
     }
 

@@ -5,6 +5,7 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
+use pulp::Arch;
 
 use super::rays::{CameraPose, Viewer, rotated};
 use super::tensors::{slice, with_values};
@@ -142,15 +143,24 @@ impl RoomViews {
 
     /// Where each view's pixels were seen from the pose of the same index in `before`: `[views, rays, 2]`.
     pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
-        let mut places = Vec::with_capacity(self.poses.len() * self.rays.len() * 2);
-        self.visit(|index, ray| {
-            let from = before[index / self.rays.len()];
-            let hit = sides.hit(ray);
-            let origin = self.origin(from);
-            let relative = std::array::from_fn(|axis| hit.point[axis] - origin[axis]);
-            let (sin, cos) = from.heading.sin_cos();
-            places.extend(viewer.project(rotated(relative, -sin, cos)));
-        });
+        let of_view = 2 * self.rays.len();
+        let mut places = vec![0.0; self.poses.len() * of_view];
+        let views = places.chunks_exact_mut(of_view).zip(&self.poses).zip(before);
+        for ((places, &pose), &from) in views {
+            let (origin, seen_from) = (self.origin(pose), self.origin(from));
+            let [(sin, cos), (sin_before, cos_before)] = [pose, from].map(|pose| pose.heading.sin_cos());
+            Arch::new().dispatch(
+                #[inline(always)]
+                || {
+                    for (place, &ray) in places.chunks_exact_mut(2).zip(&self.rays) {
+                        let direction = rotated(ray, sin, cos);
+                        let hit = sides.hit(RoomRay { origin, direction });
+                        let relative = std::array::from_fn(|axis| hit.point[axis] - seen_from[axis]);
+                        place.copy_from_slice(&viewer.project(rotated(relative, -sin_before, cos_before)));
+                    }
+                },
+            );
+        }
         places
     }
 }

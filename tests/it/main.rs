@@ -59,6 +59,7 @@ mod sessions;
 mod shared_datasets;
 mod sim;
 mod sim_errors;
+mod sizes;
 mod slow_clients;
 mod store;
 mod store_attempts;
