@@ -1,12 +1,12 @@
 //! A light HTTP/1.1 client: one kept-alive connection, and bodies with a content length.
 
 use std::io::{self, ErrorKind};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
-use tokio::net::TcpStream;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::timeout;
 
 /// Time limit for an answer: longer than any deadline of the server.
@@ -44,6 +44,19 @@ impl Request {
     pub(crate) fn json(path: &str, body: &Value) -> Self {
         Self::post(path, "application/json", body.to_string().as_bytes())
     }
+
+    /// The same request with one more header.
+    pub(crate) fn with_header(mut self, name: &str, value: &str) -> Self {
+        let line_end = self.0.windows(2).position(|pair| pair == b"\r\n").unwrap() + 2;
+        self.0
+            .splice(line_end..line_end, format!("{name}: {value}\r\n").into_bytes());
+        self
+    }
+
+    /// The same request with an API key.
+    pub(crate) fn with_key(self, key: &str) -> Self {
+        self.with_header("authorization", &format!("Bearer {key}"))
+    }
 }
 
 /// A response.
@@ -76,13 +89,27 @@ const KEEP_ALIVE: Duration = Duration::from_secs(5);
 /// One connection, opened on demand.
 pub(crate) struct Http {
     address: SocketAddr,
+    /// The address that it connects from.
+    source: Option<IpAddr>,
     /// The connection, and when it was last used.
     kept: Option<(BufReader<TcpStream>, Instant)>,
 }
 
 impl Http {
     pub(crate) fn new(address: SocketAddr) -> Self {
-        Self { address, kept: None }
+        Self {
+            address,
+            source: None,
+            kept: None,
+        }
+    }
+
+    /// A client that connects from another loopback address.
+    pub(crate) fn from_source(address: SocketAddr, source: IpAddr) -> Self {
+        Self {
+            source: Some(source),
+            ..Self::new(address)
+        }
     }
 
     /// Sends a request and returns the response. Errors: the connection ended, or the time limit passed.
@@ -102,7 +129,7 @@ impl Http {
     async fn exchange(&mut self, request: &Request) -> io::Result<Response> {
         let mut stream = match self.kept.take() {
             Some((stream, asked)) if asked.elapsed() < KEEP_ALIVE => stream,
-            _ => connect(self.address).await?,
+            _ => BufReader::new(connect(self.address, self.source).await?),
         };
         stream.get_mut().write_all(&request.0).await?;
         let (answer, is_last) = read(&mut stream).await?;
@@ -111,10 +138,15 @@ impl Http {
     }
 }
 
-async fn connect(address: SocketAddr) -> io::Result<BufReader<TcpStream>> {
-    let stream = TcpStream::connect(address).await?;
+/// Opens a connection, from `source` if there is one.
+pub(crate) async fn connect(address: SocketAddr, source: Option<IpAddr>) -> io::Result<TcpStream> {
+    let socket = TcpSocket::new_v4()?;
+    if let Some(source) = source {
+        socket.bind(SocketAddr::new(source, 0))?;
+    }
+    let stream = socket.connect(address).await?;
     stream.set_nodelay(true)?;
-    Ok(BufReader::new(stream))
+    Ok(stream)
 }
 
 /// Reads a response, and whether the connection ends after it.

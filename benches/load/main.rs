@@ -4,8 +4,13 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
+#[path = "../../tests/malformed/corpus.rs"]
+mod corpus;
+mod endurance;
 mod health;
 mod http;
+#[path = "../../tests/malformed/mutation.rs"]
+mod mutation;
 mod previews;
 mod process_usage;
 mod report;
@@ -41,7 +46,7 @@ struct Cli {
     scenario: Option<Scenario>,
     #[command(flatten)]
     stream: stream::StreamArgs,
-    /// Run a short form of every scenario, as CI does
+    /// Run a short form of every scenario but `endurance`, as CI does
     #[arg(long)]
     test: bool,
     /// Added by cargo
@@ -63,6 +68,9 @@ enum Scenario {
     Previews(previews::PreviewsArgs),
     /// Health checks and streams while a training uses every core: measure latencies
     Health(health::HealthArgs),
+    /// Everything at once, with hostile clients, kills, a full disk and a database that is away: check that nothing
+    /// acknowledged is lost, and that every prediction is right
+    Endurance(endurance::EnduranceArgs),
 }
 
 /// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.
@@ -110,5 +118,6 @@ async fn run(scenario: &Scenario, bounds: &mut Bounds) {
         Scenario::Churn(args) => churn::run(args, bounds).await,
         Scenario::Previews(args) => previews::run(args, bounds).await,
         Scenario::Health(args) => health::run(args, bounds).await,
+        Scenario::Endurance(args) => endurance::run(args, bounds).await,
     }
 }

@@ -15,7 +15,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
-use crate::http::{Http, Request, Response, TIMEOUT};
+use crate::http::{self, Http, Request, Response, TIMEOUT};
 
 /// Size of the read buffer: larger than an answer, but small, because it is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;
@@ -52,6 +52,11 @@ impl Session {
         format!("/v1/sessions/{}/stream?token={}", self.id, self.token)
     }
 
+    /// The request that exports its state.
+    pub(crate) fn export(&self) -> Request {
+        Request::get(&format!("/v1/sessions/{}/state?token={}", self.id, self.token))
+    }
+
     pub(crate) fn deletion(&self) -> Request {
         Request::delete(&format!("/v1/sessions/{}?token={}", self.id, self.token))
     }
@@ -59,21 +64,55 @@ impl Session {
 
 /// Opens a stream and reads its `ready`.
 pub(crate) async fn connect(address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
-    let stream = TcpStream::connect(address).await.map_err(Error::Io)?;
-    stream.set_nodelay(true).map_err(Error::Io)?;
+    let stream = http::connect(address, None).await.map_err(Error::Io)?;
     over(stream, address, path).await
 }
 
 /// The same over an existing socket.
 pub(crate) async fn over(stream: TcpStream, address: SocketAddr, path: &str) -> Result<Socket, Box<Error>> {
-    let mut request = format!("ws://{address}{path}").into_client_request()?;
-    let protocol = HeaderValue::from_static(Codec::Msgpack.name());
-    request.headers_mut().insert("sec-websocket-protocol", protocol);
-    let config = WebSocketConfig::default().read_buffer_size(READ_BYTES);
-    let (mut socket, _) = tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await?;
-    match receive(&mut socket).await {
-        Some(ServerMessage::Ready { .. }) => Ok(socket),
+    let mut socket = Handshake::new(address, path).over(stream).await?;
+    ready(&mut socket).await.map(|_| socket)
+}
+
+/// Reads `ready`, which says the next frame's sequence number.
+pub(crate) async fn ready(socket: &mut Socket) -> Result<u64, Box<Error>> {
+    match receive(socket).await {
+        Some(ServerMessage::Ready { next_seq, .. }) => Ok(next_seq),
         _ => Err(Box::new(Error::Io(io::ErrorKind::InvalidData.into()))),
+    }
+}
+
+/// How a stream is opened.
+pub(crate) struct Handshake<'a> {
+    pub(crate) address: SocketAddr,
+    pub(crate) path: &'a str,
+    /// The API key.
+    pub(crate) key: Option<&'a str>,
+    pub(crate) codec: Codec,
+}
+
+impl<'a> Handshake<'a> {
+    pub(crate) fn new(address: SocketAddr, path: &'a str) -> Self {
+        Self {
+            address,
+            path,
+            key: None,
+            codec: Codec::Msgpack,
+        }
+    }
+
+    /// Opens the stream over a connection.
+    pub(crate) async fn over(&self, stream: TcpStream) -> Result<Socket, Box<Error>> {
+        let mut request = format!("ws://{}{}", self.address, self.path).into_client_request()?;
+        let headers = request.headers_mut();
+        headers.insert("sec-websocket-protocol", HeaderValue::from_static(self.codec.name()));
+        if let Some(key) = self.key {
+            let key = HeaderValue::from_str(&format!("Bearer {key}")).expect("a key is ASCII");
+            headers.insert("authorization", key);
+        }
+        let config = WebSocketConfig::default().read_buffer_size(READ_BYTES);
+        let (socket, _) = tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await?;
+        Ok(socket)
     }
 }
 

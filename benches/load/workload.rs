@@ -14,6 +14,8 @@ use tokio_tungstenite::tungstenite::Message;
 use crate::http::Request;
 
 const FRAMES: usize = 15;
+/// Each component of the actions and states.
+pub(crate) const EXAMPLE_VALUE: f32 = 0.1;
 const BOUNDARY: &str = "frame-by-frame";
 
 /// The frames of `examples` and the model that they are sent to.
@@ -45,6 +47,15 @@ impl Workload {
         &self.model
     }
 
+    pub(crate) fn spec(&self) -> &ModelSpec {
+        &self.spec
+    }
+
+    /// The pixels of a frame of `examples`; the frames repeat.
+    pub(crate) fn pixels(&self, index: usize) -> &[u8] {
+        &self.images[index % FRAMES]
+    }
+
     /// Frames that a session takes before its first prediction.
     pub(crate) fn context(&self) -> u64 {
         self.spec.context as u64
@@ -58,18 +69,23 @@ impl Workload {
             timestamp_us: 0,
             image: ImageBytes(self.images[seq as usize % FRAMES].clone()),
             format: ImageFormat::Raw,
-            action: self.spec.action_inputs().map(|count| vec![0.1; count]),
-            state: self.spec.state_inputs().map(|count| vec![0.1; count]),
+            action: self.spec.action_inputs().map(|count| vec![EXAMPLE_VALUE; count]),
+            state: self.spec.state_inputs().map(|count| vec![EXAMPLE_VALUE; count]),
             plan: None,
         }))
     }
 
     /// A prediction request in JSON with base64 images.
     pub(crate) fn predict_json(&self) -> Request {
+        Request::json(&self.predict_path(), &self.context_body())
+    }
+
+    /// The body of that request.
+    pub(crate) fn context_body(&self) -> Value {
         let mut body = self.conditioning();
         let images = self.files.iter().take(self.spec.context);
         body["frames"] = images.map(|file| json!(ImageBytes(file.clone()))).collect();
-        Request::json(&self.predict_path(), &body)
+        body
     }
 
     /// The same request as a multipart form.
@@ -92,10 +108,10 @@ impl Workload {
     fn conditioning(&self) -> Value {
         let mut conditioning = json!({});
         if let Some(count) = self.spec.action_inputs() {
-            conditioning["future_actions"] = json!(vec![vec![0.1; count]; self.spec.horizon]);
+            conditioning["future_actions"] = json!(vec![vec![EXAMPLE_VALUE; count]; self.spec.horizon]);
         }
         if let Some(count) = self.spec.state_inputs() {
-            conditioning["state"] = json!(vec![0.1; count]);
+            conditioning["state"] = json!(vec![EXAMPLE_VALUE; count]);
         }
         conditioning
     }
