@@ -163,6 +163,7 @@ impl LoadedConfig {
         ] {
             url.take_if(|url| url.is_empty());
         }
+        server.import_dir.take_if(|dir| dir.as_os_str().is_empty());
         if let Some(port) = config.port {
             config.bind.set_port(port);
         }
@@ -180,8 +181,12 @@ impl LoadedConfig {
     /// missing only if it is the default. Errors: `Directory`.
     pub fn check_directories(&self) -> Result<(), ConfigError> {
         let ServerConfig {
-            data_dir, models_dir, ..
+            data_dir,
+            models_dir,
+            import_dir,
+            ..
         } = &self.config.server;
+        let missing_import_dir = import_dir.as_ref().filter(|dir| !dir.is_dir());
         let is_default = self.is_default("models_dir");
         let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
             let right = "name a directory; it is created if it does not exist";
@@ -189,6 +194,9 @@ impl LoadedConfig {
         } else if !models_dir.is_dir() && (!is_default || models_dir.exists()) {
             let right = "name a directory that holds models, or leave the setting out to serve those in ./models";
             ("models_dir", models_dir, right)
+        } else if let Some(import_dir) = missing_import_dir {
+            let right = "name the directory with the recordings, or leave the setting out to turn imports off";
+            ("import_dir", import_dir, right)
         } else {
             return Ok(());
         };

@@ -30,7 +30,7 @@ use check::{check_description, check_episode};
 pub use collect::{CollectConfig, CollectProgress, collect};
 pub use collection::CollectionStatus;
 pub use error::DatasetError;
-pub use layout::{INFO, METADATA};
+pub use layout::{IMPORT_ARGUMENTS, INFO, METADATA};
 pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 

@@ -83,6 +83,15 @@ pub(crate) fn remove_stale_partials(root: &Path) {
     }
 }
 
+/// Deletes all partial files below a directory that no other process writes to, because this one has locked it.
+pub(crate) fn remove_partials(root: &Path) {
+    for path in files_below(root).unwrap_or_default() {
+        if is_partial(&path) {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
 /// Every file below a directory, sorted.
 pub(crate) fn files_below(root: &Path) -> io::Result<Vec<PathBuf>> {
     let (mut dirs, mut files) = (vec![root.to_owned()], Vec::new());

@@ -1,4 +1,4 @@
-//! Collection, training and evaluation in the background. [`state`] defines the legal transitions, [`spec`] checks
+//! Collection, import, training and evaluation in the background. [`state`] defines the legal transitions, [`spec`] checks
 //! submitted jobs, [`queue`] is the handle for callers, `runner` claims jobs one after another and writes their reports,
 //! `progress` buffers the reports, [`pipeline`] does the work. The store holds the jobs, so that they survive the process
 //! and several processes can share them.
@@ -28,7 +28,7 @@ pub use progress::{JobProgress, Losses};
 pub use queue::{JobLimits, Jobs};
 pub use report::JobReporter;
 pub use runner::{JobExecutor, JobFailure, JobResult};
-pub use spec::{CollectSpec, EvaluateSpec, JobSpec, TrainSpec};
+pub use spec::{CollectSpec, EvaluateSpec, ImportSpec, JobSpec, TrainSpec};
 pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.

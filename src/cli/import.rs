@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, interrupt, print_line, progress::ProgressLine};
-use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import};
+use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
 use crate::dataset::{DatasetInfo, is_finished};
 use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
@@ -81,10 +81,7 @@ pub(super) struct ImportArgs {
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {
-    let sides = text
-        .split_once('x')
-        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    sides.ok_or_else(|| "write WIDTHxHEIGHT, as in 64x64".to_owned())
+    parse_size(text).map_err(|error| error.to_string())
 }
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
@@ -192,6 +189,7 @@ impl From<ImportError> for CliError {
             ImportError::Cancelled { .. } => Self::Interrupted(text),
             ImportError::UnknownSource(_)
             | ImportError::Option(_)
+            | ImportError::OptionValue { .. }
             | ImportError::Record { .. }
             | ImportError::Image { .. }
             | ImportError::Empty(_)

@@ -1,19 +1,19 @@
 //! The directory of a collection: how far it is, and how it is started, resumed and completed.
 
 use std::fs::{self, File, TryLockError};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
-use super::files::{sha256_of_file, write_atomically};
+use super::files::{is_unused, sha256_of_file, write_atomically};
 use super::layout::{ARGUMENTS, DatasetMetadata, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo, unfinished};
-use crate::files::{is_partial_of, remove_stale_partials, sha256_hex};
+use crate::files::{remove_stale_partials, sha256_hex};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -64,7 +64,7 @@ impl CollectionStatus {
     pub fn of(config: &CollectConfig) -> Result<Self, DatasetError> {
         let out = &config.out;
         let Some(found) = read_arguments(out)? else {
-            return if is_unused(out)? {
+            return if is_unused(out, ARGUMENTS)? {
                 Ok(Self::New)
             } else {
                 Err(DatasetError::OutExists { path: out.clone() })
@@ -111,34 +111,6 @@ fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
         }
         Err(error) => Err(DatasetError::io("read", &path)(error)),
     }
-}
-
-/// Whether a directory is missing, empty, or contains only the partial file of a collection that was killed during its
-/// first write.
-fn is_unused(out: &Path) -> Result<bool, DatasetError> {
-    if !out.exists() {
-        return Ok(true);
-    }
-    if !out.is_dir() {
-        return Ok(false);
-    }
-    let names = |path: &Path| -> Result<Vec<PathBuf>, DatasetError> {
-        fs::read_dir(path)
-            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
-            .map(|entries| entries.iter().map(fs::DirEntry::path).collect())
-            .map_err(DatasetError::io("read", path))
-    };
-    for path in names(out)? {
-        let is_meta = path == out.join("meta") && path.is_dir();
-        let only_half = is_meta
-            && names(&path)?
-                .iter()
-                .all(|inner| is_partial_of(&out.join(ARGUMENTS), inner));
-        if !only_half {
-            return Ok(false);
-        }
-    }
-    Ok(true)
 }
 
 /// Every argument that differs, for example `trials: 5 in the directory, 6 requested`.

@@ -15,6 +15,7 @@ mod timing;
 mod video;
 mod writer;
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -22,8 +23,8 @@ use serde::{Deserialize, Serialize};
 
 use self::recording::Recording;
 use super::{DatasetError, DatasetInfo};
-use crate::frame::FrameError;
 use crate::frame::fit::Fit;
+use crate::frame::{FrameError, MAX_SIDE_PX};
 
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
@@ -130,6 +131,16 @@ pub enum ImportError {
     /// An option does not fit the source.
     #[error("{0}")]
     Option(String),
+    /// An option's value is out of range.
+    #[error("--{option} is {value}; {right}")]
+    OptionValue {
+        /// The option of `foreframe import`, without dashes.
+        option: &'static str,
+        /// Its value.
+        value: String,
+        /// What would be right.
+        right: String,
+    },
     /// A file could not be read or written.
     #[error("could not {action} {}", path.display())]
     Io {
@@ -214,6 +225,30 @@ impl ImportError {
     }
 }
 
+/// Width and height in pixels, written as in `64x64`. Errors: `OptionValue`.
+pub fn parse_size(text: &str) -> Result<(u32, u32), ImportError> {
+    let sides = text
+        .split_once('x')
+        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    sides.ok_or_else(|| ImportError::OptionValue {
+        option: "size",
+        value: format!("\"{}\"", text.escape_default()),
+        right: "write WIDTHxHEIGHT, as in 64x64".to_owned(),
+    })
+}
+
+/// Whether a directory can be written by this import: it is unused, holds the same import, or holds another one that has
+/// written no frames yet. Errors: `OutExists`, `Io`.
+pub fn check_out(config: &ImportConfig) -> Result<(), ImportError> {
+    writer::Directory::check(config).map(drop)
+}
+
+/// How many shards an unfinished import has written; a later run continues after them.
+#[must_use]
+pub fn saved_shards(out: &Path) -> usize {
+    writer::saved_shards(out)
+}
+
 /// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once
 /// if the data set is complete. Errors: every [`ImportError`].
 pub fn import(
@@ -259,28 +294,33 @@ fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
 }
 
 impl ImportOptions {
-    fn validate(&self) -> Result<(), ImportError> {
+    /// Checks what can be checked without the source. Errors: `OptionValue`.
+    pub fn validate(&self) -> Result<(), ImportError> {
+        let wrong = |option, value: &dyn Display, right: &str| {
+            Err(ImportError::OptionValue {
+                option,
+                value: value.to_string(),
+                right: right.to_owned(),
+            })
+        };
         if self.every == 0 {
-            return Err(ImportError::Option("--every is 0; it must be at least 1".to_owned()));
+            return wrong("every", &self.every, "it must be at least 1");
         }
         if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
-            return Err(ImportError::Option(format!(
-                "--rate is {rate}; it must be 0.01 to 1000 frames per second"
-            )));
+            return wrong("rate", &rate, "it must be 0.01 to 1000 frames per second");
         }
         if !(0.0..=3600.0).contains(&self.hold_s) {
-            return Err(ImportError::Option(format!(
-                "--hold is {}; it must be 0 to 3600 seconds",
-                self.hold_s
-            )));
+            return wrong("hold", &self.hold_s, "it must be 0 to 3600 seconds");
         }
-        for (what, side) in [("width", self.frame_width_px), ("height", self.frame_height_px)] {
-            if !(1..=crate::frame::MAX_SIDE_PX).contains(&side) {
-                return Err(ImportError::Option(format!(
-                    "the frame's {what} is {side} px; it must be 1 to {} px",
-                    crate::frame::MAX_SIDE_PX
-                )));
-            }
+        let (width, height) = (self.frame_width_px, self.frame_height_px);
+        let sides = 1..=MAX_SIDE_PX;
+        if !(sides.contains(&width) && sides.contains(&height)) {
+            let right = format!("each side must be 1 to {MAX_SIDE_PX} px");
+            return wrong("size", &format!("{width}x{height}"), &right);
+        }
+        if let Some(unit) = self.units.iter().find(|unit| !unit.contains('=')) {
+            let given = format!("\"{}\"", unit.escape_default());
+            return wrong("unit", &given, "write NAME=UNIT, as in speed=m/s");
         }
         Ok(())
     }

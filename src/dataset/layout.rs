@@ -18,7 +18,7 @@ pub const METADATA: &str = "meta/foreframe.json";
 /// The arguments of the collection. They are written first.
 pub(super) const ARGUMENTS: &str = "meta/collect.json";
 /// The source and options of an import. They are written first.
-pub(super) const IMPORT_ARGUMENTS: &str = "meta/import.json";
+pub const IMPORT_ARGUMENTS: &str = "meta/import.json";
 /// Statistics of every column.
 pub(super) const STATS: &str = "meta/stats.json";
 /// The table of tasks, with one task.

@@ -36,6 +36,8 @@ pub struct JobProcess {
     pub store: StoreConfig,
     /// The directory of the shipped models.
     pub models_dir: PathBuf,
+    /// The directory that imports may read.
+    pub import_dir: Option<PathBuf>,
     /// How many threads a job uses.
     pub threads: usize,
     /// The memory that a job can use, in MiB; 0 for no limit.
@@ -47,6 +49,7 @@ pub struct JobProcess {
 struct JobOrder {
     store: StoreConfig,
     models_dir: PathBuf,
+    import_dir: Option<PathBuf>,
     threads: usize,
     memory_mb: u64,
     lease: Lease,
@@ -159,6 +162,7 @@ impl ChildExecutor {
         JobOrder {
             store: self.process.store.clone(),
             models_dir: self.process.models_dir.clone(),
+            import_dir: self.process.import_dir.clone(),
             threads: self.process.threads,
             memory_mb: self.process.memory_mb,
             lease,
@@ -242,7 +246,7 @@ fn work(
     let pipeline = runtime.block_on(async {
         let store = Store::open_existing(&order.store).await?;
         let versions = Versions::new(store.clone(), &order.models_dir);
-        Ok(Pipeline::new(store, versions, order.threads))
+        Ok(Pipeline::new(store, versions, order.threads).with_import_dir(order.import_dir.clone()))
     });
     let pipeline = pipeline.map_err(|error: crate::store::StoreError| error_text::with_causes(&error))?;
     Ok(pool.install(|| pipeline.execute(&order.spec, report, cancelled)))

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use futures_util::{StreamExt as _, TryStreamExt as _, stream};
 
 use super::JobError;
+use crate::dataset::import::{ImportConfig, ImportError, check_out};
 use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
 use crate::registry::is_valid_name;
 use crate::store::Objects;
@@ -76,6 +77,25 @@ pub(super) async fn clear_stale(objects: &Objects, name: &str, config: &CollectC
         Err(DatasetError::OutExists { .. }) if is_of_a_deleted_set => Ok(objects.delete(&key(name)).await?),
         Err(DatasetError::OtherArguments { .. }) => Ok(objects.delete(&key(name)).await?),
         // The collection reports everything else.
+        _ => Ok(()),
+    }
+}
+
+/// The same for a data set that is to be imported. Errors: `Store`, `Dataset`.
+pub(super) async fn clear_stale_import(objects: &Objects, name: &str, config: &ImportConfig) -> Result<(), JobError> {
+    if !objects.are_shared() {
+        return Ok(());
+    }
+    if is_finished(objects, name).await? {
+        return fetch(objects, name).await.map(drop);
+    }
+    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
+    let is_of_another_import = config.out.join(dataset::IMPORT_ARGUMENTS).is_file();
+    match check_out(config) {
+        Err(ImportError::OutExists { .. }) if is_of_a_deleted_set || is_of_another_import => {
+            Ok(objects.delete(&key(name)).await?)
+        }
+        // The import reports everything else.
         _ => Ok(()),
     }
 }

@@ -1,7 +1,11 @@
-//! The work of jobs, below the data directory: a collection writes `datasets/NAME`; a training works in `runs/JOB` and
+//! The work of jobs, below the data directory: collections and imports write `datasets/NAME`; a training works in `runs/JOB` and
 //! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
+mod import;
+mod training_report;
+
 use std::error::Error;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -9,25 +13,24 @@ use futures_util::future::BoxFuture;
 use serde_json::json;
 use tokio::runtime::Handle;
 
+use self::training_report::TrainingReporter;
 use super::checkpoints::{self, CheckpointSync};
 use super::patience::Patience;
 use super::report::JobReporter;
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, Losses, TrainSpec, datasets, memory};
+use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets, memory};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
 use crate::registry::LoadedModel;
-use crate::store::{LossRow, ModelMetrics, Store, StoreError};
-use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent, TrainingStage};
+use crate::store::{ModelMetrics, Store, StoreError};
+use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent};
 use crate::types::Seed;
 use crate::versions::{VersionError, Versions};
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
-/// How many points of the training loss are stored for each stage, besides those of its validations.
-const CURVE_POINTS: usize = 500;
 /// How long a job waits for another process, whose lease has expired, to unlock the directory.
 const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
 /// How often it tries.
@@ -39,6 +42,7 @@ pub struct Pipeline {
     versions: Versions,
     threads: usize,
     memory_mb: u64,
+    import_dir: Option<PathBuf>,
     runtime: Handle,
 }
 
@@ -51,6 +55,7 @@ impl Pipeline {
             versions,
             threads,
             memory_mb: 0,
+            import_dir: None,
             runtime: Handle::current(),
         }
     }
@@ -59,6 +64,12 @@ impl Pipeline {
     #[must_use]
     pub fn with_memory_limit(self, memory_mb: u64) -> Self {
         Self { memory_mb, ..self }
+    }
+
+    /// Lets imports read recordings below this directory.
+    #[must_use]
+    pub fn with_import_dir(self, import_dir: Option<PathBuf>) -> Self {
+        Self { import_dir, ..self }
     }
 }
 
@@ -70,6 +81,7 @@ impl JobExecutor for Pipeline {
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
+            JobSpec::Import(spec) => self.import(spec, report, cancelled),
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
             JobSpec::Evaluate(spec) => self.evaluate(spec, report, cancelled),
         };
@@ -84,15 +96,16 @@ impl Pipeline {
     async fn check_spec(&self, spec: JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
-        let data_dir = objects.data_dir().to_owned();
+        let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.import_dir.clone());
         let training = match &spec {
             JobSpec::Train(spec) => Some(spec.clone()),
-            JobSpec::Collect(_) | JobSpec::Evaluate(_) => None,
+            _ => None,
         };
         // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
         let checked = tokio::task::spawn_blocking(move || {
             spec.check(AvailableInputs {
                 data_dir: &data_dir,
+                import_dir: import_dir.as_deref(),
                 datasets: &datasets,
                 models: &models,
             })
@@ -310,103 +323,6 @@ fn retry_while_busy<T, E>(
 #[must_use]
 pub fn report_key(id: &str) -> String {
     format!("reports/{id}")
-}
-
-/// Turns a training's events into the job's report.
-struct TrainingReporter<'a> {
-    report: &'a JobReporter,
-    /// The steps of each stage.
-    steps: [usize; 2],
-    train_loss: Option<f64>,
-}
-
-impl TrainingReporter<'_> {
-    fn on_event(&mut self, event: TrainingEvent) {
-        match event {
-            TrainingEvent::Started { stage, step, windows } => {
-                self.progress(stage, step);
-                self.report.checkpoint(self.done(stage, step));
-                self.report
-                    .line(format!("{stage} from step {step}, on {windows} windows"));
-            }
-            // A point that the last attempt did not write before it was killed must also be in the curves.
-            TrainingEvent::Restored {
-                stage,
-                step,
-                train_loss,
-                validation_loss,
-            } => {
-                self.train_loss = Some(train_loss);
-                self.point(stage, step, Some(validation_loss));
-            }
-            TrainingEvent::Step {
-                stage,
-                step,
-                steps,
-                loss,
-            } => {
-                if step == 1 {
-                    self.report.stage();
-                }
-                self.progress(stage, step);
-                self.train_loss = Some(loss);
-                self.report.losses(Losses {
-                    train: Some(loss),
-                    validation: None,
-                });
-                if step.is_multiple_of(steps.div_ceil(CURVE_POINTS)) {
-                    self.point(stage, step, None);
-                }
-            }
-            TrainingEvent::Validated {
-                stage,
-                step,
-                loss,
-                is_best,
-            } => {
-                self.report.losses(Losses {
-                    train: None,
-                    validation: Some(loss),
-                });
-                self.point(stage, step, Some(loss));
-                let best = if is_best { ", the best so far" } else { "" };
-                self.report
-                    .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
-            }
-            TrainingEvent::CheckpointDamaged { is_previous } => self.report.line(
-                if is_previous {
-                    "the previous checkpoint is damaged too; starting from the beginning"
-                } else {
-                    "the latest checkpoint is damaged; resuming from the previous one"
-                }
-                .to_owned(),
-            ),
-            TrainingEvent::Checkpointed { stage, step } => self.report.checkpoint(self.done(stage, step)),
-        }
-    }
-
-    fn progress(&self, stage: TrainingStage, step: usize) {
-        let total = self.steps.iter().sum::<usize>() as u64;
-        self.report.progress(self.done(stage, step), total, &stage.to_string());
-    }
-
-    /// The steps of both stages that are done.
-    fn done(&self, stage: TrainingStage, step: usize) -> u64 {
-        let [pretrain, _] = self.steps;
-        match stage {
-            TrainingStage::Pretrain => step as u64,
-            TrainingStage::Fit => (pretrain + step) as u64,
-        }
-    }
-
-    fn point(&self, stage: TrainingStage, step: usize, validation: Option<f64>) {
-        self.report.point(LossRow {
-            stage: stage.to_string(),
-            step: step as i64,
-            train: self.train_loss,
-            validation,
-        });
-    }
 }
 
 /// The command that the manifest records.

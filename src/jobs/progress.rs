@@ -15,7 +15,7 @@ const MIN_MEASURED_S: f64 = 1.0;
 /// How much of a job is done.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct JobProgress {
-    /// Units done: trials of a collection, steps of a training, windows of an evaluation.
+    /// Units done: trials of a collection, frames of an import, steps of a training, windows of an evaluation.
     pub done: u64,
     /// Units in total; 0 until it is known.
     pub total: u64,

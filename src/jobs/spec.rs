@@ -1,11 +1,14 @@
 //! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
 
+mod import;
+
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::import::ImportSpec;
 use super::JobError;
 use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
 use crate::error_text;
@@ -29,6 +32,8 @@ pub const MAX_RESAMPLES: usize = 10_000;
 pub enum JobSpec {
     /// Collect a data set from the simulator.
     Collect(CollectSpec),
+    /// Turn a recording on the server into a data set.
+    Import(ImportSpec),
     /// Train a model on a data set.
     Train(TrainSpec),
     /// Measure a model on the held-out trials of a data set.
@@ -115,6 +120,8 @@ fn default_resamples() -> usize {
 pub struct AvailableInputs<'a> {
     /// The data directory.
     pub data_dir: &'a Path,
+    /// The directory that imports may read; without one, they are off.
+    pub import_dir: Option<&'a Path>,
     /// The finished data sets.
     pub datasets: &'a [String],
     /// The versions of each model.
@@ -123,13 +130,14 @@ pub struct AvailableInputs<'a> {
 
 impl JobSpec {
     /// All kinds.
-    pub const KINDS: [&'static str; 3] = ["collect", "train", "evaluate"];
+    pub const KINDS: [&'static str; 4] = ["collect", "import", "train", "evaluate"];
 
     /// Its kind.
     #[must_use]
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Collect(_) => "collect",
+            Self::Import(_) => "import",
             Self::Train(_) => "train",
             Self::Evaluate(_) => "evaluate",
         }
@@ -140,6 +148,7 @@ impl JobSpec {
     pub fn exclusive_output(&self) -> Option<(&'static str, &str)> {
         match self {
             Self::Collect(spec) => Some(("data set", &spec.name)),
+            Self::Import(spec) => Some(("data set", &spec.name)),
             Self::Train(_) | Self::Evaluate(_) => None,
         }
     }
@@ -149,6 +158,7 @@ impl JobSpec {
     pub fn dataset(&self) -> &str {
         match self {
             Self::Collect(spec) => &spec.name,
+            Self::Import(spec) => &spec.name,
             Self::Train(spec) => &spec.dataset,
             Self::Evaluate(spec) => &spec.dataset,
         }
@@ -159,6 +169,7 @@ impl JobSpec {
     pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         match self {
             Self::Collect(spec) => spec.check(available),
+            Self::Import(spec) => spec.check(available),
             Self::Train(spec) => spec.check(available.datasets),
             Self::Evaluate(spec) => spec.check(available),
         }

@@ -42,6 +42,9 @@ pub struct ServerConfig {
     pub database_wait_s: u64,
     /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share. Default: the data directory.
     pub objects_url: Option<String>,
+    /// The directory with the recordings that import jobs may read. Default: none, so imports are off.
+    #[schema(value_type = Option<String>)]
+    pub import_dir: Option<PathBuf>,
     /// If true, this server accepts jobs but leaves the work to workers.
     pub no_jobs: bool,
     /// Maximum size of a request body and of a message of a stream, in bytes.
@@ -161,6 +164,7 @@ impl Default for ServerConfig {
             database_url: None,
             database_wait_s: 60,
             objects_url: None,
+            import_dir: None,
             no_jobs: false,
             max_body_bytes: 8 << 20,
             max_job_bytes: 64 << 10,
@@ -343,6 +347,7 @@ impl ServerConfig {
             program: self.job_program.clone()?,
             store: self.store(),
             models_dir: self.models_dir.clone(),
+            import_dir: self.import_dir.clone(),
             threads: self.job_threads,
             memory_mb: self.job_memory_mb,
         })

@@ -12,6 +12,7 @@ use foreframe::frame::{Frame, codec};
 use crate::bag_files::{
     BagMessage, Chunks, camera_info, compressed_image, image, joint_state, mcap, odometry, twist, twist_stamped,
 };
+use crate::recordings::database as db3;
 
 /// The bags start at this time, in nanoseconds.
 const START_NS: i64 = 1_700_000_000_000_000_000;
@@ -396,31 +397,6 @@ fn a_file_that_is_no_mcap_is_refused() {
         .unwrap_err()
         .to_string();
     assert!(text.contains("not.mcap byte 0: this is not an MCAP file"), "{text}");
-}
-
-/// A database as rosbag2 writes it.
-fn db3(path: &Path, messages: &[BagMessage]) {
-    let connection = rusqlite::Connection::open(path).unwrap();
-    let tables = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
-            serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);
-        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);
-        BEGIN;";
-    connection.execute_batch(tables).unwrap();
-    let mut topics: Vec<&str> = Vec::new();
-    for message in messages {
-        if !topics.contains(&message.topic) {
-            topics.push(message.topic);
-            let row = (topics.len() as i64, message.topic, message.type_name);
-            connection
-                .execute("INSERT INTO topics VALUES (?1, ?2, ?3, 'cdr', '')", row)
-                .unwrap();
-        }
-        let topic = topics.iter().position(|topic| *topic == message.topic).unwrap() as i64 + 1;
-        let row = (topic, message.log_ns, &message.content);
-        let insert = "INSERT INTO messages(topic_id, timestamp, data) VALUES (?1, ?2, ?3)";
-        connection.execute(insert, row).unwrap();
-    }
-    connection.execute_batch("COMMIT").unwrap();
 }
 
 #[test]

@@ -92,6 +92,8 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
     let mut contracts = Contracts::read();
     let valid = [
         json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 2, "seed": u64::MAX}),
+        json!({"kind": "import", "name": "a", "source": "mycar/data", "size": "96x64", "fit": "letterbox", "rate": 5.5,
+            "every": 2, "action": ["/cmd_vel"], "unit": ["speed=m/s"], "hold": 0.5, "skip_bad": true}),
         json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "d", "settings": {"fit": {"steps": 1}}}),
         json!({"kind": "evaluate", "model": "a", "dataset": "d", "version": 1, "windows": 10}),
     ];
@@ -105,6 +107,9 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
         json!({"kind": "train", "name": "a", "scenario": "crowded", "trials": 2}),
         json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 2, "colour": "red"}),
         json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 0}),
+        json!({"kind": "import", "name": "a"}),
+        json!({"kind": "import", "name": "a", "source": "b", "every": 0}),
+        json!({"kind": "import", "name": "a", "source": "b", "size": "small"}),
     ] {
         assert!(contracts.body_mismatch("/v1/jobs", &invalid).is_some(), "{invalid}");
     }

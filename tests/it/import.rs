@@ -9,6 +9,8 @@ use foreframe::dataset::import::{ImportConfig, ImportError, ImportOptions, Impor
 use foreframe::frame::{Frame, codec};
 use serde_json::json;
 
+use crate::recordings::{has_ffmpeg, numpy_array as npy, video};
+
 fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, ImportError> {
     let config = ImportConfig {
         source: source.to_owned(),
@@ -128,16 +130,6 @@ fn a_numpy_array_of_sequences_becomes_episodes() {
     fs::write(&source, &bytes[..bytes.len() - 1]).unwrap();
     let cut = run(&source, &dir.path().join("b"), options).unwrap_err().to_string();
     assert!(cut.contains("the file ends here"), "{cut}");
-}
-
-/// A `NumPy` array of that type and shape.
-fn npy(kind: &str, shape: &str, values: &[u8]) -> Vec<u8> {
-    let text = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}\n");
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((text.len() as u16).to_le_bytes());
-    bytes.extend(text.as_bytes());
-    bytes.extend(values);
-    bytes
 }
 
 fn npz(path: &Path, arrays: &[(&str, Vec<u8>)], method: zip::CompressionMethod) {
@@ -369,4 +361,17 @@ fn a_failed_import_can_be_repeated_with_other_options() {
     };
     assert!(run(&source, &out, wrong).is_err());
     assert_eq!(run(&source, &out, small()).unwrap().info.episode_count, 2);
+}
+
+#[test]
+fn a_playlist_named_as_a_video_reads_no_other_file() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    video(&dir.path().join("other.mp4"), 20);
+    let source = dir.path().join("list.mp4");
+    fs::write(&source, "ffconcat version 1.0\nfile other.mp4\n").unwrap();
+    let error = run(&source, &dir.path().join("out"), small()).unwrap_err().to_string();
+    assert!(error.contains("ffprobe cannot read the video"), "{error}");
 }

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
 use foreframe::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
@@ -11,6 +10,8 @@ use foreframe::dataset::{CollectConfig, Dataset, DatasetError, collect};
 use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::types::Seed;
 use serde_json::{Value, json};
+
+use crate::recordings::has_ffmpeg;
 
 const SIDE: u32 = 32;
 
@@ -72,14 +73,6 @@ fn same_numbers(a: &Dataset, b: &Dataset) -> bool {
             .collect()
     };
     a.episodes().len() == b.episodes().len() && all(a) == all(b)
-}
-
-fn has_ffmpeg() -> bool {
-    let found = Command::new("ffmpeg").arg("-version").output().is_ok();
-    if !found {
-        eprintln!("skipped: ffmpeg is not installed");
-    }
-    found
 }
 
 #[test]

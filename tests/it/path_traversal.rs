@@ -112,6 +112,7 @@ async fn dots_in_paths_are_not_resolved() {
 #[tokio::test]
 async fn names_in_jobs_cannot_leave_the_data_directory() {
     let config = ServerConfig {
+        import_dir: Some(env!("CARGO_MANIFEST_DIR").into()),
         no_jobs: true,
         ..ServerConfig::default()
     };
@@ -120,11 +121,13 @@ async fn names_in_jobs_cannot_leave_the_data_directory() {
     let collect = json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 1});
     let train = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "a"});
     let evaluate = json!({"kind": "evaluate", "model": "plain", "dataset": "a", "twin": "plain"});
+    let import = json!({"kind": "import", "name": "a", "source": "a"});
     let asking = async {
         for (job, fields) in [
             (&collect, &["name", "scenario"][..]),
             (&train, &["name", "preset", "dataset"]),
             (&evaluate, &["dataset"]),
+            (&import, &["name", "source"]),
         ] {
             for field in fields {
                 for name in ["..", "../a", "a/../b", "/etc", "%2e%2e%2fa", "a\0", "a\\b", ""] {

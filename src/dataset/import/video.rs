@@ -10,6 +10,9 @@ use serde_json::Value;
 use super::recording::{DECODED, Images, PixelType, RawImages, Record, Recording};
 use super::{ImportError, ImportOptions};
 
+/// The containers that are read. Without such a list, ffmpeg takes a playlist for a video, and reads the files that it names.
+const CONTAINERS: [&str; 2] = ["-format_whitelist", "mov,matroska,avi"];
+
 /// Decodes a video into a file of gray frames and lists them with their times. Errors: `Program`, `Io`, `Record`.
 pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     if options.csv.is_some() || !options.actions.is_empty() || !options.states.is_empty() {
@@ -111,6 +114,7 @@ pub(super) fn packet_times(video: &Path) -> Result<Vec<f64>, ImportError> {
 fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
     let mut command = Command::new("ffprobe");
     command
+        .args(CONTAINERS)
         .args([
             "-v",
             "error",
@@ -131,7 +135,9 @@ fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
 pub(super) fn decode(video: &Path, decoded: &Path) -> Result<(), ImportError> {
     let mut command = Command::new("ffmpeg");
     command
-        .args(["-v", "error", "-nostdin", "-y", "-xerror", "-i"])
+        .args(["-v", "error", "-nostdin", "-y", "-xerror"])
+        .args(CONTAINERS)
+        .arg("-i")
         .arg(argument(video))
         .args([
             "-map",

@@ -2,6 +2,7 @@
 //! killed continues after its last whole shard.
 
 use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::super::files::{sha256_of_file, write_atomically};
+use super::super::files::{is_unused, sha256_of_file, write_atomically};
 use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use super::super::shard::{EncodedEpisode, ShardStart, build};
 use super::super::shard_reader::records;
@@ -18,14 +19,14 @@ use super::super::{DatasetError, DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording};
 use super::timing::{ImportPlan, PlannedFrame};
 use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
-use crate::files::{remove_stale_partials, sha256_hex};
+use crate::files::{remove_partials, sha256_hex};
 use crate::frame::fit::fit;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.
 const SHARD_FRAMES: usize = 2000;
 /// Images that are decoded in parallel.
 const CHUNK_FRAMES: usize = 256;
-/// What was left out, with the shard in which it would have been.
+/// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
 const SKIPPED: &str = "meta/skipped.json";
 
 /// What decides the bytes of the data set.
@@ -47,6 +48,26 @@ impl<'a> Directory<'a> {
     pub(super) fn claim(config: &'a ImportConfig) -> Result<Self, ImportError> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
+        // The file may be replaced, so the old one is locked first: another import may still use it.
+        let old = if path.is_file() { Some(lock(&path, out)?) } else { None };
+        let lock = match (Self::check(config)?, old) {
+            (None, Some(lock)) => lock,
+            (text, _) => {
+                if let Some(text) = text {
+                    write_atomically(&path, text.as_bytes())?;
+                }
+                lock(&path, out)?
+            }
+        };
+        remove_partials(out);
+        Ok(Self { config, _lock: lock })
+    }
+
+    /// Whether the directory can be taken. Returns the arguments that must be written to it; `None` if it has them already.
+    /// Errors: `OutExists`, `Io`.
+    pub(super) fn check(config: &ImportConfig) -> Result<Option<String>, ImportError> {
+        let out = &config.out;
+        let path = out.join(IMPORT_ARGUMENTS);
         let arguments = ImportArguments {
             program_version: env!("CARGO_PKG_VERSION"),
             source: &config
@@ -62,30 +83,21 @@ impl<'a> Directory<'a> {
             what: what.to_owned(),
         };
         match fs::read_to_string(&path) {
-            Ok(found) if found == text => {}
+            Ok(found) if found == text => Ok(None),
             // An import that failed before its first shard leaves nothing that is worth keeping.
-            Ok(_) if !out.join("data").exists() => write_atomically(&path, text.as_bytes())?,
-            Ok(_) => {
-                return Err(occupied(
-                    "an import with another source or other options; delete it to import again",
-                ));
-            }
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-                let is_unused = !out.exists() || fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_none());
-                if !is_unused {
-                    return Err(occupied("other files"));
+            Ok(_) if !out.join("data").exists() => Ok(Some(text)),
+            Ok(_) => Err(occupied(
+                "an import with another source or other options; delete it to import again",
+            )),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                if is_unused(out, IMPORT_ARGUMENTS)? {
+                    Ok(Some(text))
+                } else {
+                    Err(occupied("other files"))
                 }
-                write_atomically(&path, text.as_bytes())?;
             }
-            Err(error) => return Err(ImportError::io("read", &path)(error)),
+            Err(error) => Err(ImportError::io("read", &path)(error)),
         }
-        let lock = File::open(&path).map_err(ImportError::io("read", &path))?;
-        lock.try_lock().map_err(|error| match error {
-            TryLockError::WouldBlock => ImportError::Dataset(DatasetError::Busy { path: out.clone() }),
-            TryLockError::Error(source) => ImportError::io("lock", &path)(source),
-        })?;
-        remove_stale_partials(out);
-        Ok(Self { config, _lock: lock })
     }
 
     /// The data set, if it is complete. Errors: `Dataset`, `Io`.
@@ -103,12 +115,12 @@ impl<'a> Directory<'a> {
         self.config.out.join(SKIPPED)
     }
 
-    fn read_skipped(&self) -> Result<Vec<(usize, SkippedItem)>, ImportError> {
+    fn read_skipped(&self) -> Result<Vec<(Option<usize>, SkippedItem)>, ImportError> {
         let path = self.skipped_path();
         match fs::read(&path) {
             Ok(text) => serde_json::from_slice(&text)
                 .map_err(|error| ImportError::record(path.display().to_string(), error.to_string())),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Vec::new()),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
             Err(error) => Err(ImportError::io("read", &path)(error)),
         }
     }
@@ -132,7 +144,9 @@ impl<'a> Directory<'a> {
         };
         let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
         let mut done = 0;
+        // Those that the source's lists have are found again by every run.
         let mut skipped = self.read_skipped()?;
+        skipped.retain(|(of, _)| of.is_some());
         for episodes in shards {
             let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
             if cancelled.load(Ordering::Relaxed) {
@@ -140,7 +154,7 @@ impl<'a> Directory<'a> {
             }
             if !writer.resume() {
                 let shard = writer.written.len();
-                skipped.retain(|(of, _)| *of < shard);
+                skipped.retain(|(of, _)| *of != Some(shard));
                 let (encoded, bad) = writer.encode(episodes, cancelled, &|frames| {
                     on_progress(ImportProgress {
                         done: done + frames as u64,
@@ -150,7 +164,7 @@ impl<'a> Directory<'a> {
                 let Some(encoded) = encoded else {
                     return Err(ImportError::Cancelled { done, total });
                 };
-                skipped.extend(bad.into_iter().map(|item| (shard, item)));
+                skipped.extend(bad.into_iter().map(|item| (Some(shard), item)));
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }
@@ -161,23 +175,38 @@ impl<'a> Directory<'a> {
         if written.iter().all(|shard| shard.records.is_empty()) {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
-        // Those that the source's lists have are found again by every run; they come first.
         let listed = plan.recording.skipped.iter().cloned();
-        let all: Vec<(usize, SkippedItem)> = listed.map(|item| (0, item)).chain(skipped).collect();
+        let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
+        all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
-        let info = complete(&self.config.out, info, &written)?;
         video::clean_up(&self.config.out);
+        let info = complete(&self.config.out, info, &written)?;
         Ok(Imported {
             info,
             skipped: all.into_iter().map(|(_, item)| item).collect(),
         })
     }
 
-    fn write_skipped(&self, skipped: &[(usize, SkippedItem)]) -> Result<(), ImportError> {
+    fn write_skipped(&self, skipped: &[(Option<usize>, SkippedItem)]) -> Result<(), ImportError> {
         let text = serde_json::to_vec_pretty(skipped)
             .map_err(|error| ImportError::Option(format!("the list of skipped items cannot be written: {error}")))?;
         Ok(write_atomically(&self.skipped_path(), &text)?)
     }
+}
+
+/// Locks the file of the arguments. Errors: `Dataset` (busy), `Io`.
+fn lock(path: &Path, out: &Path) -> Result<File, ImportError> {
+    let file = File::open(path).map_err(ImportError::io("read", path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(ImportError::Dataset(DatasetError::Busy { path: out.to_owned() })),
+        Err(TryLockError::Error(source)) => Err(ImportError::io("lock", path)(source)),
+    }
+}
+
+/// How many shards an unfinished import has written.
+pub(super) fn saved_shards(out: &Path) -> usize {
+    (0..).take_while(|&shard| out.join(shard_path(shard)).is_file()).count()
 }
 
 fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {

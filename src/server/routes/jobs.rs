@@ -1,4 +1,4 @@
-//! Collection, training and evaluation in the background.
+//! Collection, import, training and evaluation in the background.
 
 use axum::Extension;
 use axum::body::Bytes;
@@ -53,8 +53,8 @@ struct JobList {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct ListQuery {
-    /// `collect`, `train` or `evaluate`.
-    #[param(pattern = "^(collect|train|evaluate)$")]
+    /// `collect`, `import`, `train` or `evaluate`.
+    #[param(pattern = "^(collect|import|train|evaluate)$")]
     kind: Option<String>,
     /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
     state: Option<JobState>,
@@ -137,7 +137,7 @@ impl From<LossRow> for CurvePoint {
     }
 }
 
-/// Queues a collection, a training or an evaluation. Each process runs one job at a time. A finished training publishes
+/// Queues a collection, an import, a training or an evaluation. Each process runs one job at a time. A finished training publishes
 /// the next version of its model. The first version of a name becomes active at once, later ones when they are activated.
 #[utoipa::path(
     post, path = "/v1/jobs", tag = "jobs", request_body = JobSpec,

@@ -1,0 +1,67 @@
+//! The work of an import.
+
+use std::sync::atomic::AtomicBool;
+
+use serde_json::json;
+
+use super::super::datasets;
+use super::super::report::JobReporter;
+use super::super::runner::{JobFailure, JobResult};
+use super::super::spec::ImportSpec;
+use super::{Pipeline, failed, retry_while_busy};
+use crate::dataset::DatasetError;
+use crate::dataset::import::{ImportError, ImportProgress, SkippedItem, import, saved_shards};
+
+/// How many left-out items are written to the job's log; all are in the data set.
+const LOGGED_ITEMS: usize = 200;
+
+impl Pipeline {
+    pub(super) fn import(
+        &self,
+        spec: &ImportSpec,
+        report: &JobReporter,
+        cancelled: &AtomicBool,
+    ) -> Result<JobResult, JobFailure> {
+        let data_dir = self.store.objects().data_dir();
+        let config = spec
+            .config(data_dir, self.import_dir.as_deref())
+            .map_err(|error| failed(&error))?;
+        report.progress(0, 0, "reading the recording");
+        let patience = self.patience(report, cancelled);
+        patience.run(async || datasets::clear_stale_import(self.store.objects(), &spec.name, &config).await)?;
+        // Whole shards are saved; a new attempt continues after them.
+        report.checkpoint(saved_shards(&config.out) as u64);
+        let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
+        let work = || import(&config, &on_progress, cancelled);
+        let is_busy = |error: &ImportError| matches!(error, ImportError::Dataset(DatasetError::Busy { .. }));
+        let imported = retry_while_busy(work, is_busy, cancelled).map_err(|error| failed(&error))?;
+        log_skipped(&imported.skipped, report);
+        patience.run(async || {
+            self.store
+                .objects()
+                .push(&datasets::key(&spec.name), datasets::LAST_FILE)
+                .await
+        })?;
+        let info = imported.info;
+        Ok(JobResult {
+            result: json!({
+                "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
+                "content_hash": info.content_hash, "skipped": imported.skipped.len(),
+            }),
+            published: None,
+            measured: None,
+        })
+    }
+}
+
+fn log_skipped(skipped: &[SkippedItem], report: &JobReporter) {
+    for item in skipped.iter().take(LOGGED_ITEMS) {
+        report.line(format!("left out {}: {}", item.place, item.reason));
+    }
+    if skipped.len() > LOGGED_ITEMS {
+        let count = skipped.len();
+        report.line(format!(
+            "left out {count} items; all are in the data set's meta/skipped.json"
+        ));
+    }
+}
