@@ -48,6 +48,8 @@ mod nn_spec;
 #[cfg(feature = "otlp")]
 mod otlp;
 mod overload;
+#[cfg(unix)]
+mod own_data;
 mod path_traversal;
 mod process;
 mod program;

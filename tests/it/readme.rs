@@ -87,7 +87,7 @@ impl Rule {
 
 /// The commands of a Markdown text: lines of `sh` blocks, and indented lines that begin with a lower-case letter (other
 /// indented lines show output).
-fn commands(markdown: &str) -> Vec<String> {
+pub(crate) fn commands(markdown: &str) -> Vec<String> {
     let (mut commands, mut open) = (Vec::new(), String::new());
     let (mut fence, mut was_blank, mut is_indented) = (None, true, false);
     for line in markdown.lines() {
@@ -119,7 +119,7 @@ fn commands(markdown: &str) -> Vec<String> {
 }
 
 /// A directory as a reader has it, with `foreframe` and a curl that fails on refusals in `bin`.
-fn checkout() -> tempfile::TempDir {
+pub(crate) fn checkout() -> tempfile::TempDir {
     let (dir, project) = (tempfile::tempdir().unwrap(), Path::new(env!("CARGO_MANIFEST_DIR")));
     for name in ["models", "examples"] {
         symlink(project.join(name), dir.path().join(name)).unwrap();
@@ -150,8 +150,8 @@ fn curl() -> Option<String> {
     found.map(|path| path.display().to_string())
 }
 
-/// Runs a command in a shell and returns its standard output.
-fn run(dir: &Path, command: &str) -> String {
+/// Runs a command in a shell, with the directory as home, and returns its standard output.
+pub(crate) fn run(dir: &Path, command: &str) -> String {
     let path = format!("{}:{}", dir.join("bin").display(), std::env::var("PATH").unwrap());
     // For its directory and environment only.
     let template = foreframe(dir);
@@ -163,6 +163,7 @@ fn run(dir: &Path, command: &str) -> String {
         .args(["-c", command])
         .current_dir(dir)
         .env("PATH", path)
+        .env("HOME", dir)
         .output()
         .unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), text(&output.stderr));
