@@ -10,12 +10,14 @@ use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, print_line};
-use crate::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
+use crate::dataset::export::{
+    ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_lerobot_images, to_lerobot_videos, to_mcap, to_mp4,
+};
 use crate::dataset::{Dataset, Episode};
 use crate::evaluation::figures::animation::enlarged_gif;
 use crate::frame::{Frame, codec};
 
-/// Write an episode as images or MP4, or a whole data set for LeRobot.
+/// Write an episode as images or MP4, or a data set for LeRobot or ROS 2.
 ///
 /// Without --to, it writes an episode's frames as PNG, its actions and states as JSON, and a GIF to look at. `foreframe predict`
 /// reads such a directory: frames in order, with an action and a state for each frame.
@@ -24,21 +26,23 @@ use crate::frame::{Frame, codec};
   foreframe export --dataset moving-observer --episode 3 --out look
   foreframe export --dataset static-observer --first 5 --count 10 --out part
   foreframe export --dataset mycar --to lerobot --videos --out mycar-lerobot
+  foreframe export --dataset mycar --to mcap --out mycar.mcap
   foreframe export --dataset mycar --to mp4 --episode 2 --out look.mp4")]
 pub(super) struct ExportArgs {
     /// The directory of a data set, or its name in `DATA_DIR/datasets`
     #[arg(long, value_name = "DATASET")]
     dataset: PathBuf,
-    /// What to write: png (an episode's images), mp4 (an episode as video, with ffmpeg) or lerobot (the data set, version 3)
+    /// What to write: png (an episode's images), mp4 (an episode as video, with ffmpeg), lerobot (the data set, version 3), or
+    /// mcap (a bag of ROS 2 with all episodes, or one)
     #[arg(long, value_enum, default_value_t = ExportFormat::Png)]
     to: ExportFormat,
     /// With --to lerobot: store the frames as H.264 videos (needs ffmpeg; without masks) instead of PNG images
     #[arg(long)]
     videos: bool,
-    /// The episode's number, counted from 0 [default: 0]
+    /// The episode's number, counted from 0 [default: 0; with --to mcap, all]
     #[arg(long)]
     episode: Option<usize>,
-    /// A new directory for the files; with --to mp4, a new file
+    /// A new directory for the files; with --to mp4 or mcap, a new file
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// The first frame of the episode to write, counted from 0
@@ -57,6 +61,7 @@ enum ExportFormat {
     Png,
     Mp4,
     Lerobot,
+    Mcap,
 }
 
 pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
@@ -74,6 +79,10 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     if args.to == ExportFormat::Lerobot {
         return write_lerobot(args, &dataset);
     }
+    if args.to == ExportFormat::Mcap && !is_part {
+        let episodes: Vec<_> = dataset.episodes().iter().map(Episode::frames).collect();
+        return write_mcap(args, &dataset, &episodes);
+    }
     let number = args.episode.unwrap_or(0);
     let find = |episode: &&Episode| episode.index == number;
     let episode = dataset.episodes().iter().find(find).ok_or_else(|| {
@@ -86,6 +95,9 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     let range = selected(args, episode)?;
     if args.to == ExportFormat::Mp4 {
         return write_mp4(args, &dataset, range);
+    }
+    if args.to == ExportFormat::Mcap {
+        return write_mcap(args, &dataset, &[range]);
     }
     let output = OutputDirectory::create(&args.out)?;
     write(&output, &dataset, range.clone())?;
@@ -115,13 +127,42 @@ fn write_lerobot(args: &ExportArgs, dataset: &Dataset) -> Result<(), CliError> {
     ))
 }
 
-fn write_mp4(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
+fn refuse_existing(args: &ExportArgs) -> Result<(), CliError> {
     if args.out.exists() {
         return Err(CliError::Usage(format!(
             "{} exists; name a new file",
             args.out.display()
         )));
     }
+    Ok(())
+}
+
+fn write_mcap(args: &ExportArgs, dataset: &Dataset, episodes: &[Range<usize>]) -> Result<(), CliError> {
+    refuse_existing(args)?;
+    if args.out.extension().is_none_or(|extension| extension != "mcap") {
+        return Err(CliError::Usage(format!(
+            "--out is {}; name a file that ends with .mcap",
+            args.out.display()
+        )));
+    }
+    to_mcap(dataset, episodes, &args.out)?;
+    let (info, out) = (dataset.info(), args.out.display());
+    let frames: usize = episodes.iter().map(ExactSizeIterator::len).sum();
+    print_line(format!("{out}: {} episodes, {frames} frames", episodes.len()))?;
+    let mut command = format!("foreframe import {out} --image {IMAGE_TOPIC}");
+    command += &format!(" --size {}x{}", info.frame_width_px, info.frame_height_px);
+    for (option, topic, channels) in [
+        ("--action", ACTION_TOPIC, &info.action_channels),
+        ("--state", STATE_TOPIC, &info.state_channels),
+    ] {
+        let topic = if channels.is_empty() { "none" } else { topic };
+        command += &format!(" {option} {topic}");
+    }
+    print_line(format!("to import it again: {command}"))
+}
+
+fn write_mp4(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
+    refuse_existing(args)?;
     let frames = range.len();
     to_mp4(dataset, range, &args.out)?;
     print_line(format!("{}: {frames} frames", args.out.display()))

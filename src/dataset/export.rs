@@ -1,7 +1,10 @@
-//! Writes a data set for other programs: `LeRobot` version 3 with images or videos, and one episode as MP4.
+//! Writes a data set for other programs: `LeRobot` version 3 with images or videos, a bag of ROS 2, and one episode as MP4.
 //!
 //! Other programs expect regular times, so frame k of an episode gets the time k · frame period.
 
+mod bag;
+mod cdr;
+mod mcap;
 mod video;
 
 use std::collections::HashMap;
@@ -14,6 +17,7 @@ use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
 use serde_json::{Value, json};
 
+pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
 use super::files::write_atomically;
 use super::layout::{self, EPISODES, IMAGE, INFO, MASK, STATS, TASKS, shard_location, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, batch, build, schema};

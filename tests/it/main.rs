@@ -21,6 +21,7 @@ mod dataset_sampler;
 mod deleted_versions;
 mod environments;
 mod evaluation;
+mod export_mcap;
 mod fit;
 mod fixtures;
 mod healthy_robot;

@@ -1,4 +1,5 @@
-"""Writes bags with the packages rosbags and mcap, imports them with the program, and compares every frame and action.
+"""Writes bags with the packages rosbags and mcap, imports them with the program, and compares every frame and action. Then
+exports one of the data sets as a bag, and reads it with both packages.
 
 Usage: import_bags.py PROGRAM DIRECTORY. Needs rosbags, mcap, mcap-ros2-support, numpy, pillow and pyarrow.
 """
@@ -10,9 +11,12 @@ import sys
 
 import numpy as np
 import pyarrow.parquet as parquet
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
+from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as McapWriter
 from PIL import Image
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -126,6 +130,47 @@ def check(dataset, place):
         assert row["observation.state"] == state, f"{place}: state {index} is {row['observation.state']}"
 
 
+def with_rosbags(path):
+    """Topic, type, time and content of every message of a bag."""
+    with AnyReader([path]) as bag:
+        for connection, time_ns, content in bag.messages():
+            yield connection.topic, connection.msgtype, time_ns, bag.deserialize(content, connection.msgtype)
+
+
+def with_mcap(path):
+    with open(path, "rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        # Reads the summary, then each chunk at its index.
+        assert len(reader.get_summary().chunk_indexes) >= 1, f"{path} has no index of chunks"
+        for schema, channel, message, content in reader.iter_decoded_messages():
+            yield channel.topic, schema.name, message.log_time, content
+
+
+def check_exported(found, place):
+    """The data set of `messages`, exported: TwistStamped as actions, the joints as a JointState with positions only."""
+    by_topic = {}
+    for topic, kind, time_ns, content in found:
+        stamp = content.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == time_ns, f"{place}: {topic} was made at another time"
+        by_topic.setdefault((topic, kind), []).append((time_ns, content))
+    kinds = {
+        ("/camera/image_raw", "sensor_msgs/msg/Image"),
+        ("/action", "geometry_msgs/msg/TwistStamped"),
+        ("/state", "sensor_msgs/msg/JointState"),
+    }
+    assert set(by_topic) == kinds, f"{place}: {set(by_topic)}"
+    images, actions, states = (by_topic[key] for key in sorted(kinds, key=lambda key: "cas".index(key[0][1])))
+    assert len(images) == len(actions) == len(states) == FRAMES, place
+    for index, ((time_ns, image), (_, action), (_, state)) in enumerate(zip(images, actions, states)):
+        assert time_ns - images[0][0] == index * PERIOD_NS, f"{place}: time of frame {index}"
+        assert (image.height, image.width, image.encoding, image.step) == (HEIGHT, WIDTH, "mono8", WIDTH), place
+        pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(HEIGHT, WIDTH)
+        assert np.array_equal(pixels, gray(index)), f"{place}: frame {index} differs"
+        assert (action.twist.linear.x, action.twist.angular.z) == (index, -index), f"{place}: action {index}"
+        names = ["left.position", "right.position", "left.velocity", "right.velocity"]
+        assert list(state.name) == names and list(state.position) == [index, 2.0 * index, 0.5, 0.25], f"{place}: state {index}"
+
+
 def main():
     program, folder = sys.argv[1], pathlib.Path(sys.argv[2])
     folder.mkdir(parents=True)
@@ -154,6 +199,12 @@ def main():
         subprocess.run([program, "import", bag, "--out", out, "--size", size], check=True, stdout=subprocess.DEVNULL)
         check(out, bag)
     print(f"{len(bags)} bags were imported as they were written")
+    exported = folder / "exported.mcap"
+    command = [program, "export", "--dataset", folder / "imported-0", "--to", "mcap", "--out", exported]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    check_exported(with_rosbags(exported), "exported, read with rosbags")
+    check_exported(with_mcap(exported), "exported, read with mcap")
+    print("rosbags and mcap read the exported bag as it was imported")
 
 
 main()
