@@ -45,7 +45,7 @@ async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let server = &config.server;
     let store = open_store_waiting(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
-    let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory_limit(server.job_memory_mb);
+    let pipeline = Pipeline::new(store.clone(), versions, server.job_threads).with_memory(server.job_memory());
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
     let (stopping, is_stopping) = watch::channel(false);
