@@ -1,7 +1,8 @@
 //! Data sets of recorded and simulated episodes, on disk and in memory.
 //!
-//! A [`Dataset`] is completely in memory, with all frames as bytes in one buffer. [`sampler`] divides its [`Window`]s into
-//! training, validation and test parts. [`collect()`] simulates a data set and writes it in LeRobot's v3.0 layout.
+//! A [`Dataset`] holds actions, states and times in memory. Its frames are in memory too, or, if they are too large for that,
+//! decoded in a file. [`sampler`] divides its [`Window`]s into training, validation and test parts. [`collect()`] simulates a
+//! data set and writes it in LeRobot's v3.0 layout.
 
 mod catalog;
 mod check;
@@ -10,6 +11,8 @@ mod collection;
 mod error;
 pub mod export;
 mod files;
+mod frame_file;
+mod frame_store;
 pub mod import;
 mod layout;
 mod preview;
@@ -21,6 +24,7 @@ mod store;
 mod tables;
 mod unfinished;
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use sha2::{Digest, Sha256};
@@ -30,12 +34,14 @@ use check::{check_description, check_episode};
 pub use collect::{CollectConfig, CollectProgress, collect};
 pub use collection::CollectionStatus;
 pub use error::DatasetError;
+use frame_store::{FrameStore, HeldFrames};
 pub use layout::{IMPORT_ARGUMENTS, INFO, METADATA};
 pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 
 use crate::error_text::comma_separated;
 use crate::files::hex;
+use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
 pub use crate::sim::TrialParameters;
 use crate::sim::WorldConfig;
@@ -79,6 +85,13 @@ impl DatasetInfo {
     #[must_use]
     pub fn frame_pixels(&self) -> usize {
         self.frame_width_px as usize * self.frame_height_px as usize
+    }
+
+    /// Bytes of all frames, decoded, with their masks.
+    #[must_use]
+    pub fn decoded_bytes(&self) -> u64 {
+        let images = 1 + u64::from(self.has_masks);
+        self.frame_count as u64 * self.frame_pixels() as u64 * images
     }
 }
 
@@ -129,13 +142,12 @@ pub struct Window {
     pub first_frame: usize,
 }
 
-/// A complete data set in memory.
+/// An open data set.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
     info: DatasetInfo,
     episodes: Vec<Episode>,
-    pixels: Vec<u8>,
-    masks: Option<Vec<u8>>,
+    frames: FrameStore,
     actions: Vec<f32>,
     states: Vec<f32>,
     timestamps_s: Vec<f64>,
@@ -148,17 +160,21 @@ impl Dataset {
         check_description(&info)?;
         let has_masks = episodes.first().is_some_and(|episode| episode.masks.is_some());
         let frame_count: usize = episodes.iter().map(|episode| episode.timestamps_s.len()).sum();
+        let bytes = frame_count * info.frame_pixels();
+        let mut held = HeldFrames {
+            pixels: Vec::with_capacity(bytes),
+            masks: has_masks.then(|| Vec::with_capacity(bytes)),
+        };
         let mut dataset = Self {
             episodes: Vec::with_capacity(episodes.len()),
-            pixels: Vec::with_capacity(frame_count * info.frame_pixels()),
-            masks: has_masks.then(|| Vec::with_capacity(frame_count * info.frame_pixels())),
+            frames: FrameStore::Memory(HeldFrames::zeroed(&DatasetInfo::default())),
             actions: Vec::with_capacity(frame_count * info.action_channels.len()),
             states: Vec::with_capacity(frame_count * info.state_channels.len()),
             timestamps_s: Vec::with_capacity(frame_count),
             info,
         };
         for episode in episodes {
-            dataset.push(episode)?;
+            dataset.push(&mut held, episode)?;
         }
         if dataset.timestamps_s.is_empty() {
             return Err(DatasetError::Empty {
@@ -169,15 +185,16 @@ impl Dataset {
         dataset.info.episode_count = dataset.episodes.len();
         dataset.info.has_masks = has_masks;
         if dataset.info.content_hash.is_empty() {
-            dataset.info.content_hash = dataset.hash_content();
+            dataset.info.content_hash = dataset.hash_content(&held);
         }
+        dataset.frames = FrameStore::Memory(held);
         Ok(dataset)
     }
 
-    fn push(&mut self, data: EpisodeData) -> Result<(), DatasetError> {
+    fn push(&mut self, held: &mut HeldFrames, data: EpisodeData) -> Result<(), DatasetError> {
         let index = self.episodes.len();
         check_episode(&self.info, index, &data)?;
-        match (&mut self.masks, data.masks) {
+        match (&mut held.masks, data.masks) {
             (Some(all), Some(masks)) => all.extend(masks),
             (None, None) => {}
             _ => return Err(DatasetError::MixedMasks { episode: index }),
@@ -188,20 +205,20 @@ impl Dataset {
             frame_count: data.timestamps_s.len(),
             trial: data.trial,
         });
-        self.pixels.extend(data.pixels);
+        held.pixels.extend(data.pixels);
         self.actions.extend(data.actions);
         self.states.extend(data.states);
         self.timestamps_s.extend(data.timestamps_s);
         Ok(())
     }
 
-    fn hash_content(&self) -> String {
+    fn hash_content(&self, held: &HeldFrames) -> String {
         let mut hasher = Sha256::new();
         for episode in &self.episodes {
             hasher.update((episode.frame_count as u64).to_le_bytes());
         }
-        hasher.update(&self.pixels);
-        hasher.update(self.masks.as_deref().unwrap_or_default());
+        hasher.update(&held.pixels);
+        hasher.update(held.masks.as_deref().unwrap_or_default());
         for value in self.actions.iter().chain(&self.states) {
             hasher.update(value.to_le_bytes());
         }
@@ -223,17 +240,29 @@ impl Dataset {
         &self.episodes
     }
 
-    /// The intensities of a frame, row by row. Panics if there is no such frame.
-    #[must_use]
-    pub fn pixels(&self, frame: usize) -> &[u8] {
-        item(&self.pixels, frame, self.info.frame_pixels())
+    /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there
+    /// is no such frame. Errors: `Io`, `Corrupt`; never if the frames are in memory.
+    pub fn pixels(&self, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
+        self.frames.pixels(frame, self.info.frame_pixels())
     }
 
-    /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame.
+    /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame. Errors: as
+    /// [`Dataset::pixels`].
+    pub fn mask(&self, frame: usize) -> Result<Option<Cow<'_, [u8]>>, DatasetError> {
+        self.frames.mask(frame, self.info.frame_pixels())
+    }
+
+    /// A frame. Panics if there is no such frame. Errors: as [`Dataset::pixels`].
+    pub fn frame(&self, frame: usize) -> Result<Frame, DatasetError> {
+        let pixels = self.pixels(frame)?.into_owned();
+        Frame::new(self.info.frame_width_px, self.info.frame_height_px, pixels)
+            .map_err(|error| DatasetError::Description(error.to_string()))
+    }
+
+    /// Bytes of frames and masks that this data set holds in memory; 0 if they are in a file.
     #[must_use]
-    pub fn mask(&self, frame: usize) -> Option<&[u8]> {
-        let masks = self.masks.as_deref()?;
-        Some(item(masks, frame, self.info.frame_pixels()))
+    pub fn frame_bytes_in_memory(&self) -> usize {
+        self.frames.bytes_in_memory()
     }
 
     /// The action from this frame to the next. Panics if there is no such frame.

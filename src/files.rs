@@ -1,6 +1,9 @@
 //! Writes files so that a reader sees either the complete file or none, deletes directories, computes
 //! hashes, and orders file names.
 
+#[cfg(feature = "train")]
+mod positioned;
+
 use std::cmp::Ordering;
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -10,6 +13,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
+
+#[cfg(feature = "train")]
+pub(crate) use self::positioned::PositionedFile;
 
 /// Extension of a file that is being written.
 const PARTIAL: &str = "partial";
@@ -46,7 +52,7 @@ pub(crate) fn open_lock(path: &Path) -> io::Result<File> {
 }
 
 /// The temporary path of a file. It is different in each call, because several writers can write the same file at once.
-fn partial_path(path: &Path) -> io::Result<PathBuf> {
+pub(crate) fn partial_path(path: &Path) -> io::Result<PathBuf> {
     let name = path.file_name();
     let mut name = name
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path does not end with a file name"))?
@@ -67,6 +73,12 @@ pub(crate) fn is_partial_of(path: &Path, found: &Path) -> bool {
 /// Whether the file is being written, or was being written when its writer was killed.
 pub(crate) fn is_partial(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == PARTIAL)
+}
+
+/// Whether the file, or a directory of its path, has a name that begins with a dot.
+pub(crate) fn is_hidden(path: &Path) -> bool {
+    path.components()
+        .any(|part| part.as_os_str().as_encoded_bytes().starts_with(b"."))
 }
 
 /// Deletes old partial files below a directory. Files that cannot be deleted are ignored: they do no harm.

@@ -17,7 +17,7 @@ pub use self::images::{ExposureJump, FrozenSpan, ImageSummary};
 pub use self::page::page;
 pub use self::timing::{FrameTiming, TimeGap};
 
-use crate::dataset::{Dataset, Episode};
+use crate::dataset::{Dataset, DatasetError, Episode};
 
 /// Pictures of the contact sheet.
 const CONTACT_FRAMES: usize = 24;
@@ -89,21 +89,21 @@ impl Histogram {
     }
 }
 
-/// Looks through a whole data set, on all threads of the current pool.
-#[must_use]
-pub fn inspect(dataset: &Dataset) -> Inspection {
+/// Looks through a whole data set, on all threads of the current pool. It keeps some tens of bytes of each frame, not its
+/// pixels. Errors: those of [`Dataset::pixels`].
+pub fn inspect(dataset: &Dataset) -> Result<Inspection, DatasetError> {
     let info = dataset.info();
     let timing = timing::of(dataset);
     let channels = channels::of(dataset);
-    let delays = delays::of(dataset);
-    let images = images::of(dataset);
+    let delays = delays::of(dataset)?;
+    let images = images::of(dataset)?;
     let warnings = [
         timing.warnings(),
         images.warnings(&timing),
         channels::warnings(&channels),
         delays::warnings(&delays, timing.frame_period_s),
     ];
-    Inspection {
+    Ok(Inspection {
         name: info.name.clone(),
         content_hash: info.content_hash.clone(),
         scenario: info.scenario.clone(),
@@ -117,7 +117,7 @@ pub fn inspect(dataset: &Dataset) -> Inspection {
         images,
         contact_sheet: contact_sheet(dataset),
         warnings: warnings.concat(),
-    }
+    })
 }
 
 fn contact_sheet(dataset: &Dataset) -> Vec<FramePlace> {

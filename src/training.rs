@@ -448,11 +448,13 @@ fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> R
 
 /// The distinct frames of windows of `length` frames, in increasing order.
 fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
-    let mut frames: Vec<usize> = windows
-        .iter()
-        .flat_map(|window| window.first_frame..window.first_frame + length)
-        .collect();
-    frames.sort_unstable();
-    frames.dedup();
+    let mut starts: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
+    starts.sort_unstable();
+    let (mut frames, mut next) = (Vec::new(), 0);
+    for start in starts {
+        // Windows overlap; each frame is listed once.
+        frames.extend(next.max(start)..start + length);
+        next = start + length;
+    }
     frames
 }

@@ -17,8 +17,8 @@ use crate::types::Seed;
 
 /// More threads would only wait for each other.
 const MAX_THREADS: i64 = 256;
-/// Data sets with more frames have windows enough for every preset, and take long to read.
-const MAX_COUNTED_FRAMES: usize = 50_000;
+/// Larger data sets have windows enough for every preset, and take long to read.
+const MAX_COUNTED_BYTES: u64 = 400 << 20;
 /// Trials that are enough for a training.
 const ENOUGH_TRIALS: u64 = 40;
 
@@ -107,7 +107,7 @@ fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<Strin
         Scenario::MovingObserver => &["moving"],
         Scenario::Crowded => &["static"],
     };
-    let is_large = info.frame_count > MAX_COUNTED_FRAMES;
+    let is_large = info.decoded_bytes() > MAX_COUNTED_BYTES;
     let dataset = (!is_large).then(|| Dataset::open(out)).transpose()?;
     for preset in presets {
         let config = TrainConfig::preset(preset)?;

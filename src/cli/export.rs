@@ -15,7 +15,7 @@ use crate::dataset::export::{
 };
 use crate::dataset::{Dataset, Episode};
 use crate::evaluation::figures::animation::enlarged_gif;
-use crate::frame::{Frame, codec};
+use crate::frame::codec;
 
 /// Write an episode as images or MP4, or a data set for LeRobot or ROS 2.
 ///
@@ -185,8 +185,7 @@ fn write(output: &OutputDirectory, dataset: &Dataset, range: Range<usize>) -> Re
     let info = dataset.info();
     let mut frames = Vec::with_capacity(range.len());
     for (index, frame) in range.clone().enumerate() {
-        let pixels = dataset.pixels(frame).to_vec();
-        let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels).map_err(CliError::failed)?;
+        let frame = dataset.frame(frame)?;
         let png = codec::encode_png(&frame).map_err(CliError::failed)?;
         output.write(&format!("frame-{index:03}.png"), &png)?;
         frames.push(frame);

@@ -57,7 +57,7 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
         return workspace.load_model(name).map(drop);
     }
     if let Ok(dir) = workspace.find_dataset(path) {
-        return data_set::describe(&dir, args);
+        return data_set::describe(&dir, &workspace.read_dataset(&dir)?, args);
     }
     let datasets_dir = workspace.datasets_dir();
     Err(CliError::Usage(format!(

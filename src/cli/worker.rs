@@ -46,7 +46,7 @@ async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let store = open_store_waiting(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
     let pipeline = Pipeline::new(store.clone(), versions, server.job_threads)
-        .with_memory_limit(server.job_memory_mb)
+        .with_memory(server.job_memory())
         .with_import_dir(server.import_dir.clone());
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;

@@ -35,8 +35,13 @@ impl Workspace {
     /// Reads a data set by its directory or its name.
     pub(super) fn open_dataset(&self, dataset: &Path) -> Result<(PathBuf, Dataset), CliError> {
         let dir = self.find_dataset(dataset)?;
-        let dataset = Dataset::open(&dir)?;
+        let dataset = self.read_dataset(&dir)?;
         Ok((dir, dataset))
+    }
+
+    /// Reads the data set in a directory.
+    pub(super) fn read_dataset(&self, dir: &Path) -> Result<Dataset, CliError> {
+        Ok(Dataset::open_within(dir, self.server().dataset_memory_mb)?)
     }
 
     /// The directory of a data set, by its directory or its name; fetched if data sets are shared with other servers.

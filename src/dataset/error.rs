@@ -134,6 +134,21 @@ pub enum DatasetError {
         /// The system's error.
         source: std::io::Error,
     },
+    /// The decoded frames could not be written.
+    #[error(
+        "could not write the decoded frames of the data set ({megabytes} MiB) to {path}; free disk space or make the directory \
+         writable, or hold the frames in memory with the setting dataset_memory_mb={megabytes} \
+         (FOREFRAME_DATASET_MEMORY_MB={megabytes})",
+        path = path.display()
+    )]
+    FrameFile {
+        /// The file.
+        path: PathBuf,
+        /// Its size in MiB.
+        megabytes: u64,
+        /// The system's error.
+        source: std::io::Error,
+    },
     /// The content of a file is invalid.
     #[error("{path} is damaged or not a file of a Foreframe data set: {reason}", path = path.display())]
     Corrupt {

@@ -124,19 +124,18 @@ fn shards(dataset: &Dataset) -> Vec<&[Episode]> {
 /// The episodes with regular times.
 fn encoded(dataset: &Dataset, info: &DatasetInfo, episodes: &[Episode]) -> Result<Vec<EncodedEpisode>, DatasetError> {
     let encode = |episode: &Episode| {
-        let masks = info.has_masks.then(|| {
-            let masks = episode.frames().filter_map(|frame| dataset.mask(frame));
-            masks.flatten().copied().collect()
-        });
+        let (mut pixels, mut masks) = (Vec::new(), info.has_masks.then(Vec::new));
+        for frame in episode.frames() {
+            pixels.extend_from_slice(&dataset.pixels(frame)?);
+            if let (Some(masks), Some(mask)) = (&mut masks, dataset.mask(frame)?) {
+                masks.extend_from_slice(&mask);
+            }
+        }
         let data = EpisodeData {
             timestamps_s: (0..episode.frame_count)
                 .map(|frame| frame as f64 * info.frame_period_s)
                 .collect(),
-            pixels: episode
-                .frames()
-                .flat_map(|frame| dataset.pixels(frame))
-                .copied()
-                .collect(),
+            pixels,
             masks,
             actions: episode
                 .frames()

@@ -35,8 +35,10 @@ pub(super) const MASK: &str = "observation.mask";
 pub(super) const STATE: &str = "observation.state";
 pub(super) const ACTION: &str = "action";
 pub(super) const TIMESTAMP: &str = "timestamp";
+/// The number of a frame in the data set.
+pub(super) const INDEX: &str = "index";
 /// Counters that LeRobot stores for every frame.
-pub(super) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", "index", "task_index"];
+pub(super) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", INDEX, "task_index"];
 
 /// Number of a shard's chunk directory, and of its file in that directory.
 pub(super) fn shard_location(shard: usize) -> (usize, usize) {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::files::verify;
 use super::layout::{DatasetMetadata, EPISODES};
-use super::shard_reader::{ShardSlot, read};
+use super::shard_reader::{FrameTarget, ShardSlot, read};
 use super::store::read_episodes;
 use super::{Dataset, DatasetError, DatasetInfo};
 use crate::frame::Frame;
@@ -51,13 +51,14 @@ impl Dataset {
         verify(&path, &shard.sha256)?;
         let size = info.frame_pixels();
         let mut pixels = vec![0; shard.frames * size];
-        let mut masks = info.has_masks.then(|| vec![0; shard.frames * size]);
         let mut slot = ShardSlot {
             path,
             frames: shard.frames,
             first_frame,
-            pixels: &mut pixels,
-            masks: masks.as_deref_mut(),
+            target: FrameTarget::Memory {
+                pixels: &mut pixels,
+                masks: None,
+            },
         };
         read(&info, &mut slot)?;
         let start = wanted.first_frame.saturating_sub(first_frame);

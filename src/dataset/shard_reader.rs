@@ -6,12 +6,20 @@ use std::path::{Path, PathBuf};
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
 use arrow_array::{Array, BinaryArray, RecordBatch, StructArray};
-use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::{
+    ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder,
+};
 
-use super::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
+use super::check::Numbers;
+use super::frame_file::{FrameFileWriter, FrameImage};
+use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
 use super::shard::{EpisodeRecord, RECORDS_KEY};
-use super::{DatasetError, DatasetInfo};
+use super::{DatasetError, DatasetInfo, Episode};
 use crate::frame::codec;
+
+/// Rows that are read at a time, with their images.
+const IMAGE_ROWS: usize = 64;
 
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
 pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
@@ -42,17 +50,29 @@ fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
     }
 }
 
-/// The memory into which a shard is read, and the expected number of frames.
+/// Where the decoded frames of a shard go.
+pub(super) enum FrameTarget<'a> {
+    /// The memory of the shard's frames.
+    Memory {
+        pixels: &'a mut [u8],
+        masks: Option<&'a mut [u8]>,
+    },
+    /// The file of all frames.
+    File(&'a FrameFileWriter<'a>),
+    /// The images are not read.
+    Nothing,
+}
+
+/// A shard to read, the expected number of frames, and where the frames go.
 pub(super) struct ShardSlot<'a> {
     pub(super) path: PathBuf,
     pub(super) frames: usize,
     /// Its first frame, counted over the whole data set.
     pub(super) first_frame: usize,
-    pub(super) pixels: &'a mut [u8],
-    pub(super) masks: Option<&'a mut [u8]>,
+    pub(super) target: FrameTarget<'a>,
 }
 
-/// Actions, states and timestamps of a shard's frames.
+/// Actions, states and timestamps of frames.
 #[derive(Default)]
 pub(super) struct ShardNumbers {
     pub(super) actions: Vec<f32>,
@@ -60,11 +80,42 @@ pub(super) struct ShardNumbers {
     pub(super) timestamps_s: Vec<f64>,
 }
 
-/// Decodes a shard's frames into the slot's memory. Errors: `Io`, `Corrupt`, `CorruptFrame`.
+impl ShardNumbers {
+    /// The numbers of a whole data set from those of its shards.
+    pub(super) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
+        let mut all = Self {
+            actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
+            states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
+            timestamps_s: Vec::with_capacity(info.frame_count),
+        };
+        for part in parts {
+            all.actions.extend(part.actions);
+            all.states.extend(part.states);
+            all.timestamps_s.extend(part.timestamps_s);
+        }
+        all
+    }
+
+    /// The numbers of an episode from those of its data set.
+    pub(super) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
+        let frames = episode.frames();
+        let (actions, states) = (info.action_channels.len(), info.state_channels.len());
+        Numbers {
+            actions: &self.actions[frames.start * actions..frames.end * actions],
+            states: &self.states[frames.start * states..frames.end * states],
+            timestamps_s: &self.timestamps_s[frames],
+        }
+    }
+}
+
+/// Reads a shard, a few rows at a time, and decodes its frames into the slot's target.
+/// Errors: `Io`, `Corrupt`, `CorruptFrame`, `FrameFile`.
 pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
     let mut numbers = ShardNumbers::default();
     let mut row = 0;
-    for batch in batches(&slot.path)? {
+    let with_images = !matches!(slot.target, FrameTarget::Nothing);
+    for batch in reader(&slot.path, with_images)? {
+        let batch = batch.map_err(|error| corrupt(&slot.path, &error))?;
         if row + batch.num_rows() > slot.frames {
             return Err(wrong_rows(slot, row + batch.num_rows()));
         }
@@ -75,6 +126,21 @@ pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
         return Err(wrong_rows(slot, row));
     }
     Ok(numbers)
+}
+
+fn reader(path: &Path, with_images: bool) -> Result<ParquetRecordBatchReader, DatasetError> {
+    let file = File::open(path).map_err(DatasetError::io("read", path))?;
+    let built = ParquetRecordBatchReaderBuilder::try_new(file).and_then(|builder| {
+        if with_images {
+            return builder.with_batch_size(IMAGE_ROWS).build();
+        }
+        let columns = builder.schema().fields().iter().enumerate();
+        let numbers = columns.filter(|(_, column)| ![IMAGE, MASK].contains(&column.name().as_str()));
+        let numbers = numbers.map(|(index, _)| index).collect::<Vec<usize>>();
+        let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
+        builder.with_projection(columns).build()
+    });
+    built.map_err(|error| corrupt(path, &error))
 }
 
 fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
@@ -91,15 +157,36 @@ fn read_batch(
     row: usize,
     numbers: &mut ShardNumbers,
 ) -> Result<(), DatasetError> {
-    let range = row * info.frame_pixels()..(row + batch.num_rows()) * info.frame_pixels();
-    let target = ImageTarget {
+    let images = ImageBatch {
         info,
         path: &slot.path,
+        batch,
         row,
     };
-    target.decode(batch, IMAGE, &mut slot.pixels[range.clone()])?;
-    if let Some(masks) = &mut slot.masks {
-        target.decode(batch, MASK, &mut masks[range])?;
+    let size = info.frame_pixels();
+    match &mut slot.target {
+        FrameTarget::Memory { pixels, masks } => {
+            let copy =
+                |to: &mut [u8], row: usize, frame: &[u8]| to[row * size..(row + 1) * size].copy_from_slice(frame);
+            images.decode(IMAGE, |row, frame| {
+                copy(pixels, row, frame);
+                Ok(())
+            })?;
+            if let Some(masks) = masks {
+                images.decode(MASK, |row, mask| {
+                    copy(masks, row, mask);
+                    Ok(())
+                })?;
+            }
+        }
+        FrameTarget::File(file) => {
+            let first = slot.first_frame;
+            images.decode(IMAGE, |row, frame| file.write(FrameImage::Pixels, first + row, frame))?;
+            if info.has_masks {
+                images.decode(MASK, |row, mask| file.write(FrameImage::Mask, first + row, mask))?;
+            }
+        }
+        FrameTarget::Nothing => {}
     }
     let column = Column {
         batch,
@@ -112,7 +199,7 @@ fn read_batch(
     let times = column.numbers::<Float32Type>(TIMESTAMP)?;
     numbers.timestamps_s.extend(times.iter().map(|&time| f64::from(time)));
     let first = (slot.first_frame + row) as i64;
-    let indexes = column.numbers::<Int64Type>("index")?;
+    let indexes = column.numbers::<Int64Type>(INDEX)?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
         return Err(corrupt(
             &slot.path,
@@ -122,35 +209,42 @@ fn read_batch(
     Ok(())
 }
 
-/// Decodes the images of a batch into memory.
-struct ImageTarget<'a> {
+/// The images of a batch.
+struct ImageBatch<'a> {
     info: &'a DatasetInfo,
     path: &'a Path,
+    batch: &'a RecordBatch,
+    /// The batch's first row in the shard.
     row: usize,
 }
 
-impl ImageTarget<'_> {
-    fn decode(&self, batch: &RecordBatch, key: &'static str, pixels: &mut [u8]) -> Result<(), DatasetError> {
-        let images = image_bytes(batch, key)
+impl ImageBatch<'_> {
+    /// Decodes a column, and gives each image's row in the shard and its pixels to `take`.
+    fn decode(
+        &self,
+        key: &'static str,
+        mut take: impl FnMut(usize, &[u8]) -> Result<(), DatasetError>,
+    ) -> Result<(), DatasetError> {
+        let images = image_bytes(self.batch, key)
             .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
-        for (row, target) in pixels.chunks_mut(self.info.frame_pixels()).enumerate() {
-            let frame = codec::decode(images.value(row)).map_err(|source| DatasetError::CorruptFrame {
+        let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
+        for index in 0..images.len() {
+            let row = self.row + index;
+            let frame = codec::decode(images.value(index)).map_err(|source| DatasetError::CorruptFrame {
                 path: self.path.to_owned(),
-                row: self.row + row,
+                row,
                 column: key,
                 source,
             })?;
-            let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
             if (frame.width(), frame.height()) != (width, height) {
                 let reason = format!(
-                    "{key} in row {} is {}×{} px; the data set has frames of {width}×{height} px",
-                    self.row + row,
+                    "{key} in row {row} is {}×{} px; the data set has frames of {width}×{height} px",
                     frame.width(),
                     frame.height()
                 );
                 return Err(corrupt(self.path, &reason));
             }
-            target.copy_from_slice(frame.pixels());
+            take(row, frame.pixels())?;
         }
         Ok(())
     }

@@ -1,93 +1,142 @@
 //! Reads a complete data set from disk, and writes the tables and metadata that complete one.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use arrow_array::types::Int64Type;
 use rayon::prelude::*;
 
-use super::check::{Numbers, check_numbers};
+use super::check::check_numbers;
 use super::files::{verify, write_atomically};
+use super::frame_file::{FrameFile, FrameFilePlace};
+use super::frame_store::{FrameStore, HeldFrames};
 use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, ShardEntry, TASKS};
 use super::shard::EpisodeRecord;
-use super::shard_reader::{Column, ShardNumbers, ShardSlot, batches, read};
+use super::shard_reader::{Column, FrameTarget, ShardNumbers, ShardSlot, batches, read};
 use super::tables::{self, EpisodeRow};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
 use crate::files::sha256_hex;
 
 impl Dataset {
-    /// Reads a complete data set and verifies the hash of every file.
+    /// Reads a complete data set into memory and verifies the hash of every file.
     /// Errors: `NotADataset`, `Unfinished`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `Io`, `NotFinite`, `TimeOrder`.
     pub fn open(directory: &Path) -> Result<Self, DatasetError> {
+        Self::open_within(directory, u64::MAX >> 20)
+    }
+
+    /// As [`Dataset::open`], but holds the frames in memory only if they need at most `memory_mb` MiB. Otherwise they are
+    /// decoded into a file in the directory `.cache` of the data set, unless an earlier call did so, and are read from there
+    /// when they are used. Errors: as [`Dataset::open`], and `FrameFile`.
+    pub fn open_within(directory: &Path, memory_mb: u64) -> Result<Self, DatasetError> {
         let metadata = DatasetMetadata::read(directory)?;
         let info = metadata.info_in(directory)?;
         let path = directory.join(EPISODES);
         verify(&path, &metadata.episodes_sha256)?;
         let episodes = read_episodes(&path, &info)?;
-        let mut dataset = Self {
-            pixels: vec![0; info.frame_count * info.frame_pixels()],
-            masks: info.has_masks.then(|| vec![0; info.frame_count * info.frame_pixels()]),
-            actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
-            states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
-            timestamps_s: Vec::with_capacity(info.frame_count),
+        let shards = ShardReader {
+            directory,
+            info: &info,
+            shards: &metadata.shards,
+        };
+        let (frames, numbers) = if info.decoded_bytes() <= memory_mb << 20 {
+            let mut held = HeldFrames::zeroed(&info);
+            let numbers = shards.read(held.targets(&info, &metadata.shards))?;
+            (FrameStore::Memory(held), numbers)
+        } else {
+            let (file, numbers) = shards.decode_once()?;
+            (FrameStore::File(Arc::new(file)), numbers)
+        };
+        for episode in &episodes {
+            check_numbers(&info, episode.index, &numbers.of_episode(&info, episode))?;
+        }
+        Ok(Self {
+            frames,
+            actions: numbers.actions,
+            states: numbers.states,
+            timestamps_s: numbers.timestamps_s,
             info,
             episodes,
-        };
-        let info = dataset.info.clone();
-        let slots = slots(&mut dataset, directory, &metadata.shards);
-        let numbers: Result<Vec<ShardNumbers>, DatasetError> = slots
-            .into_par_iter()
-            .zip(&metadata.shards)
-            .map(|(mut slot, entry)| {
-                verify(&slot.path, &entry.sha256)?;
-                read(&info, &mut slot)
-            })
-            .collect();
-        for part in numbers? {
-            dataset.actions.extend(part.actions);
-            dataset.states.extend(part.states);
-            dataset.timestamps_s.extend(part.timestamps_s);
-        }
-        for episode in &dataset.episodes {
-            let frames = episode.frames();
-            let actions = dataset.info.action_channels.len();
-            let states = dataset.info.state_channels.len();
-            check_numbers(
-                &dataset.info,
-                episode.index,
-                &Numbers {
-                    actions: &dataset.actions[frames.start * actions..frames.end * actions],
-                    states: &dataset.states[frames.start * states..frames.end * states],
-                    timestamps_s: &dataset.timestamps_s[frames],
-                },
-            )?;
-        }
-        Ok(dataset)
+        })
     }
 }
 
-/// Divides the buffers of the data set among its shards.
-fn slots<'a>(dataset: &'a mut Dataset, directory: &Path, shards: &[ShardEntry]) -> Vec<ShardSlot<'a>> {
-    let size = dataset.info.frame_pixels();
-    let mut pixels = dataset.pixels.as_mut_slice();
-    let mut masks = dataset.masks.as_deref_mut();
-    let mut first_frame = 0;
-    let mut slots = Vec::with_capacity(shards.len());
-    for shard in shards {
-        let (own, rest) = std::mem::take(&mut pixels).split_at_mut(shard.frames * size);
-        pixels = rest;
-        let mask = masks.take().map(|all| all.split_at_mut(shard.frames * size));
-        let (mask, rest) = mask.map_or((None, None), |(own, rest)| (Some(own), Some(rest)));
-        masks = rest;
-        slots.push(ShardSlot {
-            path: directory.join(&shard.path),
-            frames: shard.frames,
-            first_frame,
-            pixels: own,
-            masks: mask,
+/// Reads all shards of a data set.
+struct ShardReader<'a> {
+    directory: &'a Path,
+    info: &'a DatasetInfo,
+    shards: &'a [ShardEntry],
+}
+
+impl ShardReader<'_> {
+    /// Verifies the shards and reads them in parallel; each shard's frames go to one of the targets.
+    fn read(&self, targets: Vec<FrameTarget<'_>>) -> Result<ShardNumbers, DatasetError> {
+        let mut first_frame = 0;
+        let places = self.shards.iter().map(|shard| {
+            first_frame += shard.frames;
+            first_frame - shard.frames
         });
-        first_frame += shard.frames;
+        let slots: Vec<ShardSlot<'_>> = self
+            .shards
+            .iter()
+            .zip(places)
+            .zip(targets)
+            .map(|((shard, first_frame), target)| ShardSlot {
+                path: self.directory.join(&shard.path),
+                frames: shard.frames,
+                first_frame,
+                target,
+            })
+            .collect();
+        let parts: Result<Vec<ShardNumbers>, DatasetError> = slots
+            .into_par_iter()
+            .zip(self.shards)
+            .map(|(mut slot, entry)| {
+                verify(&slot.path, &entry.sha256)?;
+                read(self.info, &mut slot)
+            })
+            .collect();
+        Ok(ShardNumbers::joined(self.info, parts?))
     }
-    slots
+
+    /// Opens the file of decoded frames, which is written first if it does not exist.
+    fn decode_once(&self) -> Result<(FrameFile, ShardNumbers), DatasetError> {
+        let place = FrameFilePlace::of(self.directory, self.info);
+        let without_frames = || self.read(self.shards.iter().map(|_| FrameTarget::Nothing).collect());
+        if let Some(file) = place.open()? {
+            return Ok((file, without_frames()?));
+        }
+        let _lock = place.lock()?;
+        // Another process may have written it meanwhile.
+        if let Some(file) = place.open()? {
+            return Ok((file, without_frames()?));
+        }
+        let writer = place.create()?;
+        let targets = self.shards.iter().map(|_| FrameTarget::File(&writer)).collect();
+        let numbers = self.read(targets)?;
+        Ok((writer.finish()?, numbers))
+    }
+}
+
+impl HeldFrames {
+    /// Divides the memory among the shards.
+    fn targets(&mut self, info: &DatasetInfo, shards: &[ShardEntry]) -> Vec<FrameTarget<'_>> {
+        let mut pixels = self.pixels.as_mut_slice();
+        let mut masks = self.masks.as_deref_mut();
+        let mut targets = Vec::with_capacity(shards.len());
+        for shard in shards {
+            let bytes = shard.frames * info.frame_pixels();
+            let (own, rest) = std::mem::take(&mut pixels).split_at_mut(bytes);
+            pixels = rest;
+            let mask = masks.take().map(|all| all.split_at_mut(bytes));
+            let (mask, rest) = mask.map_or((None, None), |(own, rest)| (Some(own), Some(rest)));
+            masks = rest;
+            targets.push(FrameTarget::Memory {
+                pixels: own,
+                masks: mask,
+            });
+        }
+        targets
+    }
 }
 
 /// Reads the table of episodes. Errors: `Io`, `Corrupt`.

@@ -185,12 +185,12 @@ fn errors_of(
     let error = |(frames, window): (&[f32], &Window)| {
         let steps = frames.chunks_exact(spec.pixels()).enumerate();
         let mse = steps.map(|(step, frame)| {
-            let truth = scale(dataset.pixels(window.first_frame + spec.context + step));
-            quality::mse(&spec.preprocess.inverse(frame), &truth)
+            let truth = scale(&*dataset.pixels(window.first_frame + spec.context + step)?);
+            Ok(quality::mse(&spec.preprocess.inverse(frame), &truth))
         });
         mse.collect()
     };
-    Ok(frames.zip(windows).map(error).collect())
+    frames.zip(windows).map(error).collect()
 }
 
 /// The table of these errors per variant, window and step; the true actions come first.

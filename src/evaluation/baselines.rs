@@ -131,16 +131,17 @@ pub struct Baselines {
 
 impl Baselines {
     /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
-    /// training window of that shape exists there is no nearest one. Errors: those of [`Splits::windows`].
+    /// training window of that shape exists there is no nearest one. All but the mean training frame look only at a limited
+    /// number of windows or frames, evenly spread. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
     pub fn fit(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Self, EvaluationError> {
         let ego_motion = match CameraTurn::of(dataset.info()) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
             None => {
-                AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?).map(EgoMotion::Flow)
+                AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?)?.map(EgoMotion::Flow)
             }
         };
         let windows = training_windows(dataset, splits, shape)?;
-        let nearest = TrainingWindows::new(dataset, &evenly(&windows, nearest::MAX_WINDOWS), shape);
+        let nearest = TrainingWindows::new(dataset, &evenly(&windows, nearest::MAX_WINDOWS), shape)?;
         let single = WindowShape { context: 1, horizon: 1 };
         let frames = training_windows(dataset, splits, single)?;
         let methods = Method::ALL.into_iter().filter(|method| match method {
@@ -152,7 +153,7 @@ impl Baselines {
             methods: methods.collect(),
             width: dataset.info().frame_width_px as usize,
             training_mean: training_mean(dataset, splits)?,
-            cut_out: CutOut::fit(dataset, &frames),
+            cut_out: CutOut::fit(dataset, &frames)?,
             ego_motion,
             nearest,
         })
@@ -172,13 +173,18 @@ impl Baselines {
     }
 
     /// The frames 1…`horizon` steps ahead as a baseline predicts them; none for a method that is no baseline or that does
-    /// not apply to the data set.
-    #[must_use]
-    pub fn predict(&self, dataset: &Dataset, method: Method, input: &BaselineInput, horizon: usize) -> Vec<Vec<f32>> {
+    /// not apply to the data set. Errors: those of [`Dataset::pixels`].
+    pub fn predict(
+        &self,
+        dataset: &Dataset,
+        method: Method,
+        input: &BaselineInput,
+        horizon: usize,
+    ) -> Result<Vec<Vec<f32>>, EvaluationError> {
         let Some(last) = input.inputs.last() else {
-            return Vec::new();
+            return Ok(Vec::new());
         };
-        match method {
+        Ok(match method {
             Method::CopyLast => vec![last.clone(); horizon],
             Method::MeanOfInputs => vec![mean(input.inputs); horizon],
             Method::MeanTrainingFrame => vec![self.training_mean.clone(); horizon],
@@ -191,11 +197,11 @@ impl Baselines {
             },
             Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
             Method::NearestWindow => match &self.nearest {
-                Some(windows) => windows.predict(dataset, input.inputs, horizon),
+                Some(windows) => windows.predict(dataset, input.inputs, horizon)?,
                 None => Vec::new(),
             },
             Method::Model | Method::CodecOnly => Vec::new(),
-        }
+        })
     }
 }
 
@@ -208,8 +214,8 @@ fn training_windows(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> R
 }
 
 /// A frame of a data set, 0…1.
-fn frame_of(dataset: &Dataset, frame: usize) -> Vec<f32> {
-    scale(dataset.pixels(frame))
+fn frame_of(dataset: &Dataset, frame: usize) -> Result<Vec<f32>, EvaluationError> {
+    Ok(scale(&dataset.pixels(frame)?))
 }
 
 fn mean(frames: &[Vec<f32>]) -> Vec<f32> {
@@ -319,10 +325,10 @@ mod tests {
         let (baselines, splits) = fitted(dataset);
         let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
         let errors = windows.iter().flat_map(|&window| {
-            let frame = |step: usize| frame_of(dataset, window.first_frame + step);
+            let frame = |step: usize| frame_of(dataset, window.first_frame + step).unwrap();
             let inputs: Vec<Vec<f32>> = (0..SHAPE.context).map(frame).collect();
             let input = BaselineInput::of_window(dataset, window, SHAPE, &inputs);
-            let predicted = baselines.predict(dataset, method, &input, SHAPE.horizon);
+            let predicted = baselines.predict(dataset, method, &input, SHAPE.horizon).unwrap();
             assert_eq!(predicted.len(), SHAPE.horizon, "{method:?}");
             let errors: Vec<f64> = predicted
                 .iter()
@@ -389,14 +395,14 @@ mod tests {
         let shape = WindowShape { context: 1, horizon: 1 };
         let splits = Splits::new(&dataset, Seed(1));
         let baselines = Baselines::fit(&dataset, &splits, shape).unwrap();
-        let inputs = [frame_of(&dataset, 0)];
+        let inputs = [frame_of(&dataset, 0).unwrap()];
         let window = Window {
             episode: 0,
             first_frame: 0,
         };
         let input = BaselineInput::of_window(&dataset, window, shape, &inputs);
         for method in baselines.methods().iter().filter(|method| method.is_baseline()) {
-            let predicted = baselines.predict(&dataset, *method, &input, 1);
+            let predicted = baselines.predict(&dataset, *method, &input, 1).unwrap();
             assert!(mse(&predicted[0], &inputs[0]) < 1e-6, "{method:?}");
         }
     }

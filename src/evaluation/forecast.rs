@@ -94,15 +94,16 @@ fn forecast_batch(
             frames: &frames,
             actions: &predicted.actions[index * actions_each..][..actions_each],
         };
-        let truth = |step: usize| scale(dataset.pixels(window.first_frame + spec.context + step));
-        let errors = values.chunks_exact(pixels).enumerate();
+        let mut errors = Vec::with_capacity(spec.horizon);
+        for (step, frame) in values.chunks_exact(pixels).enumerate() {
+            let truth = scale(&dataset.pixels(window.first_frame + spec.context + step)?);
+            errors.push(quality::mse(&spec.preprocess.inverse(frame), &truth));
+        }
         let expected = |calibration: &Calibration| future.expected_errors(calibration);
         found.push(Forecast {
             inputs: future.error_inputs(novelty),
             expected: loaded.manifest.calibration.as_ref().map(expected).unwrap_or_default(),
-            errors: errors
-                .map(|(step, frame)| quality::mse(&spec.preprocess.inverse(frame), &truth(step)))
-                .collect(),
+            errors,
             context,
         });
     }

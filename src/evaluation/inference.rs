@@ -5,7 +5,6 @@ use rayon::prelude::*;
 
 use super::EvaluationError;
 use crate::dataset::{Dataset, Window};
-use crate::frame::Frame;
 use crate::frame::fit::{Fit, fit};
 use crate::frame::preprocess::Preprocess;
 use crate::nn::{ConditioningTensors, Feedback, ModelSpec};
@@ -151,15 +150,14 @@ pub(super) fn fitted_frames(
     spec: &ModelSpec,
     frames: &[usize],
 ) -> Result<Vec<f32>, EvaluationError> {
-    let info = dataset.info();
     let mut all = Vec::with_capacity(frames.len() * spec.pixels());
     for &frame in frames {
-        let frame = Frame::new(
-            info.frame_width_px,
-            info.frame_height_px,
-            dataset.pixels(frame).to_vec(),
+        let frame = fit(
+            &dataset.frame(frame)?,
+            spec.frame_width_px,
+            spec.frame_height_px,
+            Fit::Crop,
         )?;
-        let frame = fit(&frame, spec.frame_width_px, spec.frame_height_px, Fit::Crop)?;
         all.extend(spec.preprocess.forward(&frame));
     }
     Ok(all)
@@ -176,19 +174,16 @@ fn model_space(
     windows: &[Window],
     steps: std::ops::Range<usize>,
 ) -> Result<Vec<f32>, EvaluationError> {
-    let info = dataset.info();
     let frames: Vec<usize> = windows
         .iter()
         .flat_map(|window| steps.clone().map(|step| window.first_frame + step))
         .collect();
-    let size = info.frame_pixels();
+    let size = dataset.info().frame_pixels();
     let mut all = vec![0.0; frames.len() * size];
     all.par_chunks_mut(size)
         .zip(frames)
         .try_for_each(|(out, frame)| -> Result<(), EvaluationError> {
-            let pixels = dataset.pixels(frame).to_vec();
-            let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels)?;
-            out.copy_from_slice(&preprocess.forward(&frame));
+            out.copy_from_slice(&preprocess.forward(&dataset.frame(frame)?));
             Ok(())
         })?;
     Ok(all)

@@ -153,7 +153,7 @@ fn futures(
             branch.step(&action(frame)?)?;
         }
         let replayed = scale(branch.observe().frame.pixels());
-        if quality::mse(&replayed, &scale(dataset.pixels(last))) > REPLAY_TOLERANCE {
+        if quality::mse(&replayed, &scale(&dataset.pixels(last)?)) > REPLAY_TOLERANCE {
             return Ok(None);
         }
         let first_action = plan.first_frame + spec.context - 1;

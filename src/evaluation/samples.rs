@@ -71,15 +71,7 @@ fn frames(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, Evaluation
 }
 
 fn camera_frames(dataset: &Dataset, frames: std::ops::Range<usize>) -> Result<Vec<Frame>, EvaluationError> {
-    let info = dataset.info();
-    let frame = |frame| {
-        Frame::new(
-            info.frame_width_px,
-            info.frame_height_px,
-            dataset.pixels(frame).to_vec(),
-        )
-    };
-    Ok(frames.map(frame).collect::<Result<_, _>>()?)
+    Ok(frames.map(|frame| dataset.frame(frame)).collect::<Result<_, _>>()?)
 }
 
 fn chart(split: Split, scores: &SetScores) -> Chart {

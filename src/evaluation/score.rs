@@ -8,7 +8,7 @@ use super::inference::{Predicted, predict_with_ceiling};
 use super::metrics::{FrameScore, TargetFrame, WindowScores};
 use super::{EvaluationContext, EvaluationError, EvaluationStage};
 use crate::dataset::sampler::{Split, Splits, WindowShape};
-use crate::dataset::{Dataset, Window};
+use crate::dataset::{Dataset, DatasetError, Window};
 use crate::frame::preprocess::scale;
 use crate::frame::quality;
 use crate::nn::ModelSpec;
@@ -24,13 +24,13 @@ pub fn evenly(windows: &[Window], count: usize) -> Vec<Window> {
 }
 
 /// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
-/// Errors: those of [`Splits::windows`].
+/// Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
 pub fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
     let pair = WindowShape { context: 1, horizon: 1 };
     let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
     let mut sums = vec![0_u64; dataset.info().frame_pixels()];
     for pair in &pairs {
-        for (sum, &value) in sums.iter_mut().zip(dataset.pixels(pair.first_frame)) {
+        for (sum, &value) in sums.iter_mut().zip(&*dataset.pixels(pair.first_frame)?) {
             *sum += u64::from(value);
         }
     }
@@ -50,11 +50,12 @@ pub fn score(
     let mut scores = Vec::with_capacity(windows.len());
     for batch in windows.chunks(watched.batch) {
         let predicted = predict_with_ceiling(loaded, dataset, batch)?;
-        let scored = batch
+        let scored: Result<Vec<WindowScores>, EvaluationError> = batch
             .par_iter()
             .enumerate()
-            .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, baselines));
-        scores.par_extend(scored);
+            .map(|(place, &window)| score_window(spec, dataset, (place, window), &predicted, baselines))
+            .collect();
+        scores.extend(scored?);
         watched.report(EvaluationStage::Scores, scores.len(), windows.len())?;
     }
     Ok(scores)
@@ -66,7 +67,7 @@ fn score_window(
     (place, window): (usize, Window),
     predicted: &Predicted,
     baselines: &Baselines,
-) -> WindowScores {
+) -> Result<WindowScores, EvaluationError> {
     let (pixels, horizon) = (spec.pixels(), spec.horizon);
     let width = spec.frame_width_px as usize;
     let here = place * horizon * pixels..(place + 1) * horizon * pixels;
@@ -74,9 +75,12 @@ fn score_window(
         let frames = values[here.clone()].chunks_exact(pixels);
         frames.map(|frame| spec.preprocess.inverse(frame)).collect()
     };
-    let frame = |step: usize| scale(dataset.pixels(window.first_frame + step));
-    let inputs: Vec<Vec<f32>> = (0..spec.context).map(frame).collect();
-    let truth: Vec<Vec<f32>> = (spec.context..spec.context + horizon).map(frame).collect();
+    let frame = |step: usize| Ok(scale(&*dataset.pixels(window.first_frame + step)?));
+    let inputs = (0..spec.context).map(frame).collect::<Result<Vec<_>, DatasetError>>()?;
+    let future = spec.context..spec.context + horizon;
+    let truth = future.clone().map(frame).collect::<Result<Vec<_>, DatasetError>>()?;
+    let mask = |step: usize| dataset.mask(window.first_frame + step);
+    let masks = future.map(mask).collect::<Result<Vec<_>, DatasetError>>()?;
     let shape = WindowShape {
         context: spec.context,
         horizon,
@@ -89,16 +93,16 @@ fn score_window(
             let predictions = match method {
                 Method::Model => camera_space(&predicted.frames),
                 Method::CodecOnly => camera_space(&predicted.codec),
-                baseline => baselines.predict(dataset, baseline, &seen, horizon),
+                baseline => baselines.predict(dataset, baseline, &seen, horizon)?,
             };
-            let compared = predictions.iter().zip(&truth).enumerate();
-            let score = compared.map(|(step, (prediction, pixels))| {
-                let mask = dataset.mask(window.first_frame + spec.context + step);
+            let compared = predictions.iter().zip(&truth).zip(&masks);
+            let score = compared.map(|((prediction, pixels), mask)| {
+                let mask = mask.as_deref();
                 FrameScore::of(prediction, &TargetFrame { pixels, mask, width })
             });
-            score.collect()
+            Ok(score.collect())
         })
-        .collect();
+        .collect::<Result<Vec<Vec<FrameScore>>, EvaluationError>>()?;
     let seen_here = place * spec.context * pixels..(place + 1) * spec.context * pixels;
     let reconstructed = predicted
         .reconstructed
@@ -107,7 +111,7 @@ fn score_window(
         .chunks_exact(pixels);
     let own = predicted.frames[here.clone()].chunks_exact(pixels);
     let own_truth = predicted.truth[here.clone()].chunks_exact(pixels);
-    WindowScores {
+    Ok(WindowScores {
         episode: window.episode,
         first_frame: window.first_frame,
         group: resampled_with(dataset, window, spec.context + spec.horizon),
@@ -117,5 +121,5 @@ fn score_window(
             .zip(&inputs)
             .map(|(frame, truth)| quality::mse(&spec.preprocess.inverse(frame), truth))
             .collect(),
-    }
+    })
 }

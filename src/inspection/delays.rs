@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, DatasetError};
 use crate::frame::motion::phase_correlation;
 
 /// The longest delay that is looked for, in seconds and in frames.
@@ -83,12 +83,12 @@ struct ImageMotion {
     change: Vec<f64>,
 }
 
-pub(super) fn of(dataset: &Dataset) -> Vec<ActionDelay> {
+pub(super) fn of(dataset: &Dataset) -> Result<Vec<ActionDelay>, DatasetError> {
     let info = dataset.info();
     if info.action_channels.is_empty() {
-        return Vec::new();
+        return Ok(Vec::new());
     }
-    let motion = motion(dataset);
+    let motion = motion(dataset)?;
     let least = LEAST_CORRELATION.max(CHANCE_CORRELATION / (info.frame_count as f64).sqrt());
     let most = (MAX_DELAY_S / info.frame_period_s).round() as i64;
     let most = most.clamp(*FRAMES_LOOKED_AT.start(), *FRAMES_LOOKED_AT.end());
@@ -98,7 +98,7 @@ pub(super) fn of(dataset: &Dataset) -> Vec<ActionDelay> {
         (MotionSignal::Change, &motion.change),
     ];
     let channels = info.action_channels.iter().enumerate();
-    channels
+    let delays = channels
         .filter_map(|(component, channel)| {
             let candidates = signals.into_iter().map(|(signal, values)| {
                 let lags = (-most..=most).map(|lag| LagCorrelation {
@@ -112,35 +112,36 @@ pub(super) fn of(dataset: &Dataset) -> Vec<ActionDelay> {
         .map(|delay| ActionDelay {
             delay_frames: delay.delay_frames.filter(|_| delay.correlation.abs() >= least),
             ..delay
-        })
-        .collect()
+        });
+    Ok(delays.collect())
 }
 
-fn motion(dataset: &Dataset) -> ImageMotion {
+fn motion(dataset: &Dataset) -> Result<ImageMotion, DatasetError> {
     let (info, last) = (dataset.info(), last_frames(dataset));
     let width = info.frame_width_px as usize;
-    let between: Vec<(f64, f64, f64)> = (0..info.frame_count)
+    let between = (0..info.frame_count)
         .into_par_iter()
         .map(|frame| {
             if last[frame] {
-                return (0.0, 0.0, 0.0);
+                return Ok((0.0, 0.0, 0.0));
             }
-            let floats = |frame: usize| -> Vec<f32> { dataset.pixels(frame).iter().map(|&p| f32::from(p)).collect() };
-            let (before, after) = (floats(frame), floats(frame + 1));
+            let (before, after) = (dataset.pixels(frame)?, dataset.pixels(frame + 1)?);
+            let floats = |pixels: &[u8]| -> Vec<f32> { pixels.iter().map(|&pixel| f32::from(pixel)).collect() };
+            let (before, after) = (floats(&before), floats(&after));
             let shift = phase_correlation(&before, &after, width);
             let change: f32 = before.iter().zip(&after).map(|(a, b)| (a - b).abs()).sum();
-            (
+            Ok((
                 f64::from(shift.x_px),
                 f64::from(shift.y_px),
                 f64::from(change) / before.len() as f64,
-            )
+            ))
         })
-        .collect();
-    ImageMotion {
+        .collect::<Result<Vec<(f64, f64, f64)>, DatasetError>>()?;
+    Ok(ImageMotion {
         sideways: without_outliers(between.iter().map(|motion| motion.0).collect()),
         vertical: without_outliers(between.iter().map(|motion| motion.1).collect()),
         change: between.iter().map(|motion| motion.2).collect(),
-    }
+    })
 }
 
 /// Whether a frame is the last one of its episode.

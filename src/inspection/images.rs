@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::timing::FrameTiming;
 use super::{FramePlace, counted, listed, median};
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, DatasetError};
 
 /// Pixels that differ by at most so many gray levels count as equal.
 const EQUAL_LEVELS: u8 = 1;
@@ -88,8 +88,8 @@ struct LevelStep {
     is_one_way: bool,
 }
 
-pub(super) fn of(dataset: &Dataset) -> ImageSummary {
-    let changes: Vec<FrameChange> = dataset
+pub(super) fn of(dataset: &Dataset) -> Result<ImageSummary, DatasetError> {
+    let changes = dataset
         .episodes()
         .par_iter()
         .flat_map_iter(|episode| {
@@ -101,14 +101,14 @@ pub(super) fn of(dataset: &Dataset) -> ImageSummary {
                 change(dataset, place, index)
             })
         })
-        .collect();
-    let histogram = level_histogram(dataset);
+        .collect::<Result<Vec<FrameChange>, DatasetError>>()?;
+    let histogram = level_histogram(dataset)?;
     let pixels = histogram.iter().sum::<u64>().max(1) as f64;
     let share = |level: usize| histogram.get(level).copied().unwrap_or_default() as f64 / pixels;
     let steps: Vec<&LevelStep> = changes.iter().filter_map(|change| change.step.as_ref()).collect();
     let total_change: f64 = steps.iter().map(|step| step.mean_change).sum();
     let is_equal = |change: &&FrameChange| change.step.as_ref().is_some_and(|step| step.is_equal);
-    ImageSummary {
+    Ok(ImageSummary {
         mean_level: changes.iter().map(|change| change.level).sum::<f64>() / changes.len().max(1) as f64,
         black_share: share(0),
         white_share: share(255),
@@ -121,14 +121,14 @@ pub(super) fn of(dataset: &Dataset) -> ImageSummary {
         frozen: frozen(&changes),
         exposure_jumps: jumps(&changes),
         timeline: timeline(&changes),
-    }
+    })
 }
 
-fn change(dataset: &Dataset, place: FramePlace, index: usize) -> FrameChange {
-    let now = dataset.pixels(index);
-    let level = mean(now);
-    let step = (place.frame > 0).then(|| {
-        let before = dataset.pixels(index - 1);
+fn change(dataset: &Dataset, place: FramePlace, index: usize) -> Result<FrameChange, DatasetError> {
+    let now = dataset.pixels(index)?;
+    let before = (place.frame > 0).then(|| dataset.pixels(index - 1)).transpose()?;
+    let level = mean(&now);
+    let step = before.as_deref().map(|before| {
         let (mut total, mut brighter, mut darker) = (0u64, 0usize, 0usize);
         for (&now, &before) in now.iter().zip(before) {
             let difference = i16::from(now) - i16::from(before);
@@ -143,10 +143,10 @@ fn change(dataset: &Dataset, place: FramePlace, index: usize) -> FrameChange {
             is_equal: now.iter().zip(before).all(|(a, b)| a.abs_diff(*b) <= EQUAL_LEVELS),
             is_one_way: share(brighter.max(darker)) >= SAME_SHARE
                 && share(brighter.min(darker)) <= OPPOSITE_SHARE
-                && correlation(before, now) >= SAME_VIEW,
+                && correlation(before, &now) >= SAME_VIEW,
         }
     });
-    FrameChange { place, level, step }
+    Ok(FrameChange { place, level, step })
 }
 
 fn mean(pixels: &[u8]) -> f64 {
@@ -168,14 +168,14 @@ fn correlation(a: &[u8], b: &[u8]) -> f64 {
     if scale < 1e-9 { 0.0 } else { product / scale }
 }
 
-fn level_histogram(dataset: &Dataset) -> Vec<u64> {
+fn level_histogram(dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
     let mut histogram = vec![0; 256];
     for frame in 0..dataset.info().frame_count {
-        for &pixel in dataset.pixels(frame) {
+        for &pixel in &*dataset.pixels(frame)? {
             histogram[usize::from(pixel)] += 1;
         }
     }
-    histogram
+    Ok(histogram)
 }
 
 fn frozen(changes: &[FrameChange]) -> Vec<FrozenSpan> {

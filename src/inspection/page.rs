@@ -7,15 +7,15 @@ use base64::engine::general_purpose::STANDARD;
 
 use super::charts::{self, Mark, number};
 use super::{ActionDelay, ChannelSummary, FramePlace, Inspection, counted};
-use crate::dataset::Dataset;
-use crate::frame::{Frame, FrameError, codec};
+use crate::dataset::{Dataset, DatasetError};
+use crate::frame::codec;
 
 const STYLE: &str = include_str!("page.css");
 /// Pictures of frozen frames and exposure jumps, at most.
 const SHOWN_PLACES: usize = 8;
 
 /// The page. `dataset` is the one that was inspected. Errors: `Encode` if a picture cannot be written.
-pub fn page(inspection: &Inspection, dataset: &Dataset) -> Result<String, FrameError> {
+pub fn page(inspection: &Inspection, dataset: &Dataset) -> Result<String, DatasetError> {
     let mut body = header(inspection);
     body += &warnings(inspection);
     body += &contact_sheet(inspection, dataset)?;
@@ -85,7 +85,7 @@ fn warnings(inspection: &Inspection) -> String {
     format!("<h2>Warnings</h2><ul class=\"warnings\">{}</ul>\n", items.concat())
 }
 
-fn contact_sheet(inspection: &Inspection, dataset: &Dataset) -> Result<String, FrameError> {
+fn contact_sheet(inspection: &Inspection, dataset: &Dataset) -> Result<String, DatasetError> {
     let mut figures = String::new();
     for &place in &inspection.contact_sheet {
         let _ = write!(
@@ -109,10 +109,9 @@ fn time_s(dataset: &Dataset, place: FramePlace) -> f64 {
     dataset.timestamp_s(index(dataset, place))
 }
 
-fn picture(dataset: &Dataset, place: FramePlace) -> Result<String, FrameError> {
-    let info = dataset.info();
-    let pixels = dataset.pixels(index(dataset, place)).to_vec();
-    let png = codec::encode_png(&Frame::new(info.frame_width_px, info.frame_height_px, pixels)?)?;
+fn picture(dataset: &Dataset, place: FramePlace) -> Result<String, DatasetError> {
+    let frame = dataset.frame(index(dataset, place))?;
+    let png = codec::encode_png(&frame).map_err(DatasetError::Encode)?;
     Ok(format!(
         "<img alt=\"\" src=\"data:image/png;base64,{}\">",
         STANDARD.encode(png)
@@ -169,7 +168,7 @@ fn facts(facts: &[(&str, String)]) -> String {
 }
 
 /// Pictures of the first frozen frames and exposure jumps, with the frame before each.
-fn places(inspection: &Inspection, dataset: &Dataset) -> Result<String, FrameError> {
+fn places(inspection: &Inspection, dataset: &Dataset) -> Result<String, DatasetError> {
     let images = &inspection.images;
     let frozen = images.frozen.iter().map(|span| {
         let what = format!("{} equal frames", span.frames);

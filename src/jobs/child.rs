@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize};
 
+use super::memory::JobMemory;
 use super::pipeline::Pipeline;
 use super::report::{JobReporter, ReportEvent};
 use super::runner::{JobExecutor, JobFailure, JobResult};
@@ -40,8 +41,8 @@ pub struct JobProcess {
     pub import_dir: Option<PathBuf>,
     /// How many threads a job uses.
     pub threads: usize,
-    /// The memory that a job can use, in MiB; 0 for no limit.
-    pub memory_mb: u64,
+    /// The memory of a job.
+    pub memory: JobMemory,
 }
 
 /// What the parent writes to the child's standard input, in one line.
@@ -51,7 +52,7 @@ struct JobOrder {
     models_dir: PathBuf,
     import_dir: Option<PathBuf>,
     threads: usize,
-    memory_mb: u64,
+    memory: JobMemory,
     lease: Lease,
     spec: JobSpec,
 }
@@ -164,7 +165,7 @@ impl ChildExecutor {
             models_dir: self.process.models_dir.clone(),
             import_dir: self.process.import_dir.clone(),
             threads: self.process.threads,
-            memory_mb: self.process.memory_mb,
+            memory: self.process.memory,
             lease,
             spec: spec.clone(),
         }
@@ -215,7 +216,7 @@ pub fn run() -> Result<(), String> {
         return Err("run-job is started by the server, which sends it the job".to_owned());
     }
     let order: JobOrder = serde_json::from_str(&line).map_err(|error| error.to_string())?;
-    limit(order.memory_mb);
+    limit(order.memory.limit_mb);
     let cancelled = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&cancelled);
     std::thread::spawn(move || {
@@ -246,7 +247,9 @@ fn work(
     let pipeline = runtime.block_on(async {
         let store = Store::open_existing(&order.store).await?;
         let versions = Versions::new(store.clone(), &order.models_dir);
-        Ok(Pipeline::new(store, versions, order.threads).with_import_dir(order.import_dir.clone()))
+        Ok(Pipeline::new(store, versions, order.threads)
+            .with_memory(order.memory)
+            .with_import_dir(order.import_dir.clone()))
     });
     let pipeline = pipeline.map_err(|error: crate::store::StoreError| error_text::with_causes(&error))?;
     Ok(pool.install(|| pipeline.execute(&order.spec, report, cancelled)))

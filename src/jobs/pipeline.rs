@@ -15,11 +15,12 @@ use tokio::runtime::Handle;
 
 use self::training_report::TrainingReporter;
 use super::checkpoints::{self, CheckpointSync};
+use super::memory::JobMemory;
 use super::patience::Patience;
 use super::report::JobReporter;
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets, memory};
+use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig};
@@ -41,7 +42,7 @@ pub struct Pipeline {
     store: Store,
     versions: Versions,
     threads: usize,
-    memory_mb: u64,
+    memory: JobMemory,
     import_dir: Option<PathBuf>,
     runtime: Handle,
 }
@@ -54,16 +55,16 @@ impl Pipeline {
             store,
             versions,
             threads,
-            memory_mb: 0,
+            memory: JobMemory::default(),
             import_dir: None,
             runtime: Handle::current(),
         }
     }
 
-    /// Refuses trainings that need more memory, in MiB. 0 means no limit.
+    /// Refuses trainings that need more memory, and holds no more of a data set's frames.
     #[must_use]
-    pub fn with_memory_limit(self, memory_mb: u64) -> Self {
-        Self { memory_mb, ..self }
+    pub fn with_memory(self, memory: JobMemory) -> Self {
+        Self { memory, ..self }
     }
 
     /// Lets imports read recordings below this directory.
@@ -119,18 +120,9 @@ impl Pipeline {
 
     /// Refuses a training that certainly needs more memory than a job can use. Errors: `Invalid`, `Dataset`, `Store`.
     async fn check_memory(&self, spec: &TrainSpec) -> Result<(), JobError> {
-        let (allowed, config) = (self.memory_mb, spec.config()?);
-        let needed = memory::training_mb(&config, &datasets::describe(self.store.objects(), &spec.dataset).await?);
-        if allowed == 0 || needed <= allowed {
-            return Ok(());
-        }
-        Err(JobError::Invalid {
-            field: "settings",
-            reason: format!(
-                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mb); \
-                 use a smaller model, batch or data set"
-            ),
-        })
+        let config = spec.config()?;
+        let dataset = datasets::describe(self.store.objects(), &spec.dataset).await?;
+        self.memory.check(&config, &dataset)
     }
 
     fn collect(
@@ -290,7 +282,7 @@ impl Pipeline {
 
     fn dataset(&self, name: &str, patience: &Patience<'_>) -> Result<Dataset, JobFailure> {
         let fetched = patience.run(async || datasets::fetch(self.store.objects(), name).await)?;
-        Dataset::open(&fetched).map_err(|error| failed(&error))
+        Dataset::open_within(&fetched, self.memory.held_mb()).map_err(|error| failed(&error))
     }
 
     fn patience<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> Patience<'a> {

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::jobs::JobLimits;
 use crate::jobs::child::JobProcess;
+use crate::jobs::memory::{self, JobMemory};
 use crate::nn::spec::MAX_STEPS;
 use crate::serving::PredictorConfig;
 use crate::store::StoreConfig;
@@ -111,6 +112,9 @@ pub struct ServerConfig {
     pub max_cached_bytes: usize,
     /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
     pub job_memory_mb: u64,
+    /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mb`. The
+    /// frames of a larger data set are decoded once into a file in its directory (`.cache`) and read from there.
+    pub dataset_memory_mb: u64,
     /// After this many attempts in a row that ended abnormally without progress, a job fails.
     pub job_max_attempts: u32,
     /// How long one attempt of a job can run, in seconds; 0 for no limit.
@@ -193,7 +197,8 @@ impl Default for ServerConfig {
             request_threads: 4,
             picture_threads: 1,
             max_cached_bytes: 64 << 20,
-            job_memory_mb: crate::jobs::memory::default_limit_mb(),
+            job_memory_mb: memory::default_limit_mb(),
+            dataset_memory_mb: memory::default_dataset_mb(),
             job_max_attempts: 3,
             job_time_limit_s: 0,
             job_program: None,
@@ -299,6 +304,7 @@ impl ServerConfig {
             ("picture_threads", self.picture_threads as u64, 1..=1024),
             ("max_cached_bytes", self.max_cached_bytes as u64, 0..=1 << 36),
             ("job_memory_mb", self.job_memory_mb, 0..=1 << 30),
+            ("dataset_memory_mb", self.dataset_memory_mb, 0..=1 << 30),
             ("job_max_attempts", u64::from(self.job_max_attempts), 1..=1_000_000),
             ("job_time_limit_s", self.job_time_limit_s, 0..=100_000_000),
             ("job_lease_ms", self.job_lease_ms, 1000..=MAX_DEADLINE_MS),
@@ -349,8 +355,17 @@ impl ServerConfig {
             models_dir: self.models_dir.clone(),
             import_dir: self.import_dir.clone(),
             threads: self.job_threads,
-            memory_mb: self.job_memory_mb,
+            memory: self.job_memory(),
         })
+    }
+
+    /// The memory of one job.
+    #[must_use]
+    pub fn job_memory(&self) -> JobMemory {
+        JobMemory {
+            limit_mb: self.job_memory_mb,
+            dataset_mb: self.dataset_memory_mb,
+        }
     }
 
     /// Where metadata and files are kept.

@@ -120,7 +120,7 @@ impl App {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
         let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_threads)
-            .with_memory_limit(config.job_memory_mb)
+            .with_memory(config.job_memory())
             .with_import_dir(config.import_dir.clone());
         let executor = child::executor(pipeline, config.job_process());
         let jobs = Jobs::start(store.clone(), config.jobs(), executor, !config.no_jobs)?;

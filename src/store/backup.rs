@@ -14,7 +14,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::database::Database;
 use super::{DATABASE_FILE, Store, StoreConfig, StoreError, WRITE_PROBE, unix_s};
-use crate::files::{files_below, hex, is_partial, none_if_missing, write_atomically};
+use crate::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
 const INDEX_FILE: &str = "backup.json";
@@ -286,10 +286,7 @@ fn unstable(data_dir: &Path) -> BackupError {
 fn is_kept(file: &Path) -> bool {
     let text = file.to_string_lossy();
     let is_passing = is_partial(file) || file.extension().is_some_and(|part| part == "lock" || part == "tmp");
-    let is_hidden = file
-        .components()
-        .any(|part| part.as_os_str().as_encoded_bytes().starts_with(b"."));
-    !(is_passing || is_hidden || text.starts_with(DATABASE_FILE) || text == WRITE_PROBE || text == RESTORING)
+    !(is_passing || is_hidden(file) || text.starts_with(DATABASE_FILE) || text == WRITE_PROBE || text == RESTORING)
 }
 
 /// The path of a name from the list of files, if it stays in the directory.

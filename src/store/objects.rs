@@ -13,7 +13,9 @@ use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use tokio::sync::OwnedMutexGuard;
 
 use super::StoreError;
-use crate::files::{files_below, is_partial, none_if_missing, remove_dir, remove_stale_partials, write_atomically};
+use crate::files::{
+    files_below, is_hidden, is_partial, none_if_missing, remove_dir, remove_stale_partials, write_atomically,
+};
 
 /// The data directory, and the shared object store if there is one.
 #[derive(Clone)]
@@ -64,6 +66,8 @@ impl Objects {
         let root = self.data_dir.join(dir);
         let mut paths = on_disk("list", &root, files_below).await?;
         paths.retain(|path| !is_partial(path) && path.extension().is_none_or(|extension| extension != "tmp"));
+        // Hidden directories hold only copies.
+        paths.retain(|path| path.strip_prefix(&root).is_ok_and(|path| !is_hidden(path)));
         paths.sort_by_key(|path| path.file_name().is_some_and(|name| name == last));
         for path in paths {
             let bytes = tokio::fs::read(&path).await.map_err(StoreError::io("read", &path))?;

@@ -1,5 +1,7 @@
 //! Makes batches of frames and windows as tensors, and shuffles the training data.
 
+use std::sync::{Arc, Mutex, PoisonError};
+
 use candle_core::{Device, Tensor};
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
@@ -9,7 +11,6 @@ use super::augment::{ACTION, Augmentation, STATE, WindowChange};
 use super::config::Target;
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
-use crate::frame::Frame;
 use crate::frame::preprocess::Preprocess;
 use crate::nn::ConditioningTensors;
 use crate::types::Seed;
@@ -95,15 +96,14 @@ impl<'a> FrameSource<'a> {
     fn preprocessed(&self, preprocess: Preprocess, frames: &[(usize, WindowChange)]) -> Result<Tensor, TrainError> {
         let info = self.dataset.info();
         let pixels = info.frame_pixels();
+        let width = info.frame_width_px as usize;
         let mut values = vec![0.0; frames.len() * pixels];
         values
             .par_chunks_exact_mut(pixels)
             .zip(frames)
             .try_for_each(|(out, &(frame, change))| {
-                let pixels = self.dataset.pixels(frame).to_vec();
-                let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels)?;
-                out.copy_from_slice(&preprocess.forward(&frame));
-                change.apply(out, info.frame_width_px as usize, preprocess.invert);
+                out.copy_from_slice(&preprocess.forward(&self.dataset.frame(frame)?));
+                change.apply(out, width, preprocess.invert);
                 Ok::<(), TrainError>(())
             })?;
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
@@ -206,29 +206,44 @@ fn unchanged(frames: &[usize]) -> Vec<(usize, WindowChange)> {
 pub(super) struct Shuffle {
     count: usize,
     seed: Seed,
+    /// The order of the epoch that was drawn from last: to shuffle millions of positions for each batch would take long.
+    last: Mutex<(usize, Arc<Vec<usize>>)>,
 }
 
 impl Shuffle {
     /// Shuffles `count` positions. `count` is at least 1: a training without windows is refused earlier.
     pub(super) fn new(count: usize, seed: Seed) -> Self {
-        Self { count, seed }
+        Self {
+            count,
+            seed,
+            last: Mutex::new((usize::MAX, Arc::default())),
+        }
     }
 
     /// The positions of batch number `step`. A batch larger than the number of positions continues in the next epoch.
     pub(super) fn batch(&self, step: usize, batch_size: usize) -> Vec<usize> {
         let draws = step * batch_size..(step + 1) * batch_size;
-        let mut epoch = usize::MAX;
-        let mut order: Vec<usize> = Vec::new();
+        let (mut epoch, mut order) = (usize::MAX, Arc::default());
         draws
             .map(|draw| {
                 if draw / self.count != epoch {
                     epoch = draw / self.count;
-                    order = (0..self.count).collect();
-                    order.shuffle(&mut self.seed.derive("epoch", epoch as u64).rng());
+                    order = self.order(epoch);
                 }
                 order[draw % self.count]
             })
             .collect()
+    }
+
+    /// The positions in the order of an epoch.
+    fn order(&self, epoch: usize) -> Arc<Vec<usize>> {
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.0 != epoch {
+            let mut order: Vec<usize> = (0..self.count).collect();
+            order.shuffle(&mut self.seed.derive("epoch", epoch as u64).rng());
+            *last = (epoch, Arc::new(order));
+        }
+        Arc::clone(&last.1)
     }
 }
 

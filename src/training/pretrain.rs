@@ -78,10 +78,24 @@ mod tests {
     use candle_core::Device;
 
     use super::*;
-    use crate::dataset::{Dataset, DatasetInfo, EpisodeData};
+    use crate::dataset::{Dataset, DatasetInfo, EpisodeData, Window};
     use crate::types::Seed;
 
     const SIDE_PX: u32 = 8;
+
+    #[test]
+    fn the_frames_of_overlapping_windows_are_listed_once() {
+        let window = |first_frame| Window {
+            episode: 0,
+            first_frame,
+        };
+        let windows = [9, 2, 3, 20, 3].map(window);
+        assert_eq!(
+            window_frames(&windows, 4),
+            [2, 3, 4, 5, 6, 9, 10, 11, 12, 20, 21, 22, 23]
+        );
+        assert!(window_frames(&[], 4).is_empty());
+    }
 
     /// Episodes in which every frame is the same checkerboard.
     fn checkerboards() -> Dataset {
@@ -133,6 +147,7 @@ mod tests {
         weight.set(&weight.zeros_like().unwrap()).unwrap();
         let sharp: Vec<f32> = dataset
             .pixels(0)
+            .unwrap()
             .iter()
             .map(|&pixel| 1.0 - f32::from(pixel) / 255.0)
             .collect();

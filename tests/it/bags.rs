@@ -122,7 +122,7 @@ fn a_bag_becomes_frames_with_actions_and_states() {
     );
     // Half the time 3.0, half of it 3.5.
     assert_eq!(dataset.action(3), [3.25, -3.25]);
-    assert_eq!(dataset.pixels(7), gray(7));
+    assert_eq!(*dataset.pixels(7).unwrap(), gray(7));
     let state = dataset.state(4);
     assert_eq!((state[0], state[1], state[4]), (4.0, 0.0, 0.5));
     assert!((state[3] - 0.1f32.sin()).abs() < 1e-6, "{state:?}");
@@ -179,7 +179,7 @@ fn compressed_images_and_stamped_commands_are_read() {
     // The right wheel's velocity is not known at the first image.
     assert_eq!(imported.skipped.len(), 1, "{:?}", imported.skipped);
     let dataset = Dataset::open(&out).unwrap();
-    assert_eq!(dataset.pixels(0), gray(1));
+    assert_eq!(*dataset.pixels(0).unwrap(), gray(1));
     assert_eq!(dataset.action(2), [3.0, 0.0]);
     assert_eq!(
         names(&dataset.info().state_channels),

@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use foreframe::SessionState;
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe::evaluation::{self, EvaluateConfig};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
@@ -9,7 +10,6 @@ use foreframe::registry::{self, DatasetStamp, LoadedModel};
 use foreframe::server::ServerConfig;
 use foreframe::serving::{self, PredictionInput};
 use foreframe::types::{Action, RobotState, Seed};
-use foreframe::{Frame, SessionState};
 use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
@@ -55,7 +55,7 @@ fn calibrated(dir: &std::path::Path, dataset: &Dataset) -> LoadedModel {
 }
 
 fn input(dataset: &Dataset, speed: f32, steps: Option<usize>) -> PredictionInput {
-    let frame = |index| Frame::new(SIDE, SIDE, dataset.pixels(index).to_vec()).unwrap();
+    let frame = |index| dataset.frame(index).unwrap();
     PredictionInput {
         frames: (0..3).map(frame).collect(),
         state: RobotState::try_from(vec![0.5]).ok(),
@@ -97,9 +97,7 @@ fn a_calibrated_model_tells_what_to_expect() {
     }
     assert!(rollout.novelty.is_some());
     let mut strange = known.clone();
-    strange.frames = (0..3)
-        .map(|index| Frame::new(SIDE, SIDE, noise().pixels(index).to_vec()).unwrap())
-        .collect();
+    strange.frames = (0..3).map(|index| noise().frame(index).unwrap()).collect();
     assert_eq!(serving::predict(&model, &[&strange]).unwrap()[0].novelty, Some(1.0));
 }
 

@@ -82,8 +82,11 @@ fn a_data_set_reads_back_what_was_simulated() {
         assert_eq!(episode.trial.as_ref(), Some(world.parameters()));
         for frame in episode.frames() {
             let observation = world.observe();
-            assert_eq!(dataset.pixels(frame), observation.frame.pixels());
-            assert_eq!(dataset.mask(frame), Some(observation.mask.as_slice()));
+            assert_eq!(*dataset.pixels(frame).unwrap(), *observation.frame.pixels());
+            assert_eq!(
+                dataset.mask(frame).unwrap().as_deref(),
+                Some(observation.mask.as_slice())
+            );
             assert_eq!(dataset.state(frame), observation.state.as_slice());
             assert!((dataset.timestamp_s(frame) - observation.time_s).abs() < 1e-6);
             if frame + 1 < episode.frames().end {

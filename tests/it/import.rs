@@ -126,7 +126,7 @@ fn a_numpy_array_of_sequences_becomes_episodes() {
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!((dataset.episodes().len(), dataset.info().frame_count), (5, 15));
     // Sequence 1 holds the array's frames 1, 6 and 11.
-    assert_eq!([3, 4, 5].map(|frame| dataset.pixels(frame)[0]), [1, 6, 11]);
+    assert_eq!([3, 4, 5].map(|frame| dataset.pixels(frame).unwrap()[0]), [1, 6, 11]);
     fs::write(&source, &bytes[..bytes.len() - 1]).unwrap();
     let cut = run(&source, &dir.path().join("b"), options).unwrap_err().to_string();
     assert!(cut.contains("the file ends here"), "{cut}");
@@ -181,7 +181,7 @@ fn arrays_of_one_file_become_frames_actions_and_states() {
             (dataset.action(2), dataset.state(2)),
             (&[2.0f32][..], &[6.0f32, 7.0, 8.0][..])
         );
-        assert_eq!(dataset.pixels(4)[0], 40);
+        assert_eq!(dataset.pixels(4).unwrap()[0], 40);
         let names: Vec<String> = dataset.info().state_channels.iter().map(ToString::to_string).collect();
         assert_eq!(names, ["states.0", "states.1 m", "states.2"]);
         assert!(!out.join("decoded.gray.tmp").exists());

@@ -26,7 +26,7 @@ fn driving() -> (DatasetInfo, Vec<EpisodeData>) {
         timestamps_s: episode.frames().map(|frame| dataset.timestamp_s(frame)).collect(),
         pixels: episode
             .frames()
-            .flat_map(|frame| dataset.pixels(frame).to_vec())
+            .flat_map(|frame| dataset.pixels(frame).unwrap().into_owned())
             .collect(),
         actions: episode
             .frames()
@@ -47,7 +47,7 @@ fn inspected(info: &DatasetInfo, episodes: Vec<EpisodeData>) -> (Inspection, Dat
         ..info.clone()
     };
     let dataset = Dataset::from_episodes(info, episodes).unwrap();
-    (inspect(&dataset), dataset)
+    (inspect(&dataset).unwrap(), dataset)
 }
 
 /// Delay and motion of the turning speed.
@@ -153,7 +153,7 @@ fn steering_of_a_real_car_moves_the_image_later() {
         options: ImportOptions::default(),
     };
     import(&config, &|_| {}, &AtomicBool::new(false)).unwrap();
-    let inspection = inspect(&Dataset::open(&out).unwrap());
+    let inspection = inspect(&Dataset::open(&out).unwrap()).unwrap();
     assert_eq!((inspection.frame_count, inspection.timing.frame_period_s), (5854, 0.05));
     let steering = &inspection.delays[0];
     assert!(

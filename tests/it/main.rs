@@ -36,6 +36,7 @@ mod jobs_killed;
 mod jobs_limits;
 mod jobs_priority;
 mod keys;
+mod large_datasets;
 mod lerobot;
 mod malformed_requests;
 mod malformed_streams;

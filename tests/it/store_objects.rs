@@ -25,6 +25,7 @@ async fn pushed_objects_are_visible_on_other_machines() {
         write("models/m/1/manifest.json", "last");
         write("models/m/1/deep/weights", "first");
         write("models/m/1/half.partial", "never");
+        write("models/m/1/.cache/copy", "never");
         let (ours, theirs) = (here.1.objects(), there.1.objects());
         assert!(!theirs.pull("models/m/1", "manifest.json").await.unwrap());
         ours.push("models/m/1", "manifest.json").await.unwrap();
@@ -39,6 +40,7 @@ async fn pushed_objects_are_visible_on_other_machines() {
             ),
             (Some("last"), None)
         );
+        assert_eq!(read("models/m/1/.cache/copy"), None);
         write("models/m/1/manifest.json", "newer");
         ours.push("models/m/1", "manifest.json").await.unwrap();
         theirs.pull("models/m/1", "manifest.json").await.unwrap();

@@ -10,11 +10,10 @@ use crate::files::write_atomically;
 use crate::inspection::{ActionDelay, ChannelSummary, Inspection, inspect, page};
 
 /// Looks through a data set and prints what was found.
-pub(super) fn describe(dir: &Path, args: &InspectArgs) -> Result<(), CliError> {
-    let dataset = Dataset::open(dir)?;
-    let inspection = inspect(&dataset);
+pub(super) fn describe(dir: &Path, dataset: &Dataset, args: &InspectArgs) -> Result<(), CliError> {
+    let inspection = inspect(dataset)?;
     if let Some(path) = &args.html {
-        let page = page(&inspection, &dataset).map_err(CliError::failed)?;
+        let page = page(&inspection, dataset).map_err(CliError::failed)?;
         write_atomically(path, page.as_bytes()).map_err(|error| CliError::io("write", path, &error))?;
     }
     if args.json {

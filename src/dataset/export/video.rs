@@ -51,14 +51,17 @@ fn start(dataset: &Dataset, path: &Path) -> Result<Child, DatasetError> {
 }
 
 fn encode(dataset: &Dataset, mut frames: Range<usize>, mut encoder: Child) -> Result<(), DatasetError> {
-    let sent = encoder.stdin.take().map_or(Ok(()), |mut input| {
-        frames.try_for_each(|frame| input.write_all(dataset.pixels(frame)))
-    });
     let failed = |reason: String| DatasetError::Program(format!("ffmpeg could not write the video: {reason}"));
+    let sent = encoder.stdin.take().map_or(Ok(()), |mut input| {
+        frames.try_for_each(|frame| {
+            let pixels = dataset.pixels(frame)?;
+            input.write_all(&pixels).map_err(|error| failed(error.to_string()))
+        })
+    });
     let output = encoder.wait_with_output().map_err(|error| failed(error.to_string()))?;
     if !output.status.success() {
         let text = String::from_utf8_lossy(&output.stderr);
         return Err(failed(text.lines().next().unwrap_or("it gave no reason").to_owned()));
     }
-    sent.map_err(|error| failed(error.to_string()))
+    sent
 }

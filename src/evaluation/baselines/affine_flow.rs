@@ -6,8 +6,7 @@ use rayon::prelude::*;
 use super::{BaselineInput, evenly};
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
-use crate::evaluation::cholesky;
-use crate::frame::Frame;
+use crate::evaluation::{EvaluationError, cholesky};
 use crate::frame::preprocess::Preprocess;
 use crate::frame::warp::sample;
 
@@ -46,11 +45,11 @@ pub(super) struct AffineFlow {
 }
 
 impl AffineFlow {
-    /// None if the data set has no actions or there are no windows of [`SHAPE`].
-    pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Option<Self> {
+    /// None if the data set has no actions or there are no windows of [`SHAPE`]. Errors: those of [`Dataset::pixels`].
+    pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Result<Option<Self>, EvaluationError> {
         let info = dataset.info();
         if info.action_channels.is_empty() || windows.is_empty() {
-            return None;
+            return Ok(None);
         }
         let pairs = evenly(windows, MAX_PAIRS);
         let (mean, scale) = spread(dataset, &pairs);
@@ -71,16 +70,19 @@ impl AffineFlow {
                 let equations = pairs
                     .par_iter()
                     .map(|pair| flow.equations_of(dataset, pair, smooth))
-                    .reduce(
+                    .try_reduce(
                         || NormalEquations::new(AFFINE * regressors),
-                        |sum, more| sum.plus(&more),
-                    );
-                for (parameter, step) in flow.parameters.iter_mut().zip(equations.solve()?) {
+                        |sum, more| Ok(sum.plus(&more)),
+                    )?;
+                let Some(steps) = equations.solve() else {
+                    return Ok(None);
+                };
+                for (parameter, step) in flow.parameters.iter_mut().zip(steps) {
                     *parameter += step;
                 }
             }
         }
-        Some(flow)
+        Ok(Some(flow))
     }
 
     /// One frame for each action of the input: the last frame sampled once, where the motions lead back to.
@@ -145,19 +147,17 @@ impl AffineFlow {
     }
 
     /// What a pair of frames says about the step from the present parameters.
-    fn equations_of(&self, dataset: &Dataset, pair: &Window, smooth: Preprocess) -> NormalEquations {
+    fn equations_of(
+        &self,
+        dataset: &Dataset,
+        pair: &Window,
+        smooth: Preprocess,
+    ) -> Result<NormalEquations, EvaluationError> {
         let (before, after) = (pair.first_frame + 1, pair.first_frame + 2);
         let regressors = self.regressors(dataset.action(pair.first_frame), dataset.action(before));
         let mut equations = NormalEquations::new(self.parameters.len());
-        let smoothed = |frame: usize| {
-            let info = dataset.info();
-            let pixels = dataset.pixels(frame).to_vec();
-            let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels).ok()?;
-            Some(smooth.forward(&frame))
-        };
-        let (Some(source), Some(target)) = (smoothed(before), smoothed(after)) else {
-            return equations;
-        };
+        let source = smooth.forward(&dataset.frame(before)?);
+        let target = smooth.forward(&dataset.frame(after)?);
         let mut grid = self.identity();
         self.shift(&mut grid, &self.motion(&regressors));
         let (warped, inside) = sample(&source, self.width, self.height, &grid);
@@ -182,7 +182,7 @@ impl AffineFlow {
             }
         }
         equations.add(&own, &regressors);
-        equations
+        Ok(equations)
     }
 }
 

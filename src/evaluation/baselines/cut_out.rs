@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 
 use super::{evenly, mean};
 use crate::dataset::{Dataset, Window};
+use crate::evaluation::EvaluationError;
 
 /// Training frames that the background is the median of at most, evenly spread.
 const MAX_BACKGROUND_FRAMES: usize = 1000;
@@ -36,19 +37,20 @@ pub(super) struct CutOut {
 
 impl CutOut {
     /// Takes the median of every pixel over the first frames of these windows.
-    pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Self {
+    /// Errors: those of [`Dataset::pixels`].
+    pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Result<Self, EvaluationError> {
         let frames = evenly(windows, MAX_BACKGROUND_FRAMES);
         let mut counts = vec![[0u16; 256]; dataset.info().frame_pixels()];
         for window in &frames {
-            for (counts, &value) in counts.iter_mut().zip(dataset.pixels(window.first_frame)) {
+            for (counts, &value) in counts.iter_mut().zip(&*dataset.pixels(window.first_frame)?) {
                 counts[usize::from(value)] += 1;
             }
         }
         let middle = frames.len() as u16 / 2;
-        Self {
+        Ok(Self {
             background: counts.iter().map(|counts| median(counts, middle)).collect(),
             width: dataset.info().frame_width_px as usize,
-        }
+        })
     }
 
     pub(super) fn predict(&self, inputs: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {

@@ -1,8 +1,11 @@
 //! The training window whose inputs differ least, and its future.
 
+use rayon::prelude::*;
+
 use super::frame_of;
 use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
+use crate::evaluation::EvaluationError;
 
 /// Training windows that are searched at most, evenly spread.
 pub(super) const MAX_WINDOWS: usize = 15_000;
@@ -21,37 +24,50 @@ pub(super) struct TrainingWindows {
 }
 
 impl TrainingWindows {
-    /// None if there are no windows.
-    pub(super) fn new(dataset: &Dataset, windows: &[Window], shape: WindowShape) -> Option<Self> {
-        use rayon::prelude::*;
+    /// None if there are no windows. Errors: those of [`Dataset::pixels`].
+    pub(super) fn new(
+        dataset: &Dataset,
+        windows: &[Window],
+        shape: WindowShape,
+    ) -> Result<Option<Self>, EvaluationError> {
         if windows.is_empty() {
-            return None;
+            return Ok(None);
         }
         let width = dataset.info().frame_width_px as usize;
-        let small = windows
-            .par_iter()
-            .flat_map_iter(|window| {
-                let frames = window.first_frame..window.first_frame + shape.context;
-                frames.flat_map(|frame| shrunk(&frame_of(dataset, frame), width))
-            })
-            .collect();
-        Some(Self {
+        let window_values = shape.context * SMALL_SIDE * SMALL_SIDE;
+        let mut small = vec![0.0; windows.len() * window_values];
+        small
+            .par_chunks_exact_mut(window_values)
+            .zip(windows)
+            .try_for_each(|(small, window)| {
+                let frames = small.chunks_exact_mut(SMALL_SIDE * SMALL_SIDE);
+                for (step, small) in frames.enumerate() {
+                    small.copy_from_slice(&shrunk(&frame_of(dataset, window.first_frame + step)?, width));
+                }
+                Ok::<(), EvaluationError>(())
+            })?;
+        Ok(Some(Self {
             windows: windows.to_vec(),
             shape,
             width,
             small,
-        })
+        }))
     }
 
     /// The future of the nearest window.
-    pub(super) fn predict(&self, dataset: &Dataset, inputs: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
-        let first_frame = self.nearest(dataset, inputs).first_frame + self.shape.context;
+    pub(super) fn predict(
+        &self,
+        dataset: &Dataset,
+        inputs: &[Vec<f32>],
+        horizon: usize,
+    ) -> Result<Vec<Vec<f32>>, EvaluationError> {
+        let first_frame = self.nearest(dataset, inputs)?.first_frame + self.shape.context;
         (0..horizon).map(|step| frame_of(dataset, first_frame + step)).collect()
     }
 
     /// The window with the least squared error. Means of blocks never differ by more than their pixels do, so the windows
     /// that are close in small are compared first, until no other can be nearer.
-    fn nearest(&self, dataset: &Dataset, inputs: &[Vec<f32>]) -> Window {
+    fn nearest(&self, dataset: &Dataset, inputs: &[Vec<f32>]) -> Result<Window, EvaluationError> {
         let wanted: Vec<f32> = inputs.iter().flat_map(|frame| shrunk(frame, self.width)).collect();
         let mut ranked: Vec<(f32, Window)> = self
             .small
@@ -75,16 +91,15 @@ impl TrainingWindows {
             if 0.9 * bound > best.0 as f64 {
                 break;
             }
-            let error = pixels
-                .iter()
-                .enumerate()
-                .map(|(step, frame)| squared_byte_distance(frame, dataset.pixels(window.first_frame + step)))
-                .sum();
+            let mut error = 0;
+            for (step, frame) in pixels.iter().enumerate() {
+                error += squared_byte_distance(frame, &dataset.pixels(window.first_frame + step)?);
+            }
             if error < best.0 {
                 best = (error, window);
             }
         }
-        best.1
+        Ok(best.1)
     }
 }
 
