@@ -164,6 +164,9 @@ impl LoadedConfig {
             url.take_if(|url| url.is_empty());
         }
         server.import_dir.take_if(|dir| dir.as_os_str().is_empty());
+        for path in [&mut server.tls_certificate, &mut server.tls_key] {
+            path.take_if(|path| path.as_os_str().is_empty());
+        }
         if let Some(port) = config.port {
             config.bind.set_port(port);
         }

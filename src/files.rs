@@ -5,6 +5,7 @@
 mod positioned;
 
 use std::cmp::Ordering;
+use std::error::Error;
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::File;
@@ -140,6 +141,24 @@ pub(crate) fn remove_dir(dir: &Path) -> io::Result<()> {
         }
     }
     Ok(())
+}
+
+/// Whether an error comes from a file system that cannot be written or read for now, but may be later: it is full, was made
+/// read-only, or its device failed.
+pub(crate) fn may_pass(error: &(dyn Error + 'static)) -> bool {
+    /// Linux's number of an I/O error, which has no `ErrorKind`.
+    const EIO: i32 = 5;
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        if let Some(error) = error.downcast_ref::<io::Error>() {
+            return match error.kind() {
+                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::ReadOnlyFilesystem => true,
+                _ => cfg!(unix) && error.raw_os_error() == Some(EIO),
+            };
+        }
+        cause = error.source();
+    }
+    false
 }
 
 /// Turns the error `NotFound` into `None`.

@@ -24,6 +24,7 @@ mod token;
 pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};
 pub use http::problem::Problem;
+pub use http::tls::{ServerTls, TlsError};
 pub use http::{keys, shutdown};
 pub use images::{ImageBytes, ImageFormat};
 pub use router::{openapi_document, router};

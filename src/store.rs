@@ -12,6 +12,7 @@ pub mod objects;
 pub mod reports;
 mod wal;
 
+use std::error::Error as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -26,6 +27,7 @@ pub use self::keys::{KeyRow, KeyScope};
 pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
+use crate::files;
 
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
@@ -128,10 +130,14 @@ impl StoreError {
     pub fn is_unavailable(&self) -> bool {
         match self {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
-            Self::Io { source, .. } => source.kind() == std::io::ErrorKind::StorageFull,
+            Self::Io { source, .. } => files::may_pass(source),
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
             Self::Away { .. } => true,
-            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } | Self::Migrate(_) => false,
+            Self::Migrate(error) => {
+                let cause = error.source().and_then(|cause| cause.downcast_ref::<sqlx::Error>());
+                cause.is_some_and(database::is_unavailable)
+            }
+            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } => false,
         }
     }
 
@@ -282,13 +288,20 @@ impl Store {
         &self.objects
     }
 
+    /// The database's time in seconds since 1970. Leases, the expiry of keys and the order in which jobs ended go by this
+    /// clock, since the clocks of several machines can differ. Errors: `Query`.
+    pub async fn now_s(&self) -> Result<f64, StoreError> {
+        self.database.now_s().await
+    }
+
     /// Checks that the database answers. Errors: `Query`.
     pub async fn ping(&self) -> Result<(), StoreError> {
         self.database.fetch("SELECT 1", vec![]).await.map(drop)
     }
 }
 
-/// The time in the store's unit: seconds since 1970.
+/// The time of this machine's clock in the store's unit, seconds since 1970: only for times that are shown. Decisions go by
+/// [`Store::now_s`].
 #[must_use]
 pub fn unix_s() -> f64 {
     let since_1970 = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH);

@@ -14,7 +14,7 @@ const TIMEOUT: Duration = Duration::from_secs(3);
 /// Ask a running server whether it is ready: exit code 0 if it is, 1 if not.
 ///
 /// For containers, which have no curl. Without --url it asks the address that `foreframe serve` would listen on with the same
-/// settings: `admin_bind` if it is set, else `bind`.
+/// settings: `admin_bind` if it is set or the server has TLS, else `bind`.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe healthcheck
@@ -41,9 +41,14 @@ pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     Err(CliError::Failed(format!("{url}: {status}")))
 }
 
-/// `admin_bind` if it was set, since the default may be in use by another server; else `bind`.
+/// `admin_bind` if it was set, since the default may be in use by another server, or with TLS; else `bind`.
 fn address(loaded: &LoadedConfig) -> SocketAddr {
-    let admin = loaded.config.admin_bind.filter(|_| !loaded.is_default("admin_bind"));
+    // With TLS, `bind` does not speak plain HTTP.
+    let has_tls = loaded.config.server.tls_certificate.is_some();
+    let admin = loaded
+        .config
+        .admin_bind
+        .filter(|_| has_tls || !loaded.is_default("admin_bind"));
     admin.unwrap_or(loaded.config.bind)
 }
 

@@ -5,7 +5,7 @@ use super::workspace::block_on;
 use super::{CliError, print_line};
 use crate::server::keys::NewKey;
 use crate::store::audit::COMMAND_LINE;
-use crate::store::{KeyRow, KeyScope, Store, unix_s};
+use crate::store::{KeyRow, KeyScope, Store};
 
 const SECONDS_PER_DAY: f64 = 86_400.0;
 
@@ -87,7 +87,7 @@ async fn create(
         )));
     }
     let key = NewKey::generate().map_err(CliError::failed)?;
-    let now_s = unix_s();
+    let now_s = store.now_s().await?;
     let row = KeyRow {
         id: key.id.clone(),
         name: name.to_owned(),
@@ -120,7 +120,7 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 async fn list(store: &Store) -> Result<(), CliError> {
-    let now_s = unix_s();
+    let now_s = store.now_s().await?;
     for key in store.list_keys().await? {
         let state = match key.revoked_s {
             Some(_) => "revoked",
@@ -146,9 +146,10 @@ async fn list(store: &Store) -> Result<(), CliError> {
 }
 
 async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
-    if store.revoke_key(id, unix_s()).await? {
+    let now_s = store.now_s().await?;
+    if store.revoke_key(id, now_s).await? {
         store.record_change(COMMAND_LINE, "key.revoke", id).await;
-        let is_last = store.list_keys().await?.iter().all(|key| !key.is_valid(unix_s()));
+        let is_last = store.list_keys().await?.iter().all(|key| !key.is_valid(now_s));
         let consequence = if is_last {
             "; it was the last valid key: every request is refused until another is created"
         } else {

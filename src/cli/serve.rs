@@ -9,7 +9,7 @@ use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
 use super::{CliError, print_line};
 use crate::config::{Config, LoadedConfig};
 use crate::server::keys::Keys;
-use crate::server::{self, App, ServerListeners};
+use crate::server::{self, App, ServerListeners, ServerTls};
 use crate::store::Store;
 use crate::telemetry;
 
@@ -50,6 +50,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
+    let tls = ServerTls::open(&config.server).map_err(|error| CliError::Failed(error.to_string()))?;
+    let scheme = if tls.is_some() { "https" } else { "http" };
     let store = open_store_waiting(&config).await?;
     let keys = keys(&config, store.clone()).await?;
     let listener = TcpListener::bind(config.bind).await.map_err(|error| {
@@ -63,10 +65,13 @@ async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
     let app = Box::pin(App::with_store(config.server, store))
         .await
         .map_err(CliError::failed)?
-        .with_keys(keys);
+        .with_keys(keys)
+        .with_tls(tls);
     report_models(&app);
     let shutdown = server::shutdown::requested();
-    print_line(format!("Foreframe listens on http://{address}/ — press Ctrl-C to stop"))?;
+    print_line(format!(
+        "Foreframe listens on {scheme}://{address}/ — press Ctrl-C to stop"
+    ))?;
     let store = app.store().clone();
     let listeners = ServerListeners {
         public: listener,

@@ -13,11 +13,11 @@ use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize};
 
 use super::memory::JobMemory;
+use super::patience::Patience;
 use super::pipeline::Pipeline;
 use super::report::{JobReporter, ReportEvent};
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::{JobError, JobSpec};
-use crate::error_text;
 use crate::store::{Lease, Store, StoreConfig};
 use crate::versions::Versions;
 
@@ -244,14 +244,22 @@ fn work(
         .thread_name(|index| format!("jobs-{index}"))
         .build()
         .map_err(|error| error.to_string())?;
+    let patience = Patience {
+        runtime: runtime.handle(),
+        report,
+        cancelled,
+    };
+    let store = match patience.run(async || Store::open_existing(&order.store).await) {
+        Ok(store) => store,
+        Err(JobFailure::Failed(reason)) => return Err(reason),
+        Err(failure) => return Ok(Err(failure)),
+    };
     let pipeline = runtime.block_on(async {
-        let store = Store::open_existing(&order.store).await?;
         let versions = Versions::new(store.clone(), &order.models_dir);
-        Ok(Pipeline::new(store, versions, order.threads)
+        Pipeline::new(store, versions, order.threads)
             .with_memory(order.memory)
-            .with_import_dir(order.import_dir.clone()))
+            .with_import_dir(order.import_dir.clone())
     });
-    let pipeline = pipeline.map_err(|error: crate::store::StoreError| error_text::with_causes(&error))?;
     Ok(pool.install(|| pipeline.execute(&order.spec, report, cancelled)))
 }
 

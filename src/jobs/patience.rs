@@ -1,4 +1,5 @@
-//! Waits for a store that is away: a database that is being restarted, an object store that answers with errors.
+//! Waits for a store that is away: a database that is being restarted, an object store that answers with errors, a file
+//! system that is full or read-only.
 
 use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,8 +11,12 @@ use tracing::warn;
 use super::JobError;
 use super::report::JobReporter;
 use super::runner::JobFailure;
+use crate::dataset::DatasetError;
 use crate::error_text;
+use crate::evaluation::EvaluationError;
+use crate::files::may_pass;
 use crate::store::StoreError;
+use crate::training::TrainError;
 use crate::versions::VersionError;
 
 /// How long a job waits for a store before it fails. It can be resumed.
@@ -20,6 +25,11 @@ const LIMIT: Duration = Duration::from_hours(1);
 const PAUSE: Duration = Duration::from_secs(1);
 /// How often the job is asked during a pause whether it was cancelled.
 const POLL: Duration = Duration::from_millis(50);
+
+/// How long a job waits for another process, whose lease has expired, to unlock the directory.
+const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
+/// How often it tries.
+const BUSY_POLL: Duration = Duration::from_millis(200);
 
 /// An error that may come from a store that is away.
 pub(super) trait MayBeAway: Error {
@@ -35,7 +45,25 @@ impl MayBeAway for StoreError {
 
 impl MayBeAway for VersionError {
     fn is_away(&self) -> bool {
-        matches!(self, Self::Store(error) if error.is_unavailable())
+        matches!(self, Self::Store(error) if error.is_unavailable()) || may_pass(self)
+    }
+}
+
+impl MayBeAway for DatasetError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for TrainError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for EvaluationError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
     }
 }
 
@@ -55,9 +83,14 @@ pub(super) struct Patience<'a> {
 impl Patience<'_> {
     /// Does the work again and again while the store is away. Errors: `Failed` after an hour or for any other reason, `Cancelled`.
     pub(super) fn run<T, E: MayBeAway>(&self, mut work: impl AsyncFnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+        self.repeat(|| self.runtime.block_on(work()))
+    }
+
+    /// The same for work that blocks.
+    pub(super) fn repeat<T, E: MayBeAway>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
         let (began, mut is_told) = (Instant::now(), false);
         loop {
-            let error = match self.runtime.block_on(work()) {
+            let error = match work() {
                 Ok(done) => return Ok(done),
                 Err(error) => error,
             };
@@ -77,6 +110,23 @@ impl Patience<'_> {
                 }
                 std::thread::sleep(POLL);
             }
+        }
+    }
+}
+
+/// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
+pub(super) fn retry_while_busy<T, E>(
+    mut work: impl FnMut() -> Result<T, E>,
+    is_busy: impl Fn(&E) -> bool,
+    cancelled: &AtomicBool,
+) -> Result<T, E> {
+    let began = Instant::now();
+    loop {
+        let done = work();
+        let may_wait = began.elapsed() < BUSY_TIMEOUT && !cancelled.load(Ordering::Acquire);
+        match done {
+            Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
+            done => return done,
         }
     }
 }

@@ -7,7 +7,6 @@ mod training_report;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
 
 use futures_util::future::BoxFuture;
 use serde_json::json;
@@ -16,14 +15,15 @@ use tokio::runtime::Handle;
 use self::training_report::TrainingReporter;
 use super::checkpoints::{self, CheckpointSync};
 use super::memory::JobMemory;
-use super::patience::Patience;
+use super::patience::{Patience, retry_while_busy};
 use super::report::JobReporter;
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
-use crate::evaluation::{self, EvaluateConfig};
+use crate::evaluation::{self, EvaluateConfig, EvaluationError};
+use crate::files::remove_dir;
 use crate::registry::LoadedModel;
 use crate::store::{ModelMetrics, Store, StoreError};
 use crate::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent};
@@ -32,10 +32,6 @@ use crate::versions::{VersionError, Versions};
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
-/// How long a job waits for another process, whose lease has expired, to unlock the directory.
-const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
-/// How often it tries.
-const BUSY_POLL: Duration = Duration::from_millis(200);
 
 /// Runs jobs in this process.
 pub struct Pipeline {
@@ -144,7 +140,8 @@ impl Pipeline {
         }
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
-        let info = retry_while_busy(collect, is_busy, cancelled).map_err(|error| failed(&error))?;
+        // After an error it continues with the shards that are finished.
+        let info = patience.repeat(|| retry_while_busy(collect, is_busy, cancelled))?;
         patience.run(async || {
             self.store
                 .objects()
@@ -188,14 +185,15 @@ impl Pipeline {
                 sync.record(pushed).into_iter().for_each(|line| report.line(line));
             }
         };
-        let train = || training::run(&training, &mut observer, cancelled);
+        let mut train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
-        match retry_while_busy(train, is_busy, cancelled).map_err(|error| failed(&error))? {
+        // After an error it continues from the last checkpoint.
+        match patience.repeat(|| retry_while_busy(&mut train, is_busy, cancelled))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "calibrating");
-                evaluation::calibrate_trained(&model_dir, &dataset, cancelled).map_err(|error| failed(&error))?;
+                patience.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
                 report.progress(steps, steps, "publishing");
                 let written =
                     patience.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
@@ -250,9 +248,15 @@ impl Pipeline {
         // An earlier attempt may have left an incomplete report.
         patience.run(async || self.store.objects().delete(&dir).await)?;
         let out = self.store.objects().data_dir().join(&dir);
-        evaluation::prepare(&out)
-            .and_then(|()| evaluation::write(&out, &mut found, &figures))
-            .map_err(|error| failed(&error))?;
+        patience.repeat(|| {
+            // So may a write that failed.
+            remove_dir(&out).map_err(|source| EvaluationError::Io {
+                path: out.clone(),
+                source,
+            })?;
+            evaluation::prepare(&out)?;
+            evaluation::write(&out, &mut found, &figures)
+        })?;
         patience.run(async || self.store.objects().push(&dir, REPORT_FILE).await)?;
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .map_err(|error| failed(&error))?
@@ -290,23 +294,6 @@ impl Pipeline {
             runtime: &self.runtime,
             report,
             cancelled,
-        }
-    }
-}
-
-/// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
-fn retry_while_busy<T, E>(
-    mut work: impl FnMut() -> Result<T, E>,
-    is_busy: impl Fn(&E) -> bool,
-    cancelled: &AtomicBool,
-) -> Result<T, E> {
-    let began = Instant::now();
-    loop {
-        let done = work();
-        let may_wait = began.elapsed() < BUSY_TIMEOUT && !cancelled.load(Ordering::Acquire);
-        match done {
-            Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
-            done => return done,
         }
     }
 }

@@ -11,7 +11,7 @@ use super::instance::Instance;
 use super::job::{id_of, number_of};
 use super::progress::StoredProgress;
 use super::runner::{self, JobExecutor};
-use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition, unix_s};
+use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition};
 use crate::store::{EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// The maximum length of an idempotency key.
@@ -107,7 +107,8 @@ impl Jobs {
             idempotency_key: key,
             submitter: submitter.to_owned(),
         };
-        match shared.store.enqueue(new, shared.limits.queued as i64, unix_s()).await? {
+        let now_s = shared.store.now_s().await?;
+        match shared.store.enqueue(new, shared.limits.queued as i64, now_s).await? {
             EnqueueResult::New(row) => {
                 shared.wake.notify_one();
                 let job = Job::of(&row)?;
@@ -181,7 +182,7 @@ impl Jobs {
             let asked = match state.after(JobTransition::Cancel) {
                 None => return Err(illegal(id, state, JobTransition::Cancel)),
                 Some(_) if state == JobState::Running => store.ask_to_cancel(row.number).await?,
-                Some(_) => store.cancel_queued(row.number, unix_s()).await?,
+                Some(_) => store.cancel_queued(row.number, store.now_s().await?).await?,
             };
             if asked {
                 let job = self.get(id).await;

@@ -16,15 +16,15 @@ use super::instance::Instance;
 use super::progress::{ReportBuffer, StoredProgress};
 use super::queue::JobsInner;
 use super::report::JobReporter;
-use super::{Job, JobError, JobSpec, JobState, JobTransition, priority, unix_s};
-use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics};
+use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
+use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics, StoreError};
 use crate::telemetry::names;
 
 /// How often a job's report is written, unless the lease needs it more often.
 const WRITE_EVERY: Duration = Duration::from_millis(500);
 /// How often the store is asked for jobs that other processes submitted.
 const POLL_EVERY: Duration = Duration::from_secs(1);
-/// How often the runner tries to write a job's outcome.
+/// How often a runner that is asked to stop tries to write a job's outcome.
 const END_ATTEMPTS: u32 = 5;
 
 /// Why a job's work ended without a result.
@@ -331,7 +331,8 @@ impl<'a> JobRun<'a> {
             state: state.name(),
             error,
             outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
-            ended_s: state.is_final().then(unix_s),
+            // Set when it is written, by the database's clock.
+            ended_s: state.is_final().then_some(0.0),
             published: outcome.as_ref().and_then(|outcome| outcome.published.clone()),
             measured: outcome.and_then(|outcome| outcome.measured),
             crashed: crash.is_some(),
@@ -340,19 +341,30 @@ impl<'a> JobRun<'a> {
         self.shared.ended.notify_one();
     }
 
+    /// Writes the outcome. While the database is away, tries until it is back: nothing else can be claimed meanwhile.
     async fn write_outcome(&self, id: &str, outcome: JobOutcome) {
-        let report = self.take_report();
-        for attempt in 1..=END_ATTEMPTS {
-            let written = self
-                .shared
-                .store
-                .end(self.report.lease(), outcome.clone(), report.clone());
-            match written.await {
+        let (report, stop) = (self.take_report(), self.shared.stop.subscribe());
+        let mut attempt = 0;
+        loop {
+            attempt += 1;
+            match self.try_to_end(outcome.clone(), report.clone()).await {
                 Ok(true) => return self.shared.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),
                 Err(error) => warn!(job.id = %id, %error, attempt, "could not write a job's outcome"),
             }
+            if *stop.borrow() && attempt >= END_ATTEMPTS {
+                return;
+            }
             tokio::time::sleep(POLL_EVERY).await;
         }
+    }
+
+    /// Returns false if the lease was lost.
+    async fn try_to_end(&self, mut outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
+        let store = &self.shared.store;
+        if let Some(ended_s) = &mut outcome.ended_s {
+            *ended_s = store.now_s().await?;
+        }
+        store.end(self.report.lease(), outcome, report).await
     }
 }

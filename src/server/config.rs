@@ -46,6 +46,13 @@ pub struct ServerConfig {
     /// The directory with the recordings that import jobs may read. Default: none, so imports are off.
     #[schema(value_type = Option<String>)]
     pub import_dir: Option<PathBuf>,
+    /// The certificate chain of the public address as a PEM file, for HTTPS; needs the Cargo feature `tls`. The file is read
+    /// again when it changes.
+    #[schema(value_type = Option<String>)]
+    pub tls_certificate: Option<PathBuf>,
+    /// The private key of that certificate as a PEM file.
+    #[schema(value_type = Option<String>)]
+    pub tls_key: Option<PathBuf>,
     /// If true, this server accepts jobs but leaves the work to workers.
     pub no_jobs: bool,
     /// Maximum size of a request body and of a message of a stream, in bytes.
@@ -58,8 +65,8 @@ pub struct ServerConfig {
     pub max_queued_predictions: usize,
     /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch.
     pub max_batch: usize,
-    /// Maximum size of all request bodies that the server reads or works with at the same time, in bytes; more are refused with
-    /// 503. At least `max_body_bytes`. Messages of streams are not counted.
+    /// Maximum size of all request bodies and messages of streams that the server reads or works with at the same time, in
+    /// bytes; more requests are refused with 503, more streams closed with 1013. At least `max_body_bytes`.
     pub max_total_body_bytes: usize,
     /// Maximum number of connections. If all are open, a new one replaces the one that was idle the longest; see
     /// `connection_evict_ms`. If none is idle, it is refused with 503 and closed.
@@ -140,7 +147,7 @@ pub struct ServerConfig {
     /// Maximum size of a request's head, in bytes; a longer one is refused with 431.
     pub max_header_bytes: usize,
     /// How long a request's head may take to arrive, counted from the start of the connection or from the previous
-    /// response, in milliseconds. So this is also how long a connection may be idle.
+    /// response, in milliseconds. So this is also how long a connection may be idle. A TLS handshake may take as long.
     pub header_read_ms: u64,
     /// How long a client may read nothing while a response is written to it, in milliseconds.
     pub write_stall_ms: u64,
@@ -169,6 +176,8 @@ impl Default for ServerConfig {
             database_wait_s: 60,
             objects_url: None,
             import_dir: None,
+            tls_certificate: None,
+            tls_key: None,
             no_jobs: false,
             max_body_bytes: 8 << 20,
             max_job_bytes: 64 << 10,

@@ -6,7 +6,9 @@ pub(super) mod body_budget;
 mod connection_table;
 pub(super) mod connections;
 pub(super) mod extract;
+mod http_stream;
 pub(super) mod listener;
+pub(super) mod message_bytes;
 pub(super) mod middleware;
 pub(super) mod multipart;
 pub(super) mod origin;
@@ -15,6 +17,7 @@ pub(super) mod problem;
 mod rate;
 pub(super) mod request_limit;
 pub(super) mod streams;
+pub(super) mod tls;
 
 pub mod keys;
 pub mod shutdown;

@@ -7,7 +7,7 @@ use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::config::ServerConfig;
-use super::http::body_budget::{self, BodyBudget};
+use super::http::body_budget;
 use super::http::keys;
 use super::http::middleware::{self, RequestTrace};
 use super::http::origin::{self, OriginPolicy};
@@ -38,7 +38,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(config.max_body_bytes))
-        .layer(from_fn_with_state(BodyBudget::new(config), body_budget::count))
+        .layer(from_fn_with_state(app.body_budget().clone(), body_budget::count))
         .layer(from_fn_with_state(origins, origin::check))
         .layer(from_fn(move |request, next| {
             middleware::trace(trace.clone(), request, next)

@@ -9,6 +9,7 @@ use tracing::{info, warn};
 use super::admin;
 use super::http::connections::Connections;
 use super::http::listener::BoundedListener;
+use super::http::tls::ServerTls;
 use super::router::router;
 use super::routes::metrics;
 use super::state::App;
@@ -56,10 +57,12 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     let limit = Duration::from_millis(config.shutdown_deadline_ms);
     let drain = Duration::from_millis(config.drain_ms);
     let listener = BoundedListener::new(listener, config);
-    let mut connections = Connections::new(router(app.clone()), config, app.streams().stopping());
+    let connections = Connections::new(router(app.clone()), config, app.streams().stopping());
+    let mut connections = connections.with_tls(app.tls().cloned());
     tokio::select! {
         never = connections.accept(&listener) => match never {},
         never = metrics::keep_folded() => match never {},
+        never = ServerTls::keep_fresh(app.tls()) => match never {},
         never = app.keys().keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
         () = shutdown => {}
     }

@@ -12,8 +12,11 @@ use super::blocking::BlockingWork;
 use super::config::{ServerConfig, SettingError};
 use super::environments::Environments;
 use super::http::admission::Admission;
+use super::http::body_budget::BodyBudget;
 use super::http::keys::{Caller, Keys};
+use super::http::message_bytes::MessageBytes;
 use super::http::streams::{Streams, stop_requested};
+use super::http::tls::ServerTls;
 use super::pictures::Pictures;
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
@@ -59,6 +62,7 @@ impl From<VersionError> for ServerError {
 pub struct App {
     shared: Arc<AppState>,
     keys: Keys,
+    tls: Option<ServerTls>,
 }
 
 /// The parts of an [`App`] that have threads or a database.
@@ -79,6 +83,7 @@ struct AppState {
     streams: Streams,
     event_streams: Streams,
     admission: Admission,
+    body_budget: BodyBudget,
     predictions: BlockingWork,
     pictures: Pictures,
     blocking: BlockingWork,
@@ -145,6 +150,7 @@ impl App {
                 streams: Streams::new("streams", config.max_streams),
                 event_streams: Streams::new("event streams", config.max_event_streams),
                 admission: Admission::new(&config),
+                body_budget: BodyBudget::new(&config),
                 predictions: BlockingWork::new("predictions", config.request_threads),
                 pictures: Pictures::new(&config),
                 blocking: BlockingWork::new("requests", config.request_threads),
@@ -155,7 +161,18 @@ impl App {
                 parts,
             }),
             keys: Keys::none(),
+            tls: None,
         }
+    }
+
+    /// The same app with TLS on its public address. Without this call, it speaks plain HTTP.
+    #[must_use]
+    pub fn with_tls(self, tls: Option<ServerTls>) -> Self {
+        Self { tls, ..self }
+    }
+
+    pub(super) fn tls(&self) -> Option<&ServerTls> {
+        self.tls.as_ref()
     }
 
     /// The same app with these API keys. Without this call, authentication is off.
@@ -196,6 +213,10 @@ impl App {
 
     pub(super) fn shared_config(&self) -> Arc<ServerConfig> {
         Arc::clone(&self.shared.config)
+    }
+
+    pub(super) fn body_budget(&self) -> &BodyBudget {
+        &self.shared.body_budget
     }
 
     pub(super) fn keys(&self) -> &Keys {
@@ -251,7 +272,7 @@ impl App {
     }
 
     /// What a stream of that caller needs of this app.
-    pub(super) fn stream_services(&self, caller: Caller) -> StreamServices {
+    pub(super) fn stream_services(&self, caller: Caller, messages: MessageBytes) -> StreamServices {
         StreamServices {
             config: self.shared_config(),
             predictor: self.predictor().clone(),
@@ -259,6 +280,7 @@ impl App {
             streams: self.streams().clone(),
             keys: self.keys().clone(),
             caller,
+            messages,
         }
     }
 

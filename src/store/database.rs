@@ -8,7 +8,9 @@ use futures_util::future::BoxFuture;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use sqlx::query::Query;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow};
+use sqlx::sqlite::{
+    SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteRow,
+};
 use sqlx::{
     AssertSqlSafe, Connection as _, Decode, Encode, Postgres, Row as _, SqlSafeStr as _, SqlStr, Sqlite, Transaction,
     Type,
@@ -162,6 +164,7 @@ impl Database {
         let pool = SqlitePoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
             .acquire_timeout(BUSY_TIMEOUT)
+            .after_connect(|connection, _| Box::pin(refuse_read_only(connection)))
             // A failed commit or rollback, for example on a full disk, leaves the connection unusable: discard it.
             .after_release(|connection, _| {
                 Box::pin(async move {
@@ -344,6 +347,25 @@ fn sqlite_failed(path: &Path, source: sqlx::Error) -> StoreError {
             source,
         },
     }
+}
+
+/// SQLite opens a database on a read-only file system for reading, and such a connection would never write again, also if
+/// the file system can be written later. Errors: the connection cannot write.
+async fn refuse_read_only(connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
+    // Without waiting for another writer.
+    sqlx::raw_sql("PRAGMA busy_timeout = 0")
+        .execute(&mut *connection)
+        .await?;
+    match sqlx::raw_sql("BEGIN IMMEDIATE; ROLLBACK")
+        .execute(&mut *connection)
+        .await
+    {
+        Err(error) if sqlite_code(&error) != Some(SQLITE_BUSY) => return Err(error),
+        _ => {}
+    }
+    let restore = format!("PRAGMA busy_timeout = {}", BUSY_TIMEOUT.as_millis());
+    let restored = sqlx::raw_sql(AssertSqlSafe(restore)).execute(connection).await;
+    restored.map(drop)
 }
 
 /// Errors: `Damaged` if the database's structure is not sound.

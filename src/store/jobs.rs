@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::reports::{JobReport, write_report};
-use super::{ModelMetrics, Store, StoreError, unix_s};
+use super::{ModelMetrics, Store, StoreError};
 
 /// The row of a job. Structured values are JSON.
 #[derive(Clone, Debug, PartialEq)]
@@ -149,7 +149,7 @@ async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
 async fn check_capacity(
     tx: &mut Tx,
     (makes, submitter): (Option<&str>, &str),
-    max_queued: i64,
+    (max_queued, now_s): (i64, f64),
 ) -> Result<Option<EnqueueResult>, StoreError> {
     // In SQL nothing equals NULL, so a job without an exclusive output never conflicts.
     let sql = "SELECT number FROM jobs WHERE makes = $1 AND state IN ('queued', 'running')";
@@ -168,7 +168,7 @@ async fn check_capacity(
     }
     let sql = "SELECT COUNT(*) AS keys, (SELECT COUNT(*) FROM jobs WHERE submitter = $1 AND state = 'queued') AS queued \
          FROM api_keys WHERE revoked_s IS NULL AND scope <> 'predict' AND (expires_s IS NULL OR expires_s > $2)";
-    let rows = tx.fetch(sql, vec![submitter.into(), unix_s().into()]).await?;
+    let rows = tx.fetch(sql, vec![submitter.into(), now_s.into()]).await?;
     let Some(row) = rows.first() else { return Ok(None) };
     let (keys, queued): (i64, i64) = (row.get("keys")?, row.get("queued")?);
     // Equal shares of all keys that can submit jobs, rounded up.
@@ -181,7 +181,7 @@ fn first_job(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
 }
 
 impl Store {
-    /// Enqueues a job unless the queue is full. Errors: `Query`.
+    /// Enqueues a job unless the queue is full. `now_s`: see [`Store::now_s`]. Errors: `Query`.
     pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<EnqueueResult, StoreError> {
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
@@ -191,9 +191,8 @@ impl Store {
                 return Ok(EnqueueResult::Same(row));
             }
         }
-        if let Some(refused) =
-            check_capacity(&mut tx, (new.exclusive_output.as_deref(), &new.submitter), max_queued).await?
-        {
+        let output = new.exclusive_output.as_deref();
+        if let Some(refused) = check_capacity(&mut tx, (output, &new.submitter), (max_queued, now_s)).await? {
             return Ok(refused);
         }
         tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'job'", vec![])
@@ -217,13 +216,14 @@ impl Store {
 
     /// Enqueues a failed or cancelled job again; `None` if it is neither. Errors: `Query`.
     pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
+        let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
         let sql = "SELECT makes, submitter FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
         let rows = tx.fetch(sql, vec![number.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let (makes, submitter): (Option<String>, String) = (row.get("makes")?, row.get("submitter")?);
-        if let Some(refused) = check_capacity(&mut tx, (makes.as_deref(), &submitter), max_queued).await? {
+        if let Some(refused) = check_capacity(&mut tx, (makes.as_deref(), &submitter), (max_queued, now_s)).await? {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \

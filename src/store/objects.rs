@@ -126,7 +126,11 @@ impl Objects {
             let path = self.data_dir.join(object.location.as_ref());
             let here = tokio::fs::metadata(&path).await;
             if is_last(&object) || here.map(|here| here.len()).ok() != Some(object.size) {
-                write(&path, read(shared, &object.location).await?).await?;
+                let bytes = read(shared, &object.location).await?;
+                if bytes.len() as u64 != object.size {
+                    return Err(truncated(&object, bytes.len()));
+                }
+                write(&path, bytes).await?;
             }
         }
         Ok(true)
@@ -242,6 +246,15 @@ async fn on_disk<T: Send + 'static>(
         .map_err(StoreError::io(action, path))
 }
 
+/// Such an answer is an error of the way to the object store, so it is worth to try again.
+fn truncated(object: &ObjectMeta, bytes: usize) -> StoreError {
+    let reason = format!("the answer has {bytes} bytes; the object has {}", object.size);
+    failed("read", &object.location)(object_store::Error::Generic {
+        store: "object store",
+        source: reason.into(),
+    })
+}
+
 fn failed(action: &'static str, key: &Key) -> impl FnOnce(object_store::Error) -> StoreError {
     let key = key.to_string();
     move |source| StoreError::Object { action, key, source }
@@ -265,7 +278,16 @@ fn bucket(url: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
         key: url.to_owned(),
         source,
     };
-    let bucket = object_store::aws::AmazonS3Builder::from_env().with_url(url).build();
+    // A job waits for longer than that itself; a request gets 503.
+    let retry = object_store::RetryConfig {
+        max_retries: 5,
+        retry_timeout: std::time::Duration::from_secs(10),
+        ..object_store::RetryConfig::default()
+    };
+    let bucket = object_store::aws::AmazonS3Builder::from_env()
+        .with_url(url)
+        .with_retry(retry)
+        .build();
     let prefix = url.splitn(4, '/').nth(3).unwrap_or_default();
     let prefixed = object_store::prefix::PrefixStore::new(bucket.map_err(failed)?, prefix);
     Ok(Arc::new(prefixed))

@@ -17,7 +17,7 @@ const TIMEOUT: Duration = Duration::from_mins(3);
 const LEASE: Duration = Duration::from_secs(30);
 
 /// A running program. Dropping it kills the process.
-struct KillOnDrop(Child);
+pub(crate) struct KillOnDrop(Child);
 
 impl Drop for KillOnDrop {
     fn drop(&mut self) {
@@ -47,14 +47,14 @@ fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String) {
     (KillOnDrop(child), line)
 }
 
-fn serve(data_dir: &Path, more: &[&str]) -> (KillOnDrop, String) {
+pub(crate) fn serve(data_dir: &Path, more: &[&str]) -> (KillOnDrop, String) {
     let (program, line) = start(data_dir, &[&["serve", "--bind", "127.0.0.1:0"], more].concat());
     let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
     (program, address.to_owned())
 }
 
 /// Sends a request and returns the JSON body of the response.
-fn ask(address: &str, request: &str, body: &Value) -> Value {
+pub(crate) fn ask(address: &str, request: &str, body: &Value) -> Value {
     let body = if body.is_null() {
         String::new()
     } else {
@@ -73,11 +73,11 @@ fn ask(address: &str, request: &str, body: &Value) -> Value {
     serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap_or_else(|_| panic!("{answer}"))
 }
 
-fn wait_for(address: &str, id: &str, state: &str) -> Value {
+pub(crate) fn wait_for(address: &str, id: &str, state: &str) -> Value {
     wait_until(address, id, |job| job["state"] == state)
 }
 
-fn wait_until(address: &str, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
+pub(crate) fn wait_until(address: &str, id: &str, is_reached: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + TIMEOUT;
     loop {
         let job = ask(address, &format!("GET /v1/jobs/{id}"), &Value::Null);
@@ -89,7 +89,7 @@ fn wait_until(address: &str, id: &str, is_reached: impl Fn(&Value) -> bool) -> V
     }
 }
 
-fn collect() -> Value {
+pub(crate) fn collect() -> Value {
     json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40})
 }
 
@@ -104,7 +104,7 @@ fn train() -> Value {
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
 }
 
-fn weights(data_dir: &Path) -> Vec<u8> {
+pub(crate) fn weights(data_dir: &Path) -> Vec<u8> {
     std::fs::read(data_dir.join("models/m/1/model.safetensors")).unwrap()
 }
 
@@ -120,7 +120,7 @@ fn uninterrupted() -> (tempfile::TempDir, Duration) {
     (dir, Duration::from_secs_f64(took_s))
 }
 
-fn copy_dataset(from: &Path, to: &Path) {
+pub(crate) fn copy_dataset(from: &Path, to: &Path) {
     let mut dirs = vec![PathBuf::from("datasets/seen")];
     while let Some(dir) = dirs.pop() {
         std::fs::create_dir_all(to.join(&dir)).unwrap();

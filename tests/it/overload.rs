@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use foreframe::dataset::{CollectConfig, collect};
-use foreframe::server::protocol::Codec;
+use foreframe::server::protocol::{ClosingReason, Codec, ErrorCode, ServerMessage};
 use foreframe::server::{self, App, ServerConfig, ServerListeners};
 use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::types::Seed;
@@ -18,7 +18,7 @@ use tokio::task::{AbortHandle, JoinSet};
 
 use crate::client::Client;
 use crate::process::{Program, output, text};
-use crate::service::{TIMEOUT, app, context, get, post, run};
+use crate::service::{TIMEOUT, app, context, get, poll_until, post, run};
 
 /// A head that never ends.
 const DRIPPING_HEAD: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\nx-slow: ";
@@ -122,6 +122,90 @@ async fn unfinished_bodies_beyond_the_budget_are_refused() {
         }
         assert!(is_refusal(&answer) && Instant::now() < deadline, "{answer}");
     }
+    server.stop().await;
+}
+
+/// The bytes of a binary message without its last byte.
+fn unfinished_message(length: usize) -> Vec<u8> {
+    // Binary and final, masked with zeros, 64-bit length.
+    let mut bytes = vec![0x82, 0xff];
+    bytes.extend((length as u64).to_be_bytes());
+    bytes.extend([0; 4]);
+    bytes.resize(bytes.len() + length - 1, b'x');
+    bytes
+}
+
+#[tokio::test]
+async fn unfinished_messages_beyond_the_budget_close_their_streams() {
+    const MESSAGE_BYTES: usize = 64 << 10;
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_body_bytes: MESSAGE_BYTES,
+        max_total_body_bytes: 4 * MESSAGE_BYTES,
+        ..ServerConfig::default()
+    };
+    let server = run(app(dir.path(), config)).await;
+    let connect = async || {
+        let stream = Client::connect(server.address, "/v1/models/plain/stream", Codec::Msgpack);
+        stream.await.unwrap()
+    };
+    let hold = async || {
+        let mut client = connect().await;
+        // The server may close it before it has read all.
+        let _ = client
+            .socket
+            .get_mut()
+            .write_all(&unfinished_message(MESSAGE_BYTES))
+            .await;
+        client
+    };
+    let small_body = format!("{:20000}", "");
+    let request = format!(
+        "POST /v1/models/plain/predict HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\
+         content-type: application/json\r\ncontent-length: {}\r\n\r\n{small_body}",
+        small_body.len()
+    );
+    // Each counts 48 KiB: five fit, and leave less than 20,000 bytes.
+    let mut held = Vec::new();
+    for _ in 0..5 {
+        held.push(hold().await);
+    }
+    poll_until(async || {
+        let answer = exchange(TcpStream::connect(server.address).await.unwrap(), &request).await;
+        is_refusal(&answer).then_some(())
+    })
+    .await;
+    for _ in 0..5 {
+        let mut refused = hold().await;
+        match refused.receive_or_end().await {
+            Ok(ServerMessage::Error { code, detail, .. }) => {
+                assert_eq!(code, ErrorCode::Overloaded);
+                assert!(detail.contains("exceed 262144 bytes; try again in 1 s"), "{detail}");
+            }
+            other => panic!("{other:?}"),
+        }
+        assert_eq!(refused.end().await, (Some(ClosingReason::Overloaded), Some(1013)));
+    }
+    // The budget is used up, but a stream of small frames continues.
+    let mut small = connect().await;
+    small.send_text("{}").await;
+    assert!(matches!(small.receive().await, ServerMessage::Error { code, .. } if code == ErrorCode::Malformed));
+    drop(held);
+    // The streams that are gone have given back what they held.
+    poll_until(async || {
+        let mut client = hold().await;
+        let _ = client.socket.get_mut().write_all(b"x").await;
+        let answer = client.receive_or_end().await;
+        matches!(
+            answer,
+            Ok(ServerMessage::Error {
+                code: ErrorCode::Malformed,
+                ..
+            })
+        )
+        .then_some(())
+    })
+    .await;
     server.stop().await;
 }
 

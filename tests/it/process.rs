@@ -38,9 +38,15 @@ pub(crate) struct Program {
 
 impl Program {
     pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
+        Self::start_with(dir, arguments, &[])
+    }
+
+    /// The same with variables of its environment.
+    pub(crate) fn start_with(dir: &Path, arguments: &[&str], environment: &[(&str, &str)]) -> Self {
         let log = dir.join(format!("{}.log", arguments[0]));
         let mut child = foreframe(dir)
             .args(arguments)
+            .envs(environment.iter().copied())
             .env("RUST_LOG", "foreframe=debug")
             .stdout(Stdio::piped())
             .stderr(File::create(&log).unwrap())
@@ -95,14 +101,24 @@ impl Drop for Program {
 pub(crate) struct RunningServer {
     pub(crate) program: Program,
     pub(crate) address: SocketAddr,
+    /// Sent with each request.
+    key: Option<String>,
 }
 
 impl RunningServer {
     pub(crate) fn start(dir: &Path, arguments: &[&str]) -> Self {
-        Self::of(Program::start(
-            dir,
-            &[&["serve", "--bind", "127.0.0.1:0"], arguments].concat(),
-        ))
+        Self::start_with(dir, arguments, &[])
+    }
+
+    /// The same with variables of its environment.
+    pub(crate) fn start_with(dir: &Path, arguments: &[&str], environment: &[(&str, &str)]) -> Self {
+        let arguments = [&["serve", "--bind", "127.0.0.1:0"], arguments].concat();
+        Self::of(Program::start_with(dir, &arguments, environment))
+    }
+
+    pub(crate) fn with_key(self, key: &str) -> Self {
+        let key = Some(key.to_owned());
+        Self { key, ..self }
     }
 
     /// Waits until a program that serves is ready.
@@ -112,6 +128,7 @@ impl RunningServer {
         let server = Self {
             address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
             program,
+            key: None,
         };
         let deadline = Instant::now() + TIMEOUT;
         while !server.get("/readyz").starts_with("HTTP/1.1 200") {
@@ -133,13 +150,15 @@ impl RunningServer {
         serde_json::from_str(body).unwrap_or_else(|_| panic!("{answer}"))
     }
 
-    fn send(&self, method: &str, path: &str, body: &str) -> String {
+    pub(crate) fn send(&self, method: &str, path: &str, body: &str) -> String {
         let mut stream = TcpStream::connect(self.address).unwrap();
         let head = "host: a\r\nconnection: close\r\ncontent-type: application/json";
         let length = body.len();
+        let key = self.key.as_ref();
+        let key = key.map_or_else(String::new, |key| format!("authorization: Bearer {key}\r\n"));
         write!(
             stream,
-            "{method} {path} HTTP/1.1\r\n{head}\r\ncontent-length: {length}\r\n\r\n{body}"
+            "{method} {path} HTTP/1.1\r\n{head}\r\n{key}content-length: {length}\r\n\r\n{body}"
         )
         .unwrap();
         let mut answer = String::new();

@@ -14,7 +14,7 @@ use crate::process::{RunningServer, output, text};
 use crate::service::TIMEOUT;
 
 /// A PostgreSQL server of this test. Dropping it stops it.
-struct OwnPostgres {
+pub(crate) struct OwnPostgres {
     dir: tempfile::TempDir,
     tools: PathBuf,
     port: u16,
@@ -22,7 +22,7 @@ struct OwnPostgres {
 
 impl OwnPostgres {
     /// A new database cluster that is not started yet; none if PostgreSQL is not installed.
-    fn new() -> Option<Self> {
+    pub(crate) fn new() -> Option<Self> {
         let Some(tools) = tools() else {
             println!("skipped: PostgreSQL's programs are not installed");
             return None;
@@ -41,7 +41,7 @@ impl OwnPostgres {
         Some(postgres)
     }
 
-    fn url(&self) -> String {
+    pub(crate) fn url(&self) -> String {
         format!("postgres://foreframe@127.0.0.1:{}/postgres", self.port)
     }
 
@@ -49,7 +49,11 @@ impl OwnPostgres {
         self.dir.path().join("data").display().to_string()
     }
 
-    fn start(&self) {
+    pub(crate) fn port(&self) -> u16 {
+        self.port
+    }
+
+    pub(crate) fn start(&self) {
         let (data, log) = (self.data(), self.dir.path().join("log").display().to_string());
         let sockets = self.dir.path().display();
         let options = format!(
@@ -60,12 +64,12 @@ impl OwnPostgres {
     }
 
     /// Ends it without a clean shutdown.
-    fn stop(&self) {
+    pub(crate) fn stop(&self) {
         self.succeed("pg_ctl", &["-D", &self.data(), "-m", "immediate", "-w", "stop"]);
     }
 
     /// Sends a signal to all of its processes.
-    fn signal(&self, signal: &str) {
+    pub(crate) fn signal(&self, signal: &str) {
         let file = std::fs::read_to_string(self.dir.path().join("data/postmaster.pid")).unwrap();
         let postmaster = file.lines().next().unwrap().to_owned();
         let children = Command::new("ps")
@@ -92,7 +96,7 @@ impl OwnPostgres {
         command.args(arguments).current_dir("/").output().unwrap()
     }
 
-    fn succeed(&self, tool: &str, arguments: &[&str]) {
+    pub(crate) fn succeed(&self, tool: &str, arguments: &[&str]) {
         let output = self.run(tool, arguments);
         assert!(output.status.success(), "{tool}: {}", text(&output.stderr));
     }
@@ -109,7 +113,7 @@ impl Drop for OwnPostgres {
     }
 }
 
-fn is_root() -> bool {
+pub(crate) fn is_root() -> bool {
     text(&Command::new("id").arg("-u").output().unwrap().stdout).trim() == "0"
 }
 
@@ -123,11 +127,11 @@ fn tools() -> Option<PathBuf> {
     found.into_iter().next()
 }
 
-fn status(answer: &str) -> &str {
+pub(crate) fn status(answer: &str) -> &str {
     answer.split(' ').nth(1).unwrap_or_default()
 }
 
-fn wait_for_status(server: &RunningServer, path: &str, expected: &str) -> String {
+pub(crate) fn wait_for_status(server: &RunningServer, path: &str, expected: &str) -> String {
     let deadline = Instant::now() + TIMEOUT;
     loop {
         let answer = server.get(path);

@@ -1,7 +1,8 @@
-//! How many bytes of request bodies the server holds at the same time. Each body has its own limit; this one is for all
-//! together, so that many unfinished bodies do not take all memory.
+//! How many bytes of request bodies, and of the messages of streams, the server holds at the same time. Each has its own
+//! limit; this one is for all together, so that many unfinished bodies do not take all memory.
 
 use std::error::Error;
+use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -26,7 +27,7 @@ pub(in crate::server) struct BodyBudget {
 /// The bodies in flight exceed the budget.
 #[derive(Debug, thiserror::Error)]
 #[error("the request bodies that are being read exceed {limit} bytes; try again in 1 s")]
-struct BodyBudgetError {
+pub(in crate::server) struct BodyBudgetError {
     limit: usize,
 }
 
@@ -38,6 +39,14 @@ impl BodyBudget {
         }
     }
 
+    /// A share of it without any bytes.
+    pub(super) fn share(&self) -> BodyShare {
+        BodyShare {
+            budget: self.clone(),
+            taken: AtomicUsize::new(0),
+        }
+    }
+
     fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
         let limit = self.limit;
         let sum = |used: usize| used.checked_add(bytes).filter(|&sum| sum <= limit);
@@ -46,14 +55,14 @@ impl BodyBudget {
     }
 }
 
-/// What one request has taken; given back on drop.
-struct BodyShare {
+/// What one request or stream has taken; given back on drop.
+pub(super) struct BodyShare {
     budget: BodyBudget,
     taken: AtomicUsize,
 }
 
 impl BodyShare {
-    fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
+    pub(super) fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
         self.budget.take(bytes)?;
         self.taken.fetch_add(bytes, Ordering::AcqRel);
         Ok(())
@@ -102,10 +111,7 @@ pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: 
     if request.body().is_end_stream() {
         return next.run(request).await;
     }
-    let share = Arc::new(BodyShare {
-        budget,
-        taken: AtomicUsize::new(0),
-    });
+    let share = Arc::new(budget.share());
     // The bytes outlive the body: the handler works with them.
     let held = Arc::clone(&share);
     let response = next
@@ -117,12 +123,21 @@ pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: 
 
 /// The answer to a request whose body could not be read, if the budget is the cause.
 pub(super) fn exceeded(error: &(dyn Error + 'static)) -> Option<ApiError> {
+    cause(error).map(|exceeded| ApiError::unavailable(exceeded.to_string()))
+}
+
+/// The exceeded budget among the causes of an error.
+pub(in crate::server) fn cause<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a BodyBudgetError> {
     let mut cause = Some(error);
     while let Some(error) = cause {
         if let Some(exceeded) = error.downcast_ref::<BodyBudgetError>() {
-            return Some(ApiError::unavailable(exceeded.to_string()));
+            return Some(exceeded);
         }
-        cause = error.source();
+        // An I/O error's source is that of the error within it.
+        let within = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+        cause = within
+            .map(|error| error as &(dyn Error + 'static))
+            .or_else(|| error.source());
     }
     None
 }
@@ -137,11 +152,7 @@ mod tests {
             max_total_body_bytes: 100,
             ..ServerConfig::default()
         });
-        let share = || BodyShare {
-            budget: budget.clone(),
-            taken: AtomicUsize::new(0),
-        };
-        let (first, second) = (share(), share());
+        let (first, second) = (budget.share(), budget.share());
         first.take(60).unwrap();
         let error = axum::Error::new(second.take(50).unwrap_err());
         assert!(matches!(exceeded(&error), Some(ApiError::Unavailable { .. })));

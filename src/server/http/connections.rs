@@ -15,21 +15,23 @@ use hyper::server::conn::http1;
 use hyper::service::Service;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::debug;
 
 use super::connection_table::{BusyConnection, ConnectionPlace};
+use super::http_stream::HttpStream;
 use super::listener::{BoundedConnection, BoundedListener};
+use super::message_bytes::MessageBytes;
 use super::streams::stop_requested;
+use super::tls::ServerTls;
 use crate::server::config::ServerConfig;
 
 /// The open connections. Dropping this cuts them off. After an upgrade, a connection belongs to its stream's task.
 pub(in crate::server) struct Connections {
     tasks: JoinSet<()>,
-    http: http1::Builder,
-    router: Router,
-    stopping: watch::Receiver<bool>,
+    handler: ConnectionHandler,
 }
 
 impl Connections {
@@ -38,12 +40,23 @@ impl Connections {
         http.timer(TokioTimer::new())
             .header_read_timeout(Duration::from_millis(config.header_read_ms))
             .max_header_size(config.max_header_bytes);
-        Self {
-            tasks: JoinSet::new(),
+        let handler = ConnectionHandler {
             http,
             router,
             stopping,
+            tls: None,
+            handshake_limit: Duration::from_millis(config.header_read_ms),
+        };
+        Self {
+            tasks: JoinSet::new(),
+            handler,
         }
+    }
+
+    /// The same with TLS, if there is one.
+    pub(in crate::server) fn with_tls(mut self, tls: Option<ServerTls>) -> Self {
+        self.handler.tls = tls;
+        self
     }
 
     /// Accepts connections until the future is dropped.
@@ -51,7 +64,7 @@ impl Connections {
         loop {
             tokio::select! {
                 connection = listener.accept() => {
-                    self.tasks.spawn(answer(connection, self.http.clone(), self.router.clone(), self.stopping.clone()));
+                    self.tasks.spawn(self.handler.clone().run(connection));
                 }
                 // Removes tasks that have ended, so that the set holds only the open connections.
                 Some(_) = self.tasks.join_next() => {}
@@ -65,34 +78,92 @@ impl Connections {
     }
 }
 
-/// Answers a connection's requests. After the stop signal, it answers only requests that have arrived.
-///
-/// `hyper_util`'s `GracefulShutdown` does not serve here: it does not support upgrades of HTTP/1 connections, and it
-/// closes an idle connection before it reads a request that has already arrived.
-async fn answer(
-    connection: BoundedConnection,
+/// What a connection is answered with.
+#[derive(Clone)]
+struct ConnectionHandler {
     http: http1::Builder,
     router: Router,
-    mut stopping: watch::Receiver<bool>,
-) {
-    let Some(place) = connection.place() else { return };
-    let evicted = place.evicted();
-    let router = TowerToHyperService::new(router);
-    let service = BusyService { router, place };
-    let mut connection = pin!(http.serve_connection(TokioIo::new(connection), service).with_upgrades());
-    let result = tokio::select! {
-        // The connection first: it reads what has arrived before an idle connection is closed.
-        biased;
-        result = connection.as_mut() => result,
-        // Another connection has its place now.
-        () = evicted => return,
-        () = stop_requested(&mut stopping) => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+    stopping: watch::Receiver<bool>,
+    tls: Option<ServerTls>,
+    #[cfg_attr(not(feature = "tls"), expect(dead_code, reason = "only TLS has handshakes"))]
+    handshake_limit: Duration,
+}
+
+impl ConnectionHandler {
+    async fn run(self, connection: BoundedConnection) {
+        let Some(place) = connection.place() else { return };
+        match self.tls.clone() {
+            None => self.answer(connection, place).await,
+            #[cfg(feature = "tls")]
+            Some(tls) => {
+                if let Some(encrypted) = self.encrypt(&tls, connection, &place).await {
+                    self.answer(encrypted, place).await;
+                }
+            }
+            #[cfg(not(feature = "tls"))]
+            Some(tls) => match tls.never() {},
         }
-    };
-    if let Err(error) = result {
-        debug!(%error, "connection failed");
+    }
+
+    /// The connection after its TLS handshake, unless that fails, takes too long, or the server stops.
+    #[cfg(feature = "tls")]
+    async fn encrypt(
+        &self,
+        tls: &ServerTls,
+        connection: BoundedConnection,
+        place: &ConnectionPlace,
+    ) -> Option<impl AsyncRead + AsyncWrite + Send + Unpin + 'static> {
+        let mut stopping = self.stopping.clone();
+        let accepted = tokio::time::timeout(self.handshake_limit, tls.acceptor().accept(connection));
+        let accepted = tokio::select! {
+            accepted = accepted => accepted,
+            () = place.evicted() => return None,
+            () = stop_requested(&mut stopping) => return None,
+        };
+        match accepted {
+            Ok(Ok(encrypted)) => Some(encrypted),
+            Ok(Err(error)) => {
+                debug!(%error, "TLS handshake failed");
+                None
+            }
+            Err(_) => {
+                debug!("TLS handshake took too long");
+                None
+            }
+        }
+    }
+
+    /// Answers a connection's requests. After the stop signal, it answers only requests that have arrived.
+    ///
+    /// `hyper_util`'s `GracefulShutdown` does not serve here: it does not support upgrades of HTTP/1 connections, and it
+    /// closes an idle connection before it reads a request that has already arrived.
+    async fn answer<S>(mut self, stream: S, place: Arc<ConnectionPlace>)
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let (evicted, messages) = (place.evicted(), MessageBytes::default());
+        let stream = TokioIo::new(HttpStream::new(stream, messages.clone()));
+        let router = TowerToHyperService::new(self.router);
+        let service = BusyService {
+            router,
+            place,
+            messages,
+        };
+        let mut connection = pin!(self.http.serve_connection(stream, service).with_upgrades());
+        let result = tokio::select! {
+            // The connection first: it reads what has arrived before an idle connection is closed.
+            biased;
+            result = connection.as_mut() => result,
+            // Another connection has its place now.
+            () = evicted => return,
+            () = stop_requested(&mut self.stopping) => {
+                connection.as_mut().graceful_shutdown();
+                connection.await
+            }
+        };
+        if let Err(error) = result {
+            debug!(%error, "connection failed");
+        }
     }
 }
 
@@ -100,6 +171,7 @@ async fn answer(
 struct BusyService {
     router: TowerToHyperService<Router>,
     place: Arc<ConnectionPlace>,
+    messages: MessageBytes,
 }
 
 impl Service<Request<Incoming>> for BusyService {
@@ -107,8 +179,9 @@ impl Service<Request<Incoming>> for BusyService {
     type Error = Infallible;
     type Future = Pin<Box<dyn Future<Output = Result<Response, Infallible>> + Send>>;
 
-    fn call(&self, request: Request<Incoming>) -> Self::Future {
+    fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let busy = self.place.begin();
+        request.extensions_mut().insert(self.messages.clone());
         let answered = self.router.call(request);
         Box::pin(async move {
             let response = answered.await?;

@@ -19,7 +19,7 @@ use tracing::warn;
 use super::access::{Change, required_scope};
 use super::problem::ApiError;
 use super::rate::RateLimit;
-use crate::store::{KeyRow, KeyScope, Store, StoreError, unix_s};
+use crate::store::{KeyRow, KeyScope, Store, StoreError};
 use crate::telemetry::names;
 
 /// The beginning of every key, so that leaked keys are easy to find.
@@ -115,6 +115,31 @@ struct KnownKeys {
     exist: bool,
     /// Keys that an older version stored in a form that is no longer accepted.
     outdated: usize,
+    clock: StoreClock,
+}
+
+/// The store's clock since it was read: this machine's clock can be wrong, and can jump.
+#[derive(Clone, Copy)]
+struct StoreClock {
+    read_s: f64,
+    read_at: Instant,
+}
+
+impl StoreClock {
+    fn at(read_s: f64) -> Self {
+        let read_at = Instant::now();
+        Self { read_s, read_at }
+    }
+
+    fn now_s(self) -> f64 {
+        self.read_s + self.read_at.elapsed().as_secs_f64()
+    }
+}
+
+impl Default for StoreClock {
+    fn default() -> Self {
+        Self::at(0.0)
+    }
 }
 
 /// A key and what was used of its rate.
@@ -130,8 +155,8 @@ impl KnownKey {
     }
 
     /// Errors: `Unauthorized` if it has expired, `Forbidden` if its scope is too small, `TooMany`.
-    fn check(&self, needed: KeyScope) -> Result<(), ApiError> {
-        if !self.row.is_valid(unix_s()) {
+    fn check(&self, needed: KeyScope, now_s: f64) -> Result<(), ApiError> {
+        if !self.row.is_valid(now_s) {
             return Err(ApiError::Unauthorized("the API key has expired; create a new one"));
         }
         if self.row.scope < needed {
@@ -188,7 +213,9 @@ impl Keys {
     pub async fn refresh(&self) -> Result<(), StoreError> {
         let Some(store) = &self.shared.store else { return Ok(()) };
         let rows = store.list_keys().await?;
-        let (exist, now_s) = (!rows.is_empty() || store.keys_were_created(), unix_s());
+        let exist = !rows.is_empty() || store.keys_were_created();
+        let clock = StoreClock::at(store.now_s().await?);
+        let now_s = clock.now_s();
         let usable: Vec<KeyRow> = rows.into_iter().filter(|row| row.is_valid(now_s)).collect();
         let mut known = self.shared.known.write().unwrap_or_else(PoisonError::into_inner);
         let (count, mut valid) = (usable.len(), HashMap::new());
@@ -206,7 +233,12 @@ impl Keys {
                  keys create, and revoke the old ones"
             );
         }
-        *known = KnownKeys { valid, exist, outdated };
+        *known = KnownKeys {
+            valid,
+            exist,
+            outdated,
+            clock,
+        };
         drop(known);
         self.shared.refreshed.send_replace(());
         Ok(())
@@ -249,11 +281,14 @@ impl Keys {
              create NAME",
         ))?;
         let hash = KeyHash::of(key);
-        let known = self.known().valid.get(&hash).cloned();
+        let (known, clock) = {
+            let keys = self.known();
+            (keys.valid.get(&hash).cloned(), keys.clock)
+        };
         let known = known.ok_or(ApiError::Unauthorized(
             "the API key is not valid: it is unknown, was revoked or has expired",
         ))?;
-        known.check(needed)?;
+        known.check(needed, clock.now_s())?;
         Ok(Caller(Some(hash)))
     }
 

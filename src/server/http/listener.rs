@@ -17,7 +17,7 @@ use tokio::time::Sleep;
 use tracing::warn;
 
 use super::connection_table::{ConnectionLimits, ConnectionPlace, ConnectionTable};
-use super::problem::{self, CONNECTIONS_FULL_RESPONSE};
+use super::problem::CONNECTIONS_FULL_RESPONSE;
 use crate::server::config::ServerConfig;
 use crate::telemetry::names;
 
@@ -160,6 +160,14 @@ impl BoundedConnection {
         self.open.as_ref().map(|(_, place)| Arc::clone(place))
     }
 
+    /// The first byte that has arrived and is still to be read; `None` at the end.
+    #[cfg(feature = "tls")]
+    pub(super) async fn peek(&self) -> io::Result<Option<u8>> {
+        let (stream, _) = self.open.as_ref().ok_or(io::ErrorKind::NotConnected)?;
+        let mut byte = [0];
+        Ok((stream.peek(&mut byte).await? > 0).then_some(byte[0]))
+    }
+
     fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
         let (stream, _) = self.open.as_mut().ok_or(io::ErrorKind::NotConnected)?;
         Ok(Pin::new(stream))
@@ -202,11 +210,6 @@ impl AsyncRead for BoundedConnection {
 
 impl AsyncWrite for BoundedConnection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        if let Some(refusal) = problem::unreadable_request(bytes) {
-            let written = self.stream()?.poll_write(cx, &refusal);
-            // It is short and the last response, so one write is enough.
-            return self.limit_stall(cx, written).map_ok(|_| bytes.len());
-        }
         let written = self.stream()?.poll_write(cx, bytes);
         self.limit_stall(cx, written)
     }
@@ -216,9 +219,6 @@ impl AsyncWrite for BoundedConnection {
         cx: &mut Context<'_>,
         bytes: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        if let [bytes] = bytes {
-            return self.poll_write(cx, bytes);
-        }
         let written = self.stream()?.poll_write_vectored(cx, bytes);
         self.limit_stall(cx, written)
     }

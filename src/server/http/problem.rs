@@ -173,6 +173,13 @@ pub(in crate::server) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Serv
     {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
     \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
 
+/// The response to a request in plain HTTP where TLS is expected.
+#[cfg(feature = "tls")]
+pub(in crate::server) const PLAIN_HTTP_RESPONSE: &str = "HTTP/1.1 400 Bad Request\r\n\
+    Connection: close\r\nContent-Type: application/problem+json\r\nX-Content-Type-Options: nosniff\r\n\r\n\
+    {\"type\":\"urn:foreframe:problem:malformed\",\"title\":\"Bad Request\",\"status\":400,\
+    \"detail\":\"this address takes HTTPS only; use https:// or wss://\",\"instance\":\"\"}";
+
 /// The response to a request that is not HTTP, in place of the one without a body that hyper writes. `head`: what hyper would
 /// write. `None` if it is another response: all of ours have a request id.
 pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {

@@ -15,9 +15,10 @@ use utoipa_axum::routes;
 use super::sessions::AuthorizedSession;
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
+use crate::server::http::message_bytes::{MessageBytes, UNCOUNTED_BYTES};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::server::stream::connection::StreamConnection;
+use crate::server::stream::connection::{StreamConnection, StreamServices};
 use crate::server::stream::protocol::{Codec, SessionSettings};
 use crate::server::stream::session::Session;
 use crate::serving::SessionState;
@@ -28,11 +29,13 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         .routes(routes!(model_stream))
 }
 
-/// The read buffer of a socket, in bytes. It is zeroed before every read, and a stream keeps it while it is open. A longer
-/// message gets its own buffer.
-const READ_BYTES: usize = 16 << 10;
+/// The read buffer of a socket. It is zeroed before every read, and a stream keeps it while it is open; it grows with the
+/// longest message.
+const READ_BYTES: usize = UNCOUNTED_BYTES;
 
 type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
+/// Absent for a request that came over no connection; it cannot be upgraded.
+type Messages = Option<Extension<MessageBytes>>;
 
 /// Opens the stream of a session: a WebSocket that takes frames with action and state, and answers each with the predicted
 /// frames. Sub-protocols: `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` describes the messages. If the
@@ -56,10 +59,12 @@ type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
 async fn session_stream(
     State(app): State<App>,
     Extension(caller): Extension<Caller>,
+    messages: Messages,
     session: AuthorizedSession,
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
-    open(&app, caller, (session.0, true), upgrade)
+    let services = services(&app, caller, messages);
+    open(&app, services, (session.0, true), upgrade)
 }
 
 /// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
@@ -77,6 +82,7 @@ async fn session_stream(
 async fn model_stream(
     State(app): State<App>,
     Extension(caller): Extension<Caller>,
+    messages: Messages,
     Path(model): Path<String>,
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
@@ -88,12 +94,18 @@ async fn model_stream(
         Instant::now(),
     );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
-    open(&app, caller, (Arc::new(session), false), upgrade)
+    let services = services(&app, caller, messages);
+    open(&app, services, (Arc::new(session), false), upgrade)
+}
+
+fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
+    let messages = messages.map(|Extension(messages)| messages).unwrap_or_default();
+    app.stream_services(caller, messages)
 }
 
 fn open(
     app: &App,
-    caller: Caller,
+    services: StreamServices,
     (session, is_persistent): (Arc<Session>, bool),
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
@@ -114,7 +126,7 @@ fn open(
         .max_message_size(limit)
         .max_frame_size(limit)
         .read_buffer_size(READ_BYTES);
-    let services = app.stream_services(caller);
+    services.messages.begin(app.body_budget());
     Ok(upgrade.on_upgrade(move |socket| {
         let connection = StreamConnection::new(services, &session, is_persistent, chosen.unwrap_or_default());
         async move {

@@ -9,7 +9,7 @@ use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
 use metrics::{Counter, counter};
 use tokio::sync::mpsc;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, trace};
 use tungstenite::error::ProtocolError;
 
@@ -23,7 +23,9 @@ use super::step::{FrameStep, StepError};
 use crate::frame::fit::Fit;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
+use crate::server::http::body_budget;
 use crate::server::http::keys::{Caller, Keys};
+use crate::server::http::message_bytes::MessageBytes;
 use crate::server::http::problem::bounded;
 use crate::server::http::streams::{Streams, stop_requested};
 use crate::server::images::ImageFormat;
@@ -53,7 +55,7 @@ enum Received {
     /// No message for too long.
     Idle,
     /// Bytes that are not a WebSocket message; nothing after them can be read.
-    Unreadable(ClosingReason, String),
+    Unreadable(ClosingReason, ErrorCode, String),
 }
 
 /// The client has closed the connection: nothing can be sent any more.
@@ -68,6 +70,8 @@ pub(in crate::server) struct StreamServices {
     pub(in crate::server) keys: Keys,
     /// Who opened the stream.
     pub(in crate::server) caller: Caller,
+    /// Counts the bytes that the connection receives.
+    pub(in crate::server) messages: MessageBytes,
 }
 
 pub(in crate::server) struct StreamConnection {
@@ -171,12 +175,14 @@ impl StreamConnection {
         // Frames are read before the messages ahead of them are answered, so the reader keeps its own copy.
         let mut fit = self.ownership.session().settings().fit;
         loop {
+            // The message before this one was decoded: only its frame is left, in the model's size.
+            self.services.messages.message_read();
             let message = match self.receive(stream).await? {
                 Received::Message(message) => message,
                 Received::Idle => return Ok(ClosingReason::Idle),
-                Received::Unreadable(reason, detail) => {
+                Received::Unreadable(reason, code, detail) => {
                     inbox
-                        .send(PipelinedItem::refused(ErrorCode::Malformed, detail))
+                        .send(PipelinedItem::refused(code, detail))
                         .await
                         .map_err(|_| ClientGone)?;
                     return Ok(reason);
@@ -211,14 +217,21 @@ impl StreamConnection {
     async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, ClientGone> {
         let quarter = Duration::from_millis(self.services.config.stream_idle_ms) / 4;
         let mut is_warned = false;
+        let mut idle_since = Instant::now();
         loop {
-            let wait = if is_warned { quarter } else { 3 * quarter };
-            match timeout(wait, stream.next()).await {
+            let wait = if is_warned { 4 * quarter } else { 3 * quarter };
+            match timeout_at(idle_since + wait, stream.next()).await {
                 Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
                     return Ok(Received::Message(message));
                 }
-                // The WebSocket library answers these; they show that the client is there.
-                Ok(Some(Ok(Message::Ping(_) | Message::Pong(_)))) => is_warned = false,
+                // The WebSocket library answers these; they show that the client is there, and do not extend the time for a
+                // message that has begun.
+                Ok(Some(Ok(Message::Ping(content) | Message::Pong(content)))) => {
+                    self.services.messages.control_read(content.len());
+                    if !self.services.messages.is_unfinished() {
+                        (is_warned, idle_since) = (false, Instant::now());
+                    }
+                }
                 Ok(None) => return Err(ClientGone),
                 Ok(Some(Ok(Message::Close(_)))) => {
                     // The library answers a close with the next read.
@@ -325,6 +338,10 @@ impl StreamConnection {
 /// Why the bytes could not be read, if the client is still there.
 fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
     let error = error.into_inner();
+    if let Some(exceeded) = body_budget::cause(error.as_ref()) {
+        let (reason, code) = (ClosingReason::Overloaded, ErrorCode::Overloaded);
+        return Ok(Received::Unreadable(reason, code, exceeded.to_string()));
+    }
     let reason = match error.downcast_ref::<tungstenite::Error>() {
         Some(tungstenite::Error::Capacity(_)) => ClosingReason::TooLong,
         Some(tungstenite::Error::Utf8(_)) => ClosingReason::NotUtf8,
@@ -332,7 +349,7 @@ fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
         Some(tungstenite::Error::Protocol(_)) => ClosingReason::Malformed,
         _ => return Err(ClientGone),
     };
-    Ok(Received::Unreadable(reason, error.to_string()))
+    Ok(Received::Unreadable(reason, ErrorCode::Malformed, error.to_string()))
 }
 
 /// Discards input for a moment.
@@ -358,7 +375,7 @@ fn code_of(reason: ClosingReason) -> u16 {
         ClosingReason::TooLong => close_code::SIZE,
         ClosingReason::Malformed => close_code::PROTOCOL,
         ClosingReason::NotUtf8 => close_code::INVALID,
-        ClosingReason::Slow => close_code::AGAIN,
+        ClosingReason::Slow | ClosingReason::Overloaded => close_code::AGAIN,
         ClosingReason::Shutdown => close_code::AWAY,
     }
 }

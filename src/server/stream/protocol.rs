@@ -320,6 +320,8 @@ pub enum ClosingReason {
     Slow,
     /// A message was longer than `limits.message_bytes`.
     TooLong,
+    /// The bodies and messages that the server receives exceed its memory for them; try again in 1 s.
+    Overloaded,
     /// An error of the WebSocket protocol.
     Malformed,
     /// Text that is not UTF-8.
