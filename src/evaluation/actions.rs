@@ -185,7 +185,7 @@ fn errors_of(
     let error = |(frames, window): (&[f32], &Window)| {
         let steps = frames.chunks_exact(spec.pixels()).enumerate();
         let mse = steps.map(|(step, frame)| {
-            let truth = scale(&*dataset.pixels(window.first_frame + spec.context + step)?);
+            let truth = scale(&dataset.pixels(window.first_frame + spec.context + step)?);
             Ok(quality::mse(&spec.preprocess.inverse(frame), &truth))
         });
         mse.collect()

@@ -75,7 +75,7 @@ fn score_window(
         let frames = values[here.clone()].chunks_exact(pixels);
         frames.map(|frame| spec.preprocess.inverse(frame)).collect()
     };
-    let frame = |step: usize| Ok(scale(&*dataset.pixels(window.first_frame + step)?));
+    let frame = |step: usize| Ok(scale(&dataset.pixels(window.first_frame + step)?));
     let inputs = (0..spec.context).map(frame).collect::<Result<Vec<_>, DatasetError>>()?;
     let future = spec.context..spec.context + horizon;
     let truth = future.clone().map(frame).collect::<Result<Vec<_>, DatasetError>>()?;
