@@ -86,7 +86,8 @@ fn write<W: io::Write>(dataset: &Dataset, episodes: &[Range<usize>], out: W) -> 
             if let Some((topic, fov_rad)) = camera {
                 bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))?;
             }
-            bag.message(image, time_ns, &gray_image(time_ns, size, dataset.pixels(frame)))?;
+            let pixels = dataset.pixels(frame).map_err(io::Error::other)?;
+            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))?;
         }
         let duration_ns = (episode.len() as f64 * period_ns) as u64;
         let gap_ns = MIN_GAP_NS.max((period_ns as u64).saturating_mul(GAP_FRAMES));
