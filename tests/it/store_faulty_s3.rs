@@ -82,7 +82,9 @@ fn forward(mut client: TcpStream, server: &str, state: &ProxyState) -> std::io::
     client.set_read_timeout(Some(Duration::from_secs(10)))?;
     let (head, body) = read_message(&mut client)?;
     let number = state.requests.fetch_add(1, Ordering::AcqRel);
-    let fault = FAULTS[number % FAULTS.len()];
+    // Mixed, so that a client that asks for the same again does not always meet the same fault.
+    let mixed = (number as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
+    let fault = FAULTS[mixed as usize % FAULTS.len()];
     let connected = || TcpStream::connect(server);
     let ask = |body: &[u8]| -> std::io::Result<Vec<u8>> {
         let (mut server, mut answer) = (connected()?, Vec::new());
