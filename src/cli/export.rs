@@ -16,6 +16,7 @@ use crate::dataset::export::{
 use crate::dataset::{Dataset, Episode};
 use crate::evaluation::figures::animation::enlarged_gif;
 use crate::frame::codec;
+use crate::types::Channel;
 
 /// Write an episode as images or MP4, or a data set for LeRobot or ROS 2.
 ///
@@ -149,15 +150,13 @@ fn write_mcap(args: &ExportArgs, dataset: &Dataset, episodes: &[Range<usize>]) -
     let (info, out) = (dataset.info(), args.out.display());
     let frames: usize = episodes.iter().map(ExactSizeIterator::len).sum();
     print_line(format!("{out}: {} episodes, {frames} frames", episodes.len()))?;
-    let mut command = format!("foreframe import {out} --image {IMAGE_TOPIC}");
-    command += &format!(" --size {}x{}", info.frame_width_px, info.frame_height_px);
-    for (option, topic, channels) in [
-        ("--action", ACTION_TOPIC, &info.action_channels),
-        ("--state", STATE_TOPIC, &info.state_channels),
-    ] {
-        let topic = if channels.is_empty() { "none" } else { topic };
-        command += &format!(" {option} {topic}");
-    }
+    let topic = |topic, channels: &[Channel]| if channels.is_empty() { "none" } else { topic };
+    let action = topic(ACTION_TOPIC, &info.action_channels);
+    let state = topic(STATE_TOPIC, &info.state_channels);
+    let (width, height) = (info.frame_width_px, info.frame_height_px);
+    let command = format!(
+        "foreframe import {out} --image {IMAGE_TOPIC} --size {width}x{height} --action {action} --state {state}"
+    );
     print_line(format!("to import it again: {command}"))
 }
 

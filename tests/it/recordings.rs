@@ -54,7 +54,8 @@ pub(crate) fn images_with_csv(path: &Path, frames: u32) {
     for index in 0..frames {
         fs::write(path.join(format!("{index}.png")), png(index)).unwrap();
         let (time, angle) = (time_ms(index), steering(index));
-        csv += &format!("{time},{index}.png,{angle},{}\n", angle / 2.0);
+        let line = format!("{time},{index}.png,{angle},{}\n", angle / 2.0);
+        csv.push_str(&line);
     }
     fs::write(path.join("log.csv"), csv).unwrap();
 }
@@ -83,7 +84,8 @@ pub(crate) fn tub(path: &Path, frames: u32) {
             "_index": index, "_session_id": (index / EPISODE_FRAMES).to_string(), "_timestamp_ms": time_ms(index),
             "cam/image_array": name, "user/angle": steering(index), "user/throttle": 0.5, "user/mode": "user",
         });
-        catalog += &format!("{line}\n");
+        catalog.push_str(&line.to_string());
+        catalog.push('\n');
     }
     fs::write(path.join("catalog_0.catalog"), catalog).unwrap();
 }

@@ -41,21 +41,30 @@ pub fn to_mcap(dataset: &Dataset, episodes: &[Range<usize>], path: &Path) -> Res
     std::fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
     // The file appears when it is whole.
     let partial = path.with_extension("partial.mcap");
-    let file = File::create(&partial);
-    let written = file
-        .and_then(|file| write(dataset, episodes, BufWriter::new(file)))
-        .and_then(|file| file.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all())
-        .and_then(|()| std::fs::rename(&partial, path));
+    let failed = |error| DatasetError::io("write", path)(error);
+    let written = File::create(&partial).map_err(failed).and_then(|file| {
+        let mut out = BufWriter::new(file);
+        write(dataset, episodes, McapWriter::new(&mut out).map_err(failed)?, &failed)?;
+        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
+        file.sync_all()
+            .and_then(|()| std::fs::rename(&partial, path))
+            .map_err(failed)
+    });
     if written.is_err() {
         // A later run overwrites it if it stays.
         let _ = std::fs::remove_file(&partial);
     }
-    written.map_err(DatasetError::io("write", path))
+    written
 }
 
-fn write<W: io::Write>(dataset: &Dataset, episodes: &[Range<usize>], out: W) -> io::Result<W> {
+/// `failed` says what a failed write of the file means.
+fn write<W: io::Write>(
+    dataset: &Dataset,
+    episodes: &[Range<usize>],
+    mut bag: McapWriter<W>,
+    failed: &dyn Fn(io::Error) -> DatasetError,
+) -> Result<(), DatasetError> {
     let info = dataset.info();
-    let mut bag = McapWriter::new(out)?;
     let image = bag.topic(IMAGE_TOPIC, "sensor_msgs/msg/Image", &image_definition());
     let camera = info.camera.map(|camera| {
         let topic = bag.topic(CAMERA_TOPIC, "sensor_msgs/msg/CameraInfo", &camera_definition());
@@ -78,22 +87,26 @@ fn write<W: io::Write>(dataset: &Dataset, episodes: &[Range<usize>], out: W) -> 
         for (place, frame) in episode.clone().enumerate() {
             let time_ns = start_ns + (place as f64 * period_ns).round() as u64;
             if let Some((topic, kind)) = &action {
-                bag.message(*topic, time_ns, &kind.message(time_ns, &action_of(frame)))?;
+                bag.message(*topic, time_ns, &kind.message(time_ns, &action_of(frame)))
+                    .map_err(failed)?;
             }
             if let Some((topic, kind)) = &state {
-                bag.message(*topic, time_ns, &kind.message(time_ns, &state_of(frame)))?;
+                bag.message(*topic, time_ns, &kind.message(time_ns, &state_of(frame)))
+                    .map_err(failed)?;
             }
             if let Some((topic, fov_rad)) = camera {
-                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))?;
+                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))
+                    .map_err(failed)?;
             }
-            let pixels = dataset.pixels(frame).map_err(io::Error::other)?;
-            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))?;
+            let pixels = dataset.pixels(frame)?;
+            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))
+                .map_err(failed)?;
         }
         let duration_ns = (episode.len() as f64 * period_ns) as u64;
         let gap_ns = MIN_GAP_NS.max((period_ns as u64).saturating_mul(GAP_FRAMES));
         start_ns = (start_ns + duration_ns + gap_ns).next_multiple_of(1_000_000_000);
     }
-    bag.finish()
+    bag.finish().map_err(failed)
 }
 
 /// The message that holds an action or a state.

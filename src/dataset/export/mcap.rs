@@ -85,9 +85,9 @@ pub(super) struct McapWriter<W> {
     chunk_indexes: Vec<Vec<u8>>,
 }
 
-fn including(times: Option<[u64; 2]>, time: u64) -> Option<[u64; 2]> {
+fn including(times: Option<[u64; 2]>, time: u64) -> [u64; 2] {
     let [first, last] = times.unwrap_or([time, time]);
-    Some([first.min(time), last.max(time)])
+    [first.min(time), last.max(time)]
 }
 
 impl<W: Write> McapWriter<W> {
@@ -146,8 +146,8 @@ impl<W: Write> McapWriter<W> {
             of.messages += 1;
             of.in_chunk.extend([time_ns, position]);
         }
-        self.chunk_times = including(self.chunk_times, time_ns);
-        self.times = including(self.times, time_ns);
+        self.chunk_times = Some(including(self.chunk_times, time_ns));
+        self.times = Some(including(self.times, time_ns));
         if self.chunk.len() >= CHUNK_BYTES {
             self.close_chunk()?;
         }
@@ -214,8 +214,8 @@ impl<W: Write> McapWriter<W> {
             .record(operation::STATISTICS)
     }
 
-    /// Writes the indexes and returns the complete file. Errors: those of the writer.
-    pub(super) fn finish(mut self) -> io::Result<W> {
+    /// Writes the indexes; the file is then complete. Errors: those of the writer.
+    pub(super) fn finish(mut self) -> io::Result<()> {
         self.close_chunk()?;
         self.put(&RecordFields::default().u32(0).record(operation::DATA_END))?;
         let summary_start = self.written;
@@ -241,7 +241,6 @@ impl<W: Write> McapWriter<W> {
         let footer = RecordFields::default().u64s(&[summary_start, offsets.start]).u32(0);
         self.put(&footer.record(operation::FOOTER))?;
         self.put(MAGIC)?;
-        self.out.flush()?;
-        Ok(self.out)
+        self.out.flush()
     }
 }

@@ -206,7 +206,11 @@ fn lock(path: &Path, out: &Path) -> Result<File, ImportError> {
 
 /// How many shards an unfinished import has written.
 pub(super) fn saved_shards(out: &Path) -> usize {
-    (0..).take_while(|&shard| out.join(shard_path(shard)).is_file()).count()
+    let mut shards = 0;
+    while out.join(shard_path(shards)).is_file() {
+        shards += 1;
+    }
+    shards
 }
 
 fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
