@@ -187,7 +187,7 @@ fn is_importing(job: &Value) -> bool {
 fn an_import_continues_after_a_kill_and_after_a_cancellation() {
     let dir = tempfile::tempdir().unwrap();
     recordings::npy(&dir.path().join("long.npy"), FRAMES);
-    let job = |name: &str| job("long.npy", json!({"rate": 10.0, "size": "32x32", "name": name}));
+    let job = |name: &str| job("long.npy", json!({"rate": 10.0, "size": "96x96", "name": name}));
     let succeeded = |job: &Value| job["state"] == "succeeded";
     let server = start(dir.path());
     server.ask("POST", JOBS, &job("unbroken"));

@@ -14,23 +14,28 @@ const SHORT_LEASE: [&str; 2] = ["--set", "job_lease_ms=2000"];
 
 /// A short training that saves often.
 pub(crate) fn short_training() -> Value {
+    training(24)
+}
+
+/// The same with so many steps, each of a few milliseconds.
+pub(crate) fn training(steps: u32) -> Value {
     let settings = json!({
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 32, "validation_windows": 4},
         "pretrain": {"steps": 0, "start": "random"},
-        "fit": {"steps": 24, "batch_size": 8},
+        "fit": {"steps": steps, "batch_size": 8},
         "run": {"validate_every_steps": 8, "checkpoint_every_steps": 2},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
 }
 
 /// A data directory after an undisturbed collection and training.
-pub(crate) fn undisturbed() -> tempfile::TempDir {
+pub(crate) fn undisturbed(training: &Value) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let (_server, address) = serve(dir.path(), &[]);
     ask(&address, "POST /v1/jobs", &collect());
     wait_for(&address, "job-1", "succeeded");
-    ask(&address, "POST /v1/jobs", &short_training());
+    ask(&address, "POST /v1/jobs", training);
     wait_for(&address, "job-2", "succeeded");
     dir
 }
@@ -51,7 +56,7 @@ fn ends_as_undisturbed(address: &str, data_dir: &Path, whole: &Path) {
 
 #[test]
 fn a_training_survives_a_database_that_another_process_locks() {
-    let whole = undisturbed();
+    let whole = undisturbed(&short_training());
     let dir = tempfile::tempdir().unwrap();
     copy_dataset(whole.path(), dir.path());
     let (_server, address) = serve(dir.path(), &SHORT_LEASE);
@@ -85,7 +90,7 @@ fn a_training_survives_an_outage_of_postgresql() {
     let mut baseline = None;
     for outage in outages {
         let Some(postgres) = OwnPostgres::new() else { return };
-        let whole = baseline.get_or_insert_with(undisturbed);
+        let whole = baseline.get_or_insert_with(|| undisturbed(&short_training()));
         postgres.start();
         let dir = tempfile::tempdir().unwrap();
         copy_dataset(whole.path(), dir.path());

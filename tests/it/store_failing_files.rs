@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};
-use crate::jobs_outage::{short_training, undisturbed};
+use crate::jobs_outage::{training, undisturbed};
 use crate::process::RunningServer;
 use crate::store_away::{status, wait_for_status};
 
@@ -34,11 +34,14 @@ fn compiled(dir: &Path) -> Option<PathBuf> {
     Some(library)
 }
 
+/// Steps of a training that takes some seconds, so that the files fail while it runs.
+const STEPS: u32 = 1500;
+
 #[test]
 fn a_server_recovers_from_a_failing_file_system() {
     let tools = tempfile::tempdir().unwrap();
     let Some(library) = compiled(tools.path()) else { return };
-    let whole = undisturbed();
+    let whole = undisturbed(&training(STEPS));
     for number in [EROFS, EIO] {
         recovers_from(number, &library, whole.path());
     }
@@ -57,7 +60,7 @@ fn recovers_from(number: u32, library: &Path, whole: &Path) {
     let server = RunningServer::start_with(dir.path(), &["--data-dir", data_text], &environment);
     let wait_for_success = |id: &str| server.wait_for_job(id, |job| job["state"] == "succeeded");
     let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1});
-    assert_eq!(server.ask("POST", "/v1/jobs", &short_training())["id"], "job-1");
+    assert_eq!(server.ask("POST", "/v1/jobs", &training(STEPS))["id"], "job-1");
     server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
 
     // Written whole before it is seen.

@@ -185,7 +185,7 @@ fn jobs_end_the_same_behind_a_faulty_connection_to_s3() {
         );
         return;
     };
-    let whole = undisturbed();
+    let whole = undisturbed(&short_training());
     let proxy = FaultyProxy::start(endpoint.trim_start_matches("http://"));
     let through = format!("http://{}", proxy.address);
     let (here, there) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
