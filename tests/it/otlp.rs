@@ -17,7 +17,7 @@ fn first_trace(collector: &TcpListener) -> (String, Vec<u8>) {
             break;
         }
         if path.is_empty() {
-            path = line.trim().to_owned();
+            line.trim().clone_into(&mut path);
         } else if let Some(value) = line.to_lowercase().strip_prefix("content-length:") {
             length = value.trim().parse().unwrap();
         }
