@@ -49,44 +49,28 @@ struct Cli {
     command: Option<Command>,
 }
 
+// A command's help is the documentation of its arguments.
 #[derive(Subcommand)]
 enum Command {
-    /// Simulate trials and store their frames, actions and states as a data set
     Collect(collect::CollectArgs),
-    /// Turn a recording of a real robot into a data set
     Import(import::ImportArgs),
-    /// Train a model on a data set
     Train(train::TrainArgs),
-    /// Measure a model on trials that it was not trained on
     Evaluate(evaluate::EvaluateArgs),
-    /// Measure which errors to expect of a model's predictions
     Calibrate(calibrate::CalibrateArgs),
-    /// Predict the frames that follow the images in a directory
     Predict(predict::PredictArgs),
-    /// Serve models over HTTP and WebSocket (the default command)
     Serve(serve::ServeArgs),
-    /// Give a trained model to the server, as the next version of its name
     Publish(publish::PublishArgs),
-    /// List, activate and remove versions of models
     Models(models::ModelsArgs),
-    /// Create, list and revoke API keys
     Keys(keys::KeysArgs),
-    /// Copy the data directory and its database, also while a server runs
     Backup(backup::BackupArgs),
-    /// Restore a backup into a new data directory
     Restore(restore::RestoreArgs),
-    /// Print every setting with its meaning and where its value comes from
     Config(config::ConfigArgs),
-    /// Ask a running server whether it is ready
     Healthcheck(healthcheck::HealthcheckArgs),
-    /// Run jobs without serving
     Worker(worker::WorkerArgs),
     /// Run one job for a server or worker, which starts this command
     #[command(hide = true)]
     RunJob,
-    /// Describe a model or a data set
     Inspect(inspect::InspectArgs),
-    /// Write an episode's frames as PNG, its actions as JSON, and a GIF
     Export(export::ExportArgs),
 }
 

@@ -167,7 +167,7 @@ impl Dataset {
         };
         let mut dataset = Self {
             episodes: Vec::with_capacity(episodes.len()),
-            frames: FrameStore::Memory(HeldFrames::zeroed(&DatasetInfo::default())),
+            frames: FrameStore::Memory(HeldFrames::default()),
             actions: Vec::with_capacity(frame_count * info.action_channels.len()),
             states: Vec::with_capacity(frame_count * info.state_channels.len()),
             timestamps_s: Vec::with_capacity(frame_count),

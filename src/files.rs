@@ -9,6 +9,8 @@ use std::error::Error;
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::File;
+#[cfg(feature = "train")]
+use std::fs::TryLockError;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -50,6 +52,19 @@ pub(crate) fn open_lock(path: &Path) -> io::Result<File> {
     }
     let mut options = File::options();
     options.read(true).write(true).create(true).truncate(false).open(path)
+}
+
+/// Locks a file. A program that this process is just starting shares its locks until it is executed, so a lock that was released
+/// a moment ago can still be taken: a few tries are made, for a fifth of a second in all.
+#[cfg(feature = "train")]
+pub(crate) fn try_lock(file: &File) -> Result<(), TryLockError> {
+    for _ in 0..9 {
+        match file.try_lock() {
+            Err(TryLockError::WouldBlock) => std::thread::sleep(Duration::from_millis(20)),
+            locked => return locked,
+        }
+    }
+    file.try_lock()
 }
 
 /// The temporary path of a file. It is different in each call, because several writers can write the same file at once.

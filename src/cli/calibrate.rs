@@ -12,7 +12,8 @@ use crate::registry;
 /// Measure on the validation split which errors to expect of a model, and write it into the model's manifest.
 ///
 /// Predictions then carry an expected error with a 90 % band, a novelty, and warnings about actions and states out of the
-/// range of the training. `train` does this at its end; this command does it for a model that was trained before.
+/// range of the training. `train` does this at its end; this command does it again, for example with other data. It replaces the
+/// calibration in the model's manifest, also that of a shipped model.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe calibrate --model runs/moving/model --dataset moving-observer
@@ -45,9 +46,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CliError> {
     let progress = ProgressLine::new("windows");
     progress.label("calibrating");
     let found = evaluation::calibrate(&loaded, &dataset, &config, &|now| {
-        progress.update(now.done as u64, now.total as u64, || {
-            format!("calibrating, {}", now.split)
-        });
+        progress.update(now.done as u64, now.total as u64, || format!("{} split", now.split));
     });
     progress.finish();
     let calibration = found.map_err(not_calibrated)?;

@@ -18,8 +18,8 @@ const LISTED_ITEMS: usize = 10;
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
 /// `LeRobot` data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), `NumPy` arrays (.npy, .npz), or a video
-/// (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop
-/// it, run the same command again: it continues.
+/// (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop it, run the same command again:
+/// it continues.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe import ~/mycar/data --name mycar --every 4
@@ -30,7 +30,7 @@ const LISTED_ITEMS: usize = 10;
   foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
 then
   foreframe inspect mycar
-  foreframe train --preset recording --dataset mycar")]
+  foreframe train --preset recording --dataset mycar --set name=mycar")]
 pub(super) struct ImportArgs {
     /// A folder of images, a Donkeycar tub, a LeRobot data set, a bag of ROS 2, a .npy or .npz file, or a video
     source: PathBuf,
@@ -81,7 +81,11 @@ pub(super) struct ImportArgs {
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {
-    parse_size(text).map_err(|error| error.to_string())
+    // The caller names the option.
+    parse_size(text).map_err(|error| match error {
+        ImportError::OptionValue { right, .. } => right,
+        other => other.to_string(),
+    })
 }
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
@@ -147,8 +151,9 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     }
     print_line(format!("next: foreframe inspect {}", out.display()))?;
     print_line(format!(
-        "      foreframe train --preset recording --dataset {}{}",
+        "      foreframe train --preset recording --dataset {} --set name={}{}",
         out.display(),
+        info.name,
         conditioning(info)
     ))
 }

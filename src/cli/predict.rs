@@ -27,9 +27,9 @@ use crate::serving::{self, PredictionInput, Rollout};
 #[command(
     after_help = "The actions file is JSON. Entry i belongs to image i; there may be more actions than images:
   {\"states\": [[…], …], \"actions\": [[…], …]}
-The action of a frame acts from that frame to the next one. To predict 5 frames after frame N (the last frame,
-or that of --at), the file needs actions up to N + 4. So without --at, add the planned actions at the end. The model takes the
-state at frame N.
+The action of a frame acts from that frame to the next one. To predict 5 frames after frame N
+(the last frame, or that of --at), the file needs actions up to N + 4. So without --at, add the
+planned actions at the end. The model takes the state at frame N.
 
 Examples:
   foreframe predict --model paper --frames images --out predicted
@@ -109,7 +109,8 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
 fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
     if let Some(novelty) = rollout.novelty {
         print_line(format!(
-            "novelty {novelty:.2} (0: like the training data, 1: unlike all of it)"
+            "novelty {novelty:.2}: {:.0} % of the validation contexts are more like the training data",
+            novelty * 100.0
         ))?;
     }
     for (step, error) in (1..).zip(&rollout.errors) {
@@ -127,7 +128,8 @@ fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
     Ok(())
 }
 
-/// `spec` has the frames to predict as its horizon. Reads the frames up to the last that the model sees, and the true frames after it.
+/// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its
+/// horizon.
 fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, CliError> {
     let mut images = ImageFiles::list(&args.frames, args.fit)?;
     let count = images.count();

@@ -13,7 +13,7 @@ use crate::server::{self, App, ServerListeners, ServerTls};
 use crate::store::Store;
 use crate::telemetry;
 
-/// Serve models over HTTP and WebSocket.
+/// Serve models over HTTP and WebSocket (the default command).
 ///
 /// Loads the active version of every model in the models directory and the data directory, prints its address, and serves until
 /// Ctrl-C or SIGTERM. `foreframe config` lists all settings.
@@ -50,7 +50,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
-    let tls = ServerTls::open(&config.server).map_err(|error| CliError::Failed(error.to_string()))?;
+    let tls = ServerTls::open(&config.server).map_err(|error| CliError::Usage(error.to_string()))?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let store = open_store_waiting(&config).await?;
     let keys = keys(&config, store.clone()).await?;

@@ -14,8 +14,8 @@ use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcom
 /// Train a model on a data set.
 ///
 /// Training has two stages: pretrain (the frame codec alone) and fit (the recurrent network). The weights with the lowest
-/// validation error are kept, and the model is calibrated (see `foreframe calibrate`). A checkpoint is written every few hundred steps and on Ctrl-C; the same command continues from it,
-/// and ends with the same weights as without the interruption.
+/// validation error are kept, and the model is calibrated (see `foreframe calibrate`). A checkpoint is written every few hundred
+/// steps and on Ctrl-C; the same command continues from it, and ends with the same weights as without the interruption.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe train --preset paper --dataset static-observer

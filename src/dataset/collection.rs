@@ -13,7 +13,7 @@ use super::shard::{EncodedEpisode, ShardStart, build};
 use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo, unfinished};
-use crate::files::{remove_stale_partials, sha256_hex};
+use crate::files::{remove_stale_partials, sha256_hex, try_lock};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -151,7 +151,7 @@ impl<'a> Collection<'a> {
             write_atomically(&path, Arguments::text(config)?.as_bytes())?;
         }
         let lock = File::open(&path).map_err(DatasetError::io("read", &path))?;
-        lock.try_lock().map_err(|error| match error {
+        try_lock(&lock).map_err(|error| match error {
             TryLockError::WouldBlock => DatasetError::Busy {
                 path: config.out.clone(),
             },

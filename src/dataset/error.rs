@@ -97,7 +97,7 @@ pub enum DatasetError {
     /// No episode is long enough.
     #[error(
         "a window of {window} frames (context {context}, horizon {horizon}) is longer than every episode of the {split} \
-         split; the longest has {longest} frames without a gap"
+         split; the longest has {longest} frames without a gap. Record longer, or train with a smaller context or horizon"
     )]
     WindowTooLong {
         /// Frames of the window.

@@ -7,7 +7,7 @@ use super::frame_file::{FrameFile, FrameImage};
 use super::{DatasetError, DatasetInfo};
 
 /// Frames in memory, one after another.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct HeldFrames {
     pub(super) pixels: Vec<u8>,
     pub(super) masks: Option<Vec<u8>>,

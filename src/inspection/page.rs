@@ -57,7 +57,7 @@ fn header(inspection: &Inspection) -> String {
         .collect();
     let tiles = tiles.concat();
     format!(
-        "<header><h1>{}</h1><p class=\"quiet\">{origin}. Episodes of {} to {} frames, {} in the middle.</p></header>\n\
+        "<header><h1>{}</h1><p class=\"quiet\">{origin}. Episodes of {} to {} frames, median {}.</p></header>\n\
          <div class=\"tiles\">{tiles}</div>\n",
         escaped(&inspection.name),
         timing.shortest_episode_frames,

@@ -26,7 +26,7 @@ pub struct FrameTiming {
     pub total_s: f64,
     /// Frames of the shortest episode.
     pub shortest_episode_frames: usize,
-    /// Frames of the episode in the middle.
+    /// The median number of frames of an episode.
     pub median_episode_frames: usize,
     /// Frames of the longest episode.
     pub longest_episode_frames: usize,
@@ -34,7 +34,7 @@ pub struct FrameTiming {
     pub short_episodes: usize,
     /// Least time from one frame to the next, in seconds.
     pub shortest_step_s: f64,
-    /// The time from one frame to the next in the middle, in seconds.
+    /// The median time from one frame to the next, in seconds.
     pub median_step_s: f64,
     /// Greatest time from one frame to the next, in seconds.
     pub longest_step_s: f64,

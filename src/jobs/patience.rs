@@ -12,6 +12,7 @@ use super::JobError;
 use super::report::JobReporter;
 use super::runner::JobFailure;
 use crate::dataset::DatasetError;
+use crate::dataset::import::ImportError;
 use crate::error_text;
 use crate::evaluation::EvaluationError;
 use crate::files::may_pass;
@@ -50,6 +51,12 @@ impl MayBeAway for VersionError {
 }
 
 impl MayBeAway for DatasetError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for ImportError {
     fn is_away(&self) -> bool {
         may_pass(self)
     }

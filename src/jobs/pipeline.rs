@@ -142,12 +142,7 @@ impl Pipeline {
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         // After an error it continues with the shards that are finished.
         let info = patience.repeat(|| retry_while_busy(collect, is_busy, cancelled))?;
-        patience.run(async || {
-            self.store
-                .objects()
-                .push(&datasets::key(&spec.name), datasets::LAST_FILE)
-                .await
-        })?;
+        self.push_dataset(&spec.name, &patience)?;
         Ok(JobResult {
             result: json!({
                 "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
@@ -287,6 +282,12 @@ impl Pipeline {
     fn dataset(&self, name: &str, patience: &Patience<'_>) -> Result<Dataset, JobFailure> {
         let fetched = patience.run(async || datasets::fetch(self.store.objects(), name).await)?;
         Dataset::open_within(&fetched, self.memory.held_mb()).map_err(|error| failed(&error))
+    }
+
+    /// Copies a finished data set to the object store, if there is a shared one.
+    fn push_dataset(&self, name: &str, patience: &Patience<'_>) -> Result<(), JobFailure> {
+        let objects = self.store.objects();
+        patience.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)
     }
 
     fn patience<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> Patience<'a> {

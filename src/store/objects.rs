@@ -126,11 +126,7 @@ impl Objects {
             let path = self.data_dir.join(object.location.as_ref());
             let here = tokio::fs::metadata(&path).await;
             if is_last(&object) || here.map(|here| here.len()).ok() != Some(object.size) {
-                let bytes = read(shared, &object.location).await?;
-                if bytes.len() as u64 != object.size {
-                    return Err(truncated(&object, bytes.len()));
-                }
-                write(&path, bytes).await?;
+                write(&path, read(shared, &object).await?).await?;
             }
         }
         Ok(true)
@@ -152,13 +148,11 @@ impl Objects {
             let path = self.data_dir.join(path);
             return none_if_missing(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
         };
-        match read(shared, &Key::from(path)).await {
-            Ok(bytes) => Ok(Some(bytes)),
-            Err(StoreError::Object {
-                source: object_store::Error::NotFound { .. },
-                ..
-            }) => Ok(None),
-            Err(error) => Err(error),
+        let key = Key::from(path);
+        match shared.head(&key).await {
+            Ok(object) => read(shared, &object).await.map(Some),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(error) => Err(failed("read", &key)(error)),
         }
     }
 
@@ -221,9 +215,20 @@ impl Objects {
     }
 }
 
-async fn read(shared: &Arc<dyn ObjectStore>, key: &Key) -> Result<Vec<u8>, StoreError> {
+/// The whole object. Errors: `Object`, also if the answer is shorter than the object.
+async fn read(shared: &Arc<dyn ObjectStore>, object: &ObjectMeta) -> Result<Vec<u8>, StoreError> {
+    let key = &object.location;
     let content = shared.get(key).await.map_err(failed("read", key))?;
-    Ok(content.bytes().await.map_err(failed("read", key))?.into())
+    let bytes = content.bytes().await.map_err(failed("read", key))?;
+    if bytes.len() as u64 == object.size {
+        return Ok(bytes.into());
+    }
+    // The fault is on the way to the object store, so it is worth trying again.
+    let reason = format!("the answer has {} bytes; the object has {}", bytes.len(), object.size);
+    Err(failed("read", key)(object_store::Error::Generic {
+        store: "object store",
+        source: reason.into(),
+    }))
 }
 
 async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
@@ -244,15 +249,6 @@ async fn on_disk<T: Send + 'static>(
     let done = tokio::task::spawn_blocking(move || work(&worked_on)).await;
     done.unwrap_or_else(|broken| Err(io::Error::other(broken)))
         .map_err(StoreError::io(action, path))
-}
-
-/// Such an answer is an error of the way to the object store, so it is worth to try again.
-fn truncated(object: &ObjectMeta, bytes: usize) -> StoreError {
-    let reason = format!("the answer has {bytes} bytes; the object has {}", object.size);
-    failed("read", &object.location)(object_store::Error::Generic {
-        store: "object store",
-        source: reason.into(),
-    })
 }
 
 fn failed(action: &'static str, key: &Key) -> impl FnOnce(object_store::Error) -> StoreError {

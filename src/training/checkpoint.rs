@@ -13,7 +13,7 @@ use super::config::{RunConfig, TrainConfig};
 use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Adam;
 use super::stage::{HistoryPoint, TrainState};
-use crate::files::{is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, write_atomically};
+use crate::files::{is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, try_lock, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
 
 /// Name of the checkpoint file of a run.
@@ -82,7 +82,7 @@ impl RunFiles {
             write_atomically(&config, self.config_text.as_bytes()).map_err(io_failed("write", &config))?;
         }
         let lock = File::open(&config).map_err(io_failed("read", &config))?;
-        match lock.try_lock() {
+        match try_lock(&lock) {
             Ok(()) => {
                 remove_stale_partials(&self.run_dir);
                 Ok(lock)

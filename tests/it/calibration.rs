@@ -5,11 +5,11 @@ use std::time::Instant;
 use foreframe::SessionState;
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe::evaluation::{self, EvaluateConfig};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
-use foreframe::registry::{self, DatasetStamp, LoadedModel};
+use foreframe::nn::ModelSpec;
+use foreframe::registry::{self, LoadedModel};
 use foreframe::server::ServerConfig;
 use foreframe::serving::{self, PredictionInput};
-use foreframe::types::{Action, RobotState, Seed};
+use foreframe::types::{Action, RobotState};
 use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
@@ -19,37 +19,17 @@ use crate::service::{HORIZON, TIMEOUT, app, context, png, post, start, with_data
 const SIDE: u32 = 16;
 
 fn spec() -> ModelSpec {
-    let channel = |name: &str, unit: &str| ChannelScale {
-        name: name.to_owned(),
-        unit: unit.to_owned(),
-        mean: 1.0,
-        std: 0.8,
-    };
     ModelSpec {
-        frame_width_px: SIDE,
-        frame_height_px: SIDE,
-        features: 8,
-        hidden: 12,
         context: 3,
         horizon: 2,
-        conditioning: Conditioning::StateAction,
-        actions: vec![channel("speed", "px/frame")],
-        states: vec![channel("phase", "")],
-        ..ModelSpec::default()
+        ..fixtures::squares_spec(SIDE)
     }
 }
 
 /// An untrained model below `dir/models`, calibrated on the squares.
 fn calibrated(dir: &std::path::Path, dataset: &Dataset) -> LoadedModel {
-    let trained_on = DatasetStamp {
-        name: dataset.info().name.clone(),
-        content_hash: dataset.info().content_hash.clone(),
-        scenario: None,
-        windows: 0,
-        split_seed: Seed(7),
-    };
     let model_dir = dir.join("models/squares");
-    fixtures::model(&model_dir, "squares", spec(), trained_on);
+    fixtures::model(&model_dir, "squares", spec(), fixtures::stamp(dataset));
     evaluation::calibrate_trained(&model_dir, dataset, &false.into()).unwrap();
     registry::load(&model_dir).unwrap()
 }

@@ -49,6 +49,18 @@ fn working_dir() -> tempfile::TempDir {
 }
 
 #[test]
+fn the_help_of_a_command_explains_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let help = succeed(dir.path(), "calibrate --help");
+    assert!(
+        help.contains("It replaces the calibration in the model's manifest"),
+        "{help}"
+    );
+    let summary = "calibrate    Measure on the validation split which errors to expect of a model";
+    assert!(succeed(dir.path(), "--help").contains(summary));
+}
+
+#[test]
 fn usage_errors_exit_with_2_and_advice() {
     let dir = working_dir();
     fs::create_dir(dir.path().join("thesis")).unwrap();

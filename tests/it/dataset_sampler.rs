@@ -170,7 +170,7 @@ fn a_window_longer_than_every_episode_is_refused() {
     assert_eq!(
         error.to_string(),
         "a window of 10 frames (context 5, horizon 5) is longer than every episode of the train split; the longest has \
-         9 frames without a gap"
+         9 frames without a gap. Record longer, or train with a smaller context or horizon"
     );
 }
 

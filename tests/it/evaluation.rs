@@ -10,7 +10,7 @@ use foreframe::evaluation::plans::PlanOutcome;
 use foreframe::evaluation::report::{EvaluationReport, SetOutcome};
 use foreframe::evaluation::{self, EvaluateConfig, EvaluationError, Purpose};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
-use foreframe::registry::{DatasetStamp, LoadedModel};
+use foreframe::registry::LoadedModel;
 use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::types::{Channel, Seed};
 
@@ -19,36 +19,22 @@ use crate::fixtures::{self, moving_squares};
 const SIDE: u32 = 16;
 
 fn spec(conditioning: Conditioning) -> ModelSpec {
-    let channel = |name: &str, unit: &str| ChannelScale {
-        name: name.to_owned(),
-        unit: unit.to_owned(),
-        mean: 1.0,
-        std: 0.8,
-    };
     ModelSpec {
-        frame_width_px: SIDE,
-        frame_height_px: SIDE,
-        features: 8,
-        hidden: 12,
         context: 4,
         horizon: 3,
         conditioning,
-        actions: vec![channel("speed", "px/frame")],
-        states: vec![channel("phase", "")],
-        ..ModelSpec::default()
+        ..fixtures::squares_spec(SIDE)
     }
 }
 
 /// An untrained model whose manifest names this data set as its training data.
 fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
-    let trained_on = DatasetStamp {
-        name: dataset.info().name.clone(),
-        content_hash: dataset.info().content_hash.clone(),
-        scenario: None,
-        windows: 0,
-        split_seed: Seed(7),
-    };
-    fixtures::model(tempfile::tempdir().unwrap().path(), name, spec, trained_on)
+    fixtures::model(
+        tempfile::tempdir().unwrap().path(),
+        name,
+        spec,
+        fixtures::stamp(dataset),
+    )
 }
 
 fn config() -> EvaluateConfig<'static> {

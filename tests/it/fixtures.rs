@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::nn::{ModelSpec, Parameters};
+use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
 use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
 use foreframe::types::{Channel, Seed};
 
@@ -46,6 +46,37 @@ pub(crate) fn moving_squares(episodes: usize, side: u32, period_s: f64) -> Datas
         ..DatasetInfo::default()
     };
     Dataset::from_episodes(info, data.collect()).unwrap()
+}
+
+/// A small dense network for the moving squares.
+pub(crate) fn squares_spec(side: u32) -> ModelSpec {
+    let channel = |name: &str, unit: &str| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 1.0,
+        std: 0.8,
+    };
+    ModelSpec {
+        frame_width_px: side,
+        frame_height_px: side,
+        features: 8,
+        hidden: 12,
+        conditioning: Conditioning::StateAction,
+        actions: vec![channel("speed", "px/frame")],
+        states: vec![channel("phase", "")],
+        ..ModelSpec::default()
+    }
+}
+
+/// Names a data set as that of a training, with the split seed 7.
+pub(crate) fn stamp(dataset: &Dataset) -> DatasetStamp {
+    DatasetStamp {
+        name: dataset.info().name.clone(),
+        content_hash: dataset.info().content_hash.clone(),
+        scenario: None,
+        windows: 0,
+        split_seed: Seed(7),
+    }
 }
 
 /// A model with random weights, published in `model_dir` and loaded from there.

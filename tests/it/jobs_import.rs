@@ -155,7 +155,7 @@ async fn imports_are_off_by_default() {
 }
 
 /// Frames of a recording that takes a few seconds to import.
-const FRAMES: u32 = 6000;
+const FRAMES: u32 = 20_000;
 /// Time limit of every wait: jobs have a low priority, so a busy machine imports few frames per second.
 const IMPORT_TIMEOUT: Duration = Duration::from_mins(5);
 

@@ -161,9 +161,10 @@ impl RunningServer {
             "{method} {path} HTTP/1.1\r\n{head}\r\n{key}content-length: {length}\r\n\r\n{body}"
         )
         .unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        answer
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        // Pictures are not text.
+        String::from_utf8_lossy(&answer).into_owned()
     }
 
     /// Polls a job until the condition holds. Panics if the job fails.

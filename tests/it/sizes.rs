@@ -1,12 +1,12 @@
 //! Frames of many sizes, contexts and horizons of many lengths: both networks train on them and predict.
 
-use std::sync::atomic::AtomicBool;
-
 use candle_core::{Device, Tensor};
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe::nn::ConditioningTensors;
 use foreframe::registry;
-use foreframe::training::{TrainConfig, Training, TrainingOutcome, run};
+use foreframe::training::{TrainConfig, TrainingOutcome};
+
+use crate::training::train;
 
 /// Width and height in pixels, context and horizon in frames.
 const SHAPES: [[usize; 4]; 5] = [
@@ -65,14 +65,7 @@ fn trains_and_predicts(preset: &str, [width, height, context, horizon]: [usize; 
         waves(width, height, context + horizon + 6),
         tempfile::tempdir().unwrap(),
     );
-    let training = Training {
-        config: &config,
-        dataset: &dataset,
-        run_dir: dir.path(),
-        command: "test",
-        start: None,
-    };
-    let outcome = run(&training, &mut |_| {}, &AtomicBool::new(false)).unwrap();
+    let outcome = train(&config, &dataset, dir.path()).unwrap();
     let TrainingOutcome::Finished { model_dir, .. } = outcome else {
         panic!("{outcome:?}")
     };

@@ -6,11 +6,14 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};
 use crate::jobs_outage::{training, undisturbed};
 use crate::process::RunningServer;
+use crate::recordings;
+use crate::service::{context, model, spec};
 use crate::store_away::{status, wait_for_status};
 
 const EIO: u32 = 5;
@@ -34,6 +37,8 @@ fn compiled(dir: &Path) -> Option<PathBuf> {
     Some(library)
 }
 
+/// Frames of a recording that takes some seconds to import.
+const FRAMES: u32 = 20_000;
 /// Steps of a training that takes some seconds, so that the files fail while it runs.
 const STEPS: u32 = 1500;
 
@@ -47,38 +52,76 @@ fn a_server_recovers_from_a_failing_file_system() {
     }
 }
 
+/// A server whose files below `data` fail while the switch is on.
+struct FailingServer {
+    server: RunningServer,
+    switch: PathBuf,
+}
+
+impl FailingServer {
+    fn start(dir: &Path, library: &Path) -> Self {
+        let (data, switch, import) = (dir.join("data"), dir.join("switch"), dir.join("recordings"));
+        for dir in [&data, &import] {
+            std::fs::create_dir_all(dir).unwrap();
+        }
+        let [data, switch_text, library] = [&data, &switch, library].map(|path: &Path| path.to_str().unwrap());
+        let environment = [
+            ("LD_PRELOAD", library),
+            ("FAILING_DIR", data),
+            ("FAILING_SWITCH", switch_text),
+        ];
+        let import = format!("import_dir={}", import.display());
+        let server = RunningServer::start_with(dir, &["--data-dir", data, "--set", &import], &environment);
+        Self { server, switch }
+    }
+
+    fn fail_with(&self, number: u32) {
+        // Written whole before it is seen.
+        let partial = self.switch.with_extension("partial");
+        std::fs::write(&partial, number.to_string()).unwrap();
+        std::fs::rename(partial, &self.switch).unwrap();
+    }
+
+    fn mend(&self) {
+        std::fs::remove_file(&self.switch).unwrap();
+    }
+
+    fn wait_for_success(&self, id: &str) -> Value {
+        self.server.wait_for_job(id, |job| job["state"] == "succeeded")
+    }
+}
+
 fn recovers_from(number: u32, library: &Path, whole: &Path) {
     let dir = tempfile::tempdir().unwrap();
-    let (data, switch) = (dir.path().join("data"), dir.path().join("switch"));
+    let data = dir.path().join("data");
     copy_dataset(whole, &data);
-    let [data_text, switch_text, library] = [&data, &switch, library].map(|path: &Path| path.to_str().unwrap());
-    let environment = [
-        ("LD_PRELOAD", library),
-        ("FAILING_DIR", data_text),
-        ("FAILING_SWITCH", switch_text),
-    ];
-    let server = RunningServer::start_with(dir.path(), &["--data-dir", data_text], &environment);
-    let wait_for_success = |id: &str| server.wait_for_job(id, |job| job["state"] == "succeeded");
+    let models = dir.path().join("models");
+    std::fs::create_dir(&models).unwrap();
+    model(&models, "plain", spec(Conditioning::None));
+    let failing = FailingServer::start(dir.path(), library);
+    let server = &failing.server;
     let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1});
     assert_eq!(server.ask("POST", "/v1/jobs", &training(STEPS))["id"], "job-1");
     server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
 
-    // Written whole before it is seen.
-    let partial = dir.path().join("switch.partial");
-    std::fs::write(&partial, number.to_string()).unwrap();
-    std::fs::rename(partial, &switch).unwrap();
-    wait_for_status(&server, "/readyz", "503");
+    failing.fail_with(number);
+    wait_for_status(server, "/readyz", "503");
     let refused = server.send("POST", "/v1/jobs", &collect("refused").to_string());
     assert_eq!(status(&refused), "503", "{refused}");
     assert!(refused.to_lowercase().contains("\r\nretry-after: "), "{refused}");
     assert_eq!(status(&server.get("/livez")), "200");
-    assert_eq!(status(&server.get("/v1/models")), "200");
+    // Predictions need no file.
+    let predicted = server.ask("POST", "/v1/models/plain/predict", &json!({"frames": context()}));
+    assert!(predicted["frames"].is_array(), "{predicted}");
+    // What needs the database is refused for a while, or answered by a connection that is still open.
+    let models = server.get("/v1/models");
+    assert!(["200", "503"].contains(&status(&models)), "{models}");
     std::thread::sleep(Duration::from_secs(3));
-    std::fs::remove_file(&switch).unwrap();
+    failing.mend();
 
-    wait_for_status(&server, "/readyz", "200");
+    wait_for_status(server, "/readyz", "200");
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("after"))["id"], "job-2");
-    let trained = wait_for_success("job-1");
+    let trained = failing.wait_for_success("job-1");
     assert_eq!(
         (&trained["attempts"], &trained["result"]["version"]),
         (&json!(1), &json!(1))
@@ -86,7 +129,31 @@ fn recovers_from(number: u32, library: &Path, whole: &Path) {
     assert!(weights(&data) == weights(whole), "the weights differ");
     let log = server.get("/v1/jobs/job-1/logs");
     assert!(log.contains("waiting for the store: "), "{log}");
-    wait_for_success("job-2");
+    failing.wait_for_success("job-2");
     let jobs = server.ask("GET", "/v1/jobs", &Value::Null);
     assert_eq!(jobs["jobs"].as_array().unwrap().len(), 2, "{jobs}");
+}
+
+#[test]
+fn an_import_waits_for_a_failing_file_system() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(library) = compiled(dir.path()) else { return };
+    let recordings = dir.path().join("recordings");
+    let failing = FailingServer::start(dir.path(), &library);
+    recordings::npy(&recordings.join("long.npy"), FRAMES);
+    let job = json!({"kind": "import", "source": "long.npy", "name": "long", "rate": 10.0, "size": "96x96"});
+    assert_eq!(failing.server.ask("POST", "/v1/jobs", &job)["id"], "job-1");
+    failing
+        .server
+        .wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
+    failing.fail_with(EIO);
+    std::thread::sleep(Duration::from_secs(4));
+    failing.mend();
+    let imported = failing.wait_for_success("job-1");
+    assert_eq!(
+        (&imported["attempts"], &imported["result"]["frames"]),
+        (&json!(1), &json!(FRAMES))
+    );
+    let log = failing.server.get("/v1/jobs/job-1/logs");
+    assert!(log.contains("waiting for the store: "), "{log}");
 }

@@ -63,7 +63,7 @@ fn small_config(extra: &[&str]) -> TrainConfig {
     TrainConfig::layered("paper", None, &settings).unwrap()
 }
 
-fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<TrainingOutcome, TrainError> {
+pub(crate) fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Result<TrainingOutcome, TrainError> {
     train_until(config, dataset, dir, usize::MAX)
 }
 

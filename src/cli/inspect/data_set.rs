@@ -73,7 +73,7 @@ fn camera(info: &DatasetInfo) -> String {
 fn print_times(inspection: &Inspection) -> Result<(), CliError> {
     let timing = &inspection.timing;
     print_line(format!(
-        "  lengths     {:.1} s in all; episodes of {} to {} frames, {} in the middle",
+        "  lengths     {:.1} s in all; episodes of {} to {} frames, median {}",
         timing.total_s, timing.shortest_episode_frames, timing.longest_episode_frames, timing.median_episode_frames
     ))?;
     print_line(format!(

@@ -10,7 +10,7 @@ use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
 use crate::types::Channel;
 
-/// The topics of a bag.
+/// The topic of the images.
 pub const IMAGE_TOPIC: &str = "/camera/image_raw";
 /// Beside the images, if the data set has a camera model.
 const CAMERA_TOPIC: &str = "/camera/camera_info";

@@ -66,17 +66,17 @@ fn name_of(path: &Path) -> String {
 }
 
 fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+    let mut paths = entries(folder)?;
+    paths.retain(|path| ["png", "jpg", "jpeg"].contains(&extension(path).as_str()));
+    if paths.is_empty() {
+        return Err(ImportError::UnknownSource(folder.to_owned()));
+    }
     let Some(rate) = options.rate_hz else {
         return Err(ImportError::Option(format!(
             "{} has no timestamps (no CSV file); give the frames per second with --rate",
             folder.display()
         )));
     };
-    let mut paths = entries(folder)?;
-    paths.retain(|path| ["png", "jpg", "jpeg"].contains(&extension(path).as_str()));
-    if paths.is_empty() {
-        return Err(ImportError::UnknownSource(folder.to_owned()));
-    }
     let record = |(index, path): (usize, &PathBuf)| Record {
         timestamp_s: index as f64 / rate,
         session: String::new(),

@@ -19,7 +19,7 @@ use super::super::{DatasetError, DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording};
 use super::timing::{ImportPlan, PlannedFrame};
 use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
-use crate::files::{remove_partials, sha256_hex};
+use crate::files::{remove_partials, sha256_hex, try_lock};
 use crate::frame::fit::fit;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.
@@ -197,7 +197,7 @@ impl<'a> Directory<'a> {
 /// Locks the file of the arguments. Errors: `Dataset` (busy), `Io`.
 fn lock(path: &Path, out: &Path) -> Result<File, ImportError> {
     let file = File::open(path).map_err(ImportError::io("read", path))?;
-    match file.try_lock() {
+    match try_lock(&file) {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(ImportError::Dataset(DatasetError::Busy { path: out.to_owned() })),
         Err(TryLockError::Error(source)) => Err(ImportError::io("lock", path)(source)),

@@ -5,10 +5,11 @@ use std::sync::atomic::AtomicBool;
 use serde_json::json;
 
 use super::super::datasets;
+use super::super::patience::retry_while_busy;
 use super::super::report::JobReporter;
 use super::super::runner::{JobFailure, JobResult};
 use super::super::spec::ImportSpec;
-use super::{Pipeline, failed, retry_while_busy};
+use super::{Pipeline, failed};
 use crate::dataset::DatasetError;
 use crate::dataset::import::{ImportError, ImportProgress, SkippedItem, import, saved_shards};
 
@@ -34,14 +35,10 @@ impl Pipeline {
         let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
         let work = || import(&config, &on_progress, cancelled);
         let is_busy = |error: &ImportError| matches!(error, ImportError::Dataset(DatasetError::Busy { .. }));
-        let imported = retry_while_busy(work, is_busy, cancelled).map_err(|error| failed(&error))?;
+        // After an error it continues with the shards that are finished.
+        let imported = patience.repeat(|| retry_while_busy(work, is_busy, cancelled))?;
         log_skipped(&imported.skipped, report);
-        patience.run(async || {
-            self.store
-                .objects()
-                .push(&datasets::key(&spec.name), datasets::LAST_FILE)
-                .await
-        })?;
+        self.push_dataset(&spec.name, &patience)?;
         let info = imported.info;
         Ok(JobResult {
             result: json!({

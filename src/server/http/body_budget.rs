@@ -26,7 +26,7 @@ pub(in crate::server) struct BodyBudget {
 
 /// The bodies in flight exceed the budget.
 #[derive(Debug, thiserror::Error)]
-#[error("the request bodies that are being read exceed {limit} bytes; try again in 1 s")]
+#[error("the requests and messages that are being read exceed {limit} bytes; try again in 1 s")]
 pub(in crate::server) struct BodyBudgetError {
     limit: usize,
 }

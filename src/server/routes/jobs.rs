@@ -137,8 +137,9 @@ impl From<LossRow> for CurvePoint {
     }
 }
 
-/// Queues a collection, an import, a training or an evaluation. Each process runs one job at a time. A finished training publishes
-/// the next version of its model. The first version of a name becomes active at once, later ones when they are activated.
+/// Queues a collection, an import, a training or an evaluation. Each process runs one job at a time. A finished training
+/// publishes the next version of its model. The first version of a name becomes active at once, later ones when they are
+/// activated.
 #[utoipa::path(
     post, path = "/v1/jobs", tag = "jobs", request_body = JobSpec,
     params(("Idempotency-Key" = Option<String>, Header, pattern = "^[!-~]{1,128}$",
