@@ -15,6 +15,7 @@ mod frame_file;
 mod frame_store;
 pub mod import;
 mod layout;
+mod parquet_file;
 mod preview;
 pub mod sampler;
 mod shard;

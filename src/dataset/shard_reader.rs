@@ -15,7 +15,7 @@ use super::check::Numbers;
 use super::frame_file::{FrameFileWriter, FrameImage};
 use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
 use super::shard::{EpisodeRecord, RECORDS_KEY};
-use super::{DatasetError, DatasetInfo, Episode};
+use super::{DatasetError, DatasetInfo, Episode, parquet_file};
 use crate::frame::codec;
 
 /// Rows that are read at a time, with their images.
@@ -37,7 +37,7 @@ pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
 /// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
 pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let reader = ParquetRecordBatchReaderBuilder::try_new(file)
+    let reader = parquet_file::open(file)
         .and_then(ParquetRecordBatchReaderBuilder::build)
         .map_err(|error| corrupt(path, &error))?;
     reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, &error))
@@ -130,7 +130,7 @@ pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
 
 fn reader(path: &Path, with_images: bool) -> Result<ParquetRecordBatchReader, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let built = ParquetRecordBatchReaderBuilder::try_new(file).and_then(|builder| {
+    let built = parquet_file::open(file).and_then(|builder| {
         if with_images {
             return builder.with_batch_size(IMAGE_ROWS).build();
         }

@@ -8,11 +8,11 @@ use std::sync::{Mutex, PoisonError};
 use arrow_array::cast::AsArray;
 use arrow_array::{Array, RecordBatch};
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::super::images::inside;
 use super::super::recording::{PixelType, RawImages};
 use super::super::{ImportError, video};
+use crate::dataset::parquet_file;
 use crate::frame::{Frame, codec};
 
 /// Rows that are read together.
@@ -116,7 +116,7 @@ impl ImageTable {
         let path = &self.tables[table];
         let wrong = |reason: String| ImportError::record(path.display().to_string(), reason.trim());
         let file = File::open(path).map_err(ImportError::io("read", path))?;
-        let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|error| wrong(error.to_string()))?;
+        let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string()))?;
         let root = builder
             .schema()
             .fields()

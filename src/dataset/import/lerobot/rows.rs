@@ -10,10 +10,10 @@ use arrow_array::types::{
 use arrow_array::{Array, ArrayRef, RecordBatch};
 use arrow_schema::DataType;
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::super::ImportError;
 use super::description::Component;
+use crate::dataset::parquet_file;
 
 /// The numbers of one row.
 pub(super) struct Row {
@@ -33,8 +33,7 @@ pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> R
         std::io::ErrorKind::NotFound => wrong(format!("the table {} is missing", name.display())),
         _ => ImportError::io("read", path)(error),
     })?;
-    let builder =
-        ParquetRecordBatchReaderBuilder::try_new(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+    let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
     let mut wanted = vec!["episode_index", "timestamp"];
     wanted.extend(components.iter().map(|component| component.feature.as_str()));
     let fields = builder.schema().fields();
