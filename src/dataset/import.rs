@@ -16,6 +16,8 @@ mod video;
 mod writer;
 
 use std::fmt::Display;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -265,6 +267,35 @@ pub fn import(
     let recording = open(config)?;
     let plan = timing::plan(recording, options)?;
     directory.write(&plan, on_progress, cancelled)
+}
+
+/// Opens a file of a recording. Errors: `Io`, also for what is no regular file: reading a named pipe could take forever.
+fn open_file(path: &Path) -> Result<File, ImportError> {
+    let opened = std::fs::metadata(path).and_then(|found| {
+        if found.is_file() {
+            File::open(path)
+        } else {
+            Err(std::io::Error::new(
+                std::io::ErrorKind::InvalidInput,
+                "it is not a regular file",
+            ))
+        }
+    });
+    opened.map_err(ImportError::io("read", path))
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>, ImportError> {
+    let mut bytes = Vec::new();
+    let mut file = open_file(path)?;
+    file.read_to_end(&mut bytes).map_err(ImportError::io("read", path))?;
+    Ok(bytes)
+}
+
+fn read_text(path: &Path) -> Result<String, ImportError> {
+    let invalid = |_| std::io::Error::new(std::io::ErrorKind::InvalidData, "it is not UTF-8 text");
+    String::from_utf8(read_file(path)?)
+        .map_err(invalid)
+        .map_err(ImportError::io("read", path))
 }
 
 /// Reads the records of a source, after finding out of which kind it is.

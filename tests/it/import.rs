@@ -11,7 +11,7 @@ use serde_json::json;
 
 use crate::recordings::{has_ffmpeg, numpy_array as npy, video};
 
-fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, ImportError> {
+pub(crate) fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, ImportError> {
     let config = ImportConfig {
         source: source.to_owned(),
         out: out.to_owned(),
@@ -20,7 +20,7 @@ fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, Im
     import(&config, &|_| {}, &AtomicBool::new(false))
 }
 
-fn small() -> ImportOptions {
+pub(crate) fn small() -> ImportOptions {
     ImportOptions {
         frame_width_px: 16,
         frame_height_px: 12,
@@ -33,7 +33,7 @@ fn image(level: u8) -> Frame {
 }
 
 /// A folder of images with a CSV: 8 frames at 10 Hz, a gap, 4 frames.
-fn folder(dir: &Path) -> PathBuf {
+pub(crate) fn folder(dir: &Path) -> PathBuf {
     let source = dir.join("walk");
     fs::create_dir_all(&source).unwrap();
     let mut csv = "timestamp,file,action.speed [m/s],state.heading\n".to_owned();
@@ -132,7 +132,7 @@ fn a_numpy_array_of_sequences_becomes_episodes() {
     assert!(cut.contains("the file ends here"), "{cut}");
 }
 
-fn npz(path: &Path, arrays: &[(&str, Vec<u8>)], method: zip::CompressionMethod) {
+pub(crate) fn npz(path: &Path, arrays: &[(&str, Vec<u8>)], method: zip::CompressionMethod) {
     let mut archive = zip::ZipWriter::new(fs::File::create(path).unwrap());
     for (name, array) in arrays {
         let options = zip::write::SimpleFileOptions::default().compression_method(method);

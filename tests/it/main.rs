@@ -26,6 +26,7 @@ mod fit;
 mod fixtures;
 mod healthy_robot;
 mod import;
+mod import_hostile;
 mod import_killed;
 mod inspection;
 mod jobs;

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use super::images::inside;
 use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions};
+use super::{ImportError, ImportOptions, open_file, read_text};
 use crate::types::Channel;
 
 const MANIFEST: &str = "manifest.json";
@@ -30,7 +30,7 @@ struct TubManifest {
 impl TubManifest {
     fn read(tub: &Path) -> Result<Self, ImportError> {
         let path = tub.join(MANIFEST);
-        let text = std::fs::read_to_string(&path).map_err(ImportError::io("read", &path))?;
+        let text = read_text(&path)?;
         let wrong = |line: usize, reason: &str| ImportError::Record {
             place: format!("{} line {line}", path.display()),
             reason: reason.to_owned(),
@@ -138,7 +138,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
     let mut paths = Vec::new();
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
-        let file = std::fs::File::open(&path).map_err(ImportError::io("read", &path))?;
+        let file = open_file(&path)?;
         for (row, line) in BufReader::new(file).lines().enumerate() {
             let place = format!("{} line {}", path.display(), row + 1);
             let parsed = line

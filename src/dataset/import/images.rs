@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, extension};
+use super::{ImportError, ImportOptions, extension, open_file};
 use crate::files::natural_order;
 use crate::types::Channel;
 
@@ -108,8 +108,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
     let unreadable = |error: csv::Error| ImportError::record(csv.display().to_string(), error.to_string());
     let mut reader = csv::ReaderBuilder::new()
         .trim(csv::Trim::All)
-        .from_path(csv)
-        .map_err(unreadable)?;
+        .from_reader(open_file(csv)?);
     let header: Vec<String> = reader
         .headers()
         .map_err(unreadable)?
@@ -127,8 +126,12 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         skipped: Vec::new(),
     };
     let mut paths = Vec::new();
-    for (row, line) in reader.records().enumerate() {
-        let place = format!("{} line {}", csv.display(), row + 2);
+    let mut lines = reader.records();
+    let mut row = 0;
+    while let Some(line) = lines.next() {
+        // The line after this one, since empty lines are not counted as records.
+        let next = lines.reader().position().line();
+        let place = format!("{} line {}", csv.display(), next.saturating_sub(1).max(row as u64 + 2));
         let parsed = line
             .map_err(|error| ImportError::record(&place, error.to_string()))
             .and_then(|line| columns.record(&line, row, &place, folder, options));
@@ -145,6 +148,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
                 None => return Err(error),
             },
         }
+        row += 1;
     }
     recording.images = Images::Files(paths);
     Ok(recording)
@@ -246,7 +250,11 @@ impl Columns {
     ) -> Result<(PathBuf, Record), ImportError> {
         let text = |column: usize| line.get(column).unwrap_or_default();
         let number = |column: usize| -> Result<f64, ImportError> {
-            let value = text(column).parse::<f64>().ok().filter(|value| value.is_finite());
+            // Data sets hold 32 bits.
+            let value = text(column)
+                .parse::<f64>()
+                .ok()
+                .filter(|value| (*value as f32).is_finite());
             value.ok_or_else(|| {
                 let reason = format!(
                     "column {} is {:?}; it must be a finite number",

@@ -11,7 +11,7 @@ use zip::{CompressionMethod, ZipArchive};
 
 use super::numpy::{ArrayHeader, FrameLayout};
 use super::recording::{DECODED, Images, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions};
+use super::{ImportError, ImportOptions, open_file};
 use crate::types::Channel;
 
 /// Names of the arrays if none are given.
@@ -29,6 +29,8 @@ const TIMES: [(&str, f64); 8] = [
     ("timestamps_us", 1e-6),
     ("timestamps_ns", 1e-9),
 ];
+/// One byte of a deflated array becomes at most this many.
+const MAX_COMPRESSION: u64 = 1033;
 /// Actions, states and times are in memory as a whole.
 const MAX_VALUES_BYTES: u64 = 1 << 30;
 
@@ -38,6 +40,7 @@ pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<R
     let frames = npz.frames(options)?;
     let header = npz.header(&frames)?;
     let layout = FrameLayout::of(&header, &npz.place(&frames))?;
+    npz.check_size(&frames, &header)?;
     let mut read = |given: &[String], usual: &[&str], what: &'static str| {
         let names = npz.chosen(given, usual, what)?;
         let rows = names.iter().map(|name| npz.rows(name, &layout));
@@ -139,7 +142,7 @@ struct Npz {
 
 impl Npz {
     fn open(path: &Path) -> Result<Self, ImportError> {
-        let file = File::open(path).map_err(ImportError::io("read", path))?;
+        let file = open_file(path)?;
         let wrong = |error: ZipError| {
             let reason = format!("this is not a .npz file of numpy.savez, or it was cut off: {error}");
             ImportError::record(path.display().to_string(), reason)
@@ -203,6 +206,26 @@ impl Npz {
         let entry = self.archive.by_name(&format!("{name}.npy"));
         let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
         ArrayHeader::read(entry, &place)
+    }
+
+    /// Checks that the archive can hold an array of this shape. Errors: `Record`.
+    fn check_size(&mut self, name: &str, header: &ArrayHeader) -> Result<(), ImportError> {
+        let place = self.place(name);
+        let entry = self.archive.by_name(&format!("{name}.npy"));
+        let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
+        let needed = header.data_offset.saturating_add(header.bytes());
+        // What the archive states can be wrong as well.
+        let found = entry
+            .size()
+            .min(entry.compressed_size().saturating_mul(MAX_COMPRESSION));
+        if found < needed {
+            let reason = format!(
+                "it has {found} bytes at most; its shape {:?} needs {needed}",
+                header.shape
+            );
+            return Err(ImportError::record(place, reason));
+        }
+        Ok(())
     }
 
     /// Reads an array with as many rows as there are frames. Errors: `Record`.
@@ -274,14 +297,6 @@ impl Npz {
         let entry = self.archive.by_name(&format!("{name}.npy"));
         let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
         let needed = header.data_offset.saturating_add(header.bytes());
-        if entry.size() < needed {
-            let reason = format!(
-                "it has {} bytes; its shape {:?} needs {needed}",
-                entry.size(),
-                header.shape
-            );
-            return Err(ImportError::record(place, reason));
-        }
         if entry.compression() == CompressionMethod::Stored
             && let Some(start) = entry.data_start()
         {

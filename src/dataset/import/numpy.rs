@@ -1,13 +1,12 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
 //! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
 
-use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 use std::sync::Mutex;
 
 use super::recording::{Images, PixelType, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions};
+use super::{ImportError, ImportOptions, open_file};
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// A header is a short Python dictionary.
@@ -60,7 +59,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
             path.display()
         )));
     };
-    let file = File::open(path).map_err(ImportError::io("read", path))?;
+    let file = open_file(path)?;
     let place = path.display().to_string();
     let header = ArrayHeader::read(BufReader::new(&file), &place)?;
     let layout = FrameLayout::of(&header, &place)?;
@@ -154,6 +153,12 @@ impl FrameLayout {
                 "its frames are {width}×{height} px; each side must be 1 to {} px",
                 crate::frame::MAX_SIDE_PX
             ));
+        }
+        let bytes = sequences
+            .checked_mul(frames)
+            .and_then(|count| count.checked_mul(height * width * pixel.bytes()));
+        if bytes.is_none() {
+            return wrong(format!("its shape {:?} is too large", header.shape));
         }
         Ok(Self {
             sequences,

@@ -7,7 +7,8 @@ use std::sync::PoisonError;
 
 use super::bag::BagImages;
 use super::lerobot::LerobotImages;
-use super::{ImportError, SkippedItem};
+use super::{ImportError, SkippedItem, read_file};
+use crate::files::may_pass;
 use crate::frame::warp::CameraModel;
 use crate::frame::{Frame, codec};
 use crate::types::Channel;
@@ -93,11 +94,14 @@ impl Images {
         match self {
             Self::Files(paths) => {
                 let path = &paths[image];
-                let bytes = std::fs::read(path).map_err(|error| match error.kind() {
-                    std::io::ErrorKind::NotFound => {
+                let bytes = read_file(path).map_err(|error| match error {
+                    ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
                         ImportError::record(place, format!("the image {} is missing", path.display()))
                     }
-                    _ => ImportError::io("read", path)(error),
+                    ImportError::Io { source, .. } if !may_pass(&source) => {
+                        ImportError::record(place, format!("the image {} cannot be read: {source}", path.display()))
+                    }
+                    other => other,
                 })?;
                 codec::decode(&bytes).map_err(|source| ImportError::Image {
                     place: place.to_owned(),

@@ -3,13 +3,20 @@
 //! The rule: records of one session follow each other until time jumps by more than 3 median periods; that ends an
 //! episode. Without a rate, every Nth record becomes a frame. With a rate, frame k of an episode is the record nearest to
 //! its start + k / rate, if one lies within half a period; if none does, the episode ends. The action of a frame is the mean
-//! of the records' actions from this frame up to the next one. Its state is that of its record.
+//! of the records' actions from this frame up to the next one. Its state is that of its record. Very long episodes are cut.
+
+use std::ops::RangeInclusive;
 
 use super::recording::{Record, Recording};
-use super::{ImportError, ImportOptions};
+use super::{ImportError, ImportOptions, SkippedItem};
 
 /// A jump of time by more than this many median periods ends an episode.
 const GAP_PERIODS: f64 = 3.0;
+/// The median time from one record to the next: the reach of `--rate`.
+const PERIODS_S: RangeInclusive<f64> = 0.001..=100.0;
+/// Longer episodes are cut, if their frames are more than `MIN_LONGEST_FRAMES`.
+const MAX_EPISODE_BYTES: usize = 256 << 20;
+const MIN_LONGEST_FRAMES: usize = 1000;
 /// Rates this near to a whole number of frames per second are taken for it.
 const RATE_TOLERANCE: f64 = 0.03;
 
@@ -38,11 +45,21 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
             options.csv.clone().unwrap_or_else(|| recording.name.clone().into()),
         ));
     };
+    if !PERIODS_S.contains(&period_s) {
+        return Err(ImportError::Option(format!(
+            "the times of {:?} are {period_s} s apart (median); {} to {} s are possible. Times are in seconds unless their name \
+             ends with _ms, _us or _ns",
+            recording.name,
+            PERIODS_S.start(),
+            PERIODS_S.end()
+        )));
+    }
     let (frame_period_s, resampled) = match options.rate_hz {
         Some(rate) if (rate * period_s - 1.0).abs() > RATE_TOLERANCE => (1.0 / rate, true),
         Some(rate) => (1.0 / rate, false),
         None => (whole_rate(period_s), false),
     };
+    let longest = longest_episode(options);
     let mut episodes = Vec::new();
     for segment in segments(records, GAP_PERIODS * period_s) {
         let picked = if resampled {
@@ -53,7 +70,12 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
         for chosen in picked {
             let kept: Vec<usize> = chosen.into_iter().step_by(options.every).collect();
             if kept.len() > 1 {
-                episodes.push(with_actions(records, &kept));
+                let frames = with_actions(records, &kept);
+                let parts = frames.len().div_ceil(longest);
+                for part in frames.chunks(frames.len().div_ceil(parts)) {
+                    check_stored_times(records, part)?;
+                    episodes.push(part.to_vec());
+                }
             }
         }
     }
@@ -67,12 +89,51 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     })
 }
 
-/// Refuses records whose time is not after the one before in their session, or leaves them out.
+/// Data sets store the times since the episode's start with 24 bits. Errors: `Record` if two of them would be the same.
+fn check_stored_times(records: &[Record], frames: &[PlannedFrame]) -> Result<(), ImportError> {
+    let time_s = |frame: &PlannedFrame| records[frame.record].timestamp_s;
+    let since_start = |frame: &PlannedFrame| (time_s(frame) - time_s(&frames[0])) as f32;
+    let mut pairs = frames.windows(2);
+    match pairs.find(|pair| since_start(&pair[1]) <= since_start(&pair[0])) {
+        None => Ok(()),
+        Some(pair) => Err(ImportError::record(
+            records[pair[1].record].place.clone(),
+            format!(
+                "its time is too near to the one before, {} s after the start of its episode; use fewer frames per second",
+                since_start(&pair[0])
+            ),
+        )),
+    }
+}
+
+/// The frames of the longest episode. One episode is in memory while it is written, and an import continues after a whole one.
+fn longest_episode(options: &ImportOptions) -> usize {
+    let pixels = options.frame_width_px as usize * options.frame_height_px as usize;
+    (MAX_EPISODE_BYTES / pixels).max(MIN_LONGEST_FRAMES)
+}
+
+/// Refuses records whose time is not after the one before in their session, or leaves them out. A single time that is too late is
+/// left out itself, not those after it.
 fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Result<(), ImportError> {
     let mut kept: Vec<Record> = Vec::with_capacity(recording.records.len());
     for record in std::mem::take(&mut recording.records) {
         match kept.last() {
             Some(last) if last.session == record.session && record.timestamp_s <= last.timestamp_s => {
+                let before = kept.len().checked_sub(2).map(|index| &kept[index]);
+                let fits = before
+                    .is_none_or(|before| before.session != record.session || before.timestamp_s < record.timestamp_s);
+                if options.skip_bad && fits && record.timestamp_s < last.timestamp_s {
+                    recording.skipped.push(SkippedItem {
+                        place: last.place.clone(),
+                        reason: format!(
+                            "its time {} s is not before the one after, {} s",
+                            last.timestamp_s, record.timestamp_s
+                        ),
+                    });
+                    kept.pop();
+                    kept.push(record);
+                    continue;
+                }
                 let error = ImportError::record(
                     record.place.clone(),
                     format!(
@@ -135,16 +196,24 @@ fn nearest(records: &[Record], segment: std::ops::Range<usize>, period_s: f64) -
     let start_s = records[segment.start].timestamp_s;
     let end_s = records[segment.end - 1].timestamp_s;
     let (mut lists, mut list, mut index) = (Vec::new(), Vec::new(), segment.start);
-    for step in 0..=((end_s - start_s) / period_s) as usize {
-        let wanted_s = start_s + step as f64 * period_s;
+    let (mut step, last_step) = (0.0, ((end_s - start_s) / period_s).floor());
+    while step <= last_step {
+        let wanted_s = start_s + step * period_s;
         let distance = |record: usize| (records[record].timestamp_s - wanted_s).abs();
         while index + 1 < segment.end && distance(index + 1) <= distance(index) {
             index += 1;
         }
+        step += 1.0;
         if distance(index) <= period_s / 2.0 && list.last() != Some(&index) {
             list.push(index);
         } else {
             lists.push(std::mem::take(&mut list));
+            // No grid time has a record near it until the next record.
+            if let Some(next) = records[..segment.end].get(index + 1) {
+                step = ((next.timestamp_s - start_s) / period_s - 0.5).ceil().max(step);
+            } else {
+                break;
+            }
         }
     }
     lists.push(list);
@@ -249,5 +318,19 @@ mod tests {
         };
         let plan = plan(recording(&times), &options).unwrap();
         assert_eq!((plan.recording.skipped.len(), plan.episodes[0].len()), (1, 4));
+    }
+
+    #[test]
+    fn a_very_long_episode_is_cut_into_equal_parts() {
+        let times_s: Vec<f64> = (0..2500).map(|index| f64::from(index) * 0.1).collect();
+        let options = ImportOptions {
+            frame_width_px: 1024,
+            frame_height_px: 1024,
+            ..ImportOptions::default()
+        };
+        let episodes = planned(&times_s, &options);
+        let lengths: Vec<usize> = episodes.iter().map(Vec::len).collect();
+        assert_eq!(lengths, [834, 834, 832]);
+        assert_eq!(episodes[1][0], (834, 834.0));
     }
 }

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use super::collector::{Collector, Position};
 use super::compression::{self, MAX_RECORD_BYTES};
-use crate::dataset::import::ImportError;
+use crate::dataset::import::{ImportError, open_file};
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// The operation code and the length of a record.
@@ -153,7 +153,7 @@ struct McapScan<'a, 'b> {
 
 /// Passes every message of a file to the collector. Errors: `Io`, `Record` where damage may not be left out.
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
-    let file = File::open(path).map_err(ImportError::io("read", path))?;
+    let file = open_file(path)?;
     let length = file.metadata().map_err(ImportError::io("read", path))?.len();
     let mut scan = McapScan {
         path,
@@ -182,8 +182,8 @@ impl McapScan<'_, '_> {
         let (mut offset, mut body) = (MAGIC.len() as u64, Vec::new());
         loop {
             let mut header = [0; RECORD_HEADER_BYTES as usize];
-            let left = self.length.saturating_sub(offset + RECORD_HEADER_BYTES);
-            if offset + RECORD_HEADER_BYTES > self.length {
+            let left = self.length.saturating_sub(offset.saturating_add(RECORD_HEADER_BYTES));
+            if offset.saturating_add(RECORD_HEADER_BYTES) > self.length {
                 return self.fault(
                     offset,
                     "the file ends without the end of its data; the recording was cut off",
@@ -223,7 +223,7 @@ impl McapScan<'_, '_> {
                 }
                 _ => self.skip(length)?,
             }
-            offset += RECORD_HEADER_BYTES + length;
+            offset = offset.saturating_add(RECORD_HEADER_BYTES).saturating_add(length);
         }
     }
 
@@ -332,7 +332,7 @@ impl McapFile {
     pub(super) fn open(path: &Path) -> Result<Self, ImportError> {
         Ok(Self {
             path: path.to_owned(),
-            file: Mutex::new(File::open(path).map_err(ImportError::io("read", path))?),
+            file: Mutex::new(open_file(path)?),
             cache: Mutex::new(Vec::new()),
         })
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::dataset::import::images::{entries, inside};
-use crate::dataset::import::{ImportError, extension};
+use crate::dataset::import::{ImportError, extension, read_text};
 
 const METADATA: &str = "metadata.yaml";
 /// Endings of files that were compressed as a whole.
@@ -33,7 +33,7 @@ pub(super) fn files(source: &Path) -> Result<Vec<PathBuf>, ImportError> {
         paths.retain(|path| is_bag_file(path));
         return Ok(paths);
     }
-    let text = std::fs::read_to_string(&metadata).map_err(ImportError::io("read", &metadata))?;
+    let text = read_text(&metadata)?;
     let place = metadata.display().to_string();
     let names = file_names(&text);
     if names.is_empty() {

@@ -6,20 +6,51 @@ use std::sync::{Mutex, PoisonError};
 use rusqlite::{Connection, OpenFlags};
 
 use super::collector::{Collector, Position};
-use crate::dataset::import::ImportError;
+use crate::dataset::import::{ImportError, open_file};
 
 /// Opens a database, perhaps even if it was cut off.
 fn connect(path: &Path, even_if_cut: bool) -> Result<Connection, ImportError> {
     // A missing file is an error of the file, not of the database.
-    std::fs::File::open(path).map_err(ImportError::io("read", path))?;
-    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let connection = Connection::open_with_flags(path, flags).map_err(|error| unreadable(path, &error))?;
+    open_file(path)?;
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX | OpenFlags::SQLITE_OPEN_URI;
+    let connection = Connection::open_with_flags(uri(path), flags).map_err(|error| unreadable(path, &error))?;
+    // Sorting never writes files.
+    connection
+        .execute_batch("PRAGMA temp_store = MEMORY")
+        .map_err(|error| unreadable(path, &error))?;
     if even_if_cut {
         // Otherwise SQLite refuses a file that has fewer pages than its header says. Nothing is written.
         let relaxed = connection.execute_batch("PRAGMA writable_schema = ON");
         relaxed.map_err(|error| unreadable(path, &error))?;
     }
     Ok(connection)
+}
+
+/// The database's name. Without a write-ahead log it is opened as one that never changes, so that SQLite writes nothing beside it.
+fn uri(path: &Path) -> PathBuf {
+    let Some(text) = path.to_str() else {
+        return path.to_owned();
+    };
+    let log = PathBuf::from(format!("{text}-wal"));
+    let escaped = text.replace('%', "%25").replace('?', "%3f").replace('#', "%23");
+    let option = if log.exists() { "" } else { "?immutable=1" };
+    // Two slashes before a relative path would name a host.
+    let root = if path.is_absolute() { "//" } else { "" };
+    PathBuf::from(format!("file:{root}{escaped}{option}"))
+}
+
+/// Tables whose rows are computed could have no end. Errors: `Record`.
+fn check_tables(connection: &Connection, path: &Path) -> Result<(), ImportError> {
+    let computed = "SELECT count(*) FROM sqlite_master WHERE name IN ('messages', 'topics') AND (type <> 'table' \
+         OR sql LIKE '%virtual%' OR sql LIKE '% as %(%')";
+    let count: i64 = connection
+        .query_row(computed, [], |row| row.get(0))
+        .map_err(|error| unreadable(path, &error))?;
+    if count > 0 {
+        let reason = "its messages or topics are computed (a view, a virtual table or a generated column); a bag has plain tables";
+        return Err(ImportError::record(path.display().to_string(), reason));
+    }
+    Ok(())
 }
 
 fn unreadable(path: &Path, error: &rusqlite::Error) -> ImportError {
@@ -33,6 +64,7 @@ fn unreadable(path: &Path, error: &rusqlite::Error) -> ImportError {
 /// left out.
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let connection = connect(path, collector.options.skip_bad)?;
+    check_tables(&connection, path)?;
     let topics = topics(&connection, collector).map_err(|error| unreadable(path, &error))?;
     let mut statement = connection
         .prepare("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::super::images::inside;
-use super::super::{ImportError, ImportOptions};
+use super::super::{ImportError, ImportOptions, read_file, read_text};
 use super::INFO;
 use super::rows::column_numbers;
 use crate::dataset::shard_reader::batches;
@@ -19,6 +19,10 @@ const EPISODE_LINES: &str = "meta/episodes.jsonl";
 const EPISODE_TABLES: &str = "meta/episodes";
 /// Version 2 without this field puts so many episodes into a directory.
 const CHUNK_EPISODES: usize = 1000;
+/// The greatest size of a vector feature.
+const MAX_COMPONENTS: usize = 10_000;
+/// The most digits of a number in a path.
+const MAX_DIGITS: usize = 20;
 /// Types whose values are read as numbers.
 const NUMBERS: [&str; 11] = [
     "float32", "float64", "float16", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool",
@@ -88,7 +92,7 @@ impl Description {
     /// Errors: `Io`, `Record`, `Option` if it is of another version.
     pub(super) fn read(source: &Path) -> Result<Self, ImportError> {
         let path = source.join(INFO);
-        let text = std::fs::read(&path).map_err(ImportError::io("read", &path))?;
+        let text = read_file(&path)?;
         let info: InfoFile = serde_json::from_slice(&text)
             .map_err(|error| ImportError::record(path.display().to_string(), error.to_string()))?;
         if !["v2.", "v3."]
@@ -100,6 +104,16 @@ impl Description {
                 source.display(),
                 info.codebase_version
             )));
+        }
+        let mut vectors = info.features.iter().filter(|(_, feature)| feature.is_vector());
+        if let Some((name, feature)) = vectors.find(|(_, feature)| feature.size() > MAX_COMPONENTS) {
+            return Err(ImportError::record(
+                path.display().to_string(),
+                format!(
+                    "feature \"{name}\" has {} components; at most {MAX_COMPONENTS} are read",
+                    feature.size()
+                ),
+            ));
         }
         Ok(Self {
             source: source.to_owned(),
@@ -206,7 +220,7 @@ impl Description {
             length: usize,
         }
         let path = self.source.join(EPISODE_LINES);
-        let text = std::fs::read_to_string(&path).map_err(ImportError::io("read", &path))?;
+        let text = read_text(&path)?;
         let entry = |(number, line): (usize, &str)| {
             let place = format!("{} line {}", path.display(), number + 1);
             let line: Line =
@@ -325,9 +339,13 @@ impl Feature {
             .any(|key| self.info[key] == Value::Bool(true))
     }
 
+    fn size(&self) -> usize {
+        self.shape.first().copied().unwrap_or(1)
+    }
+
     /// Its components, with the names that the data set gives them, or numbers.
     fn components(&self, feature: &str) -> Vec<Component> {
-        let size = self.shape.first().copied().unwrap_or(1);
+        let size = self.size();
         let mut names = Vec::new();
         texts(&self.names, &mut names);
         let short = feature.rsplit('.').next().unwrap_or(feature);
@@ -369,7 +387,7 @@ fn filled(template: &str, image: &str, fields: &[(&str, usize)]) -> String {
             let Some(length) = text[start..].find('}') else { break };
             let field = &text[start..=start + length];
             let width = field.trim_end_matches(['}', 'd']).rsplit(':').next();
-            let width = width.and_then(|width| width.parse().ok()).unwrap_or(0);
+            let width = width.and_then(|width| width.parse().ok()).unwrap_or(0).min(MAX_DIGITS);
             text = text.replace(field, &format!("{value:0width$}"));
         }
     }
@@ -407,6 +425,7 @@ mod tests {
         let fields = [("episode_chunk", 1), ("episode_index", 1234)];
         let path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet";
         assert_eq!(filled(path, "", &fields), "data/chunk-001/episode_001234.parquet");
+        assert_eq!(filled("{episode_index:099999d}", "", &fields).len(), MAX_DIGITS);
     }
 
     #[test]

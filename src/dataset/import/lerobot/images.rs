@@ -11,7 +11,7 @@ use parquet::arrow::ProjectionMask;
 
 use super::super::images::inside;
 use super::super::recording::{PixelType, RawImages};
-use super::super::{ImportError, video};
+use super::super::{ImportError, open_file, read_file, video};
 use crate::dataset::parquet_file;
 use crate::frame::{Frame, codec};
 
@@ -79,7 +79,7 @@ impl ImageTable {
             StoredImage::Bytes(bytes) => (bytes, path.clone()),
             StoredImage::File(name) => {
                 let path = inside(&self.source, &name, place)?;
-                (std::fs::read(&path).map_err(ImportError::io("read", &path))?, path)
+                (read_file(&path)?, path)
             }
             StoredImage::Missing => {
                 return Err(ImportError::record(place, format!("{} has no image", self.column)));
@@ -115,7 +115,7 @@ impl ImageTable {
     fn load(&self, table: usize, first: usize) -> Result<Vec<StoredImage>, ImportError> {
         let path = &self.tables[table];
         let wrong = |reason: String| ImportError::record(path.display().to_string(), reason.trim());
-        let file = File::open(path).map_err(ImportError::io("read", path))?;
+        let file = open_file(path)?;
         let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string()))?;
         let root = builder
             .schema()

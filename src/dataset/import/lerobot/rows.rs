@@ -26,6 +26,9 @@ pub(super) struct Row {
     pub(super) bad: Option<String>,
 }
 
+/// The rows of a table are in memory as a whole.
+const MAX_ROWS: i64 = 5_000_000;
+
 /// Reads the chosen components of all rows. Errors: `Io`, `Record`.
 pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> Result<Vec<Row>, ImportError> {
     let wrong = |reason: String| ImportError::record(path.display().to_string(), reason);
@@ -34,6 +37,12 @@ pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> R
         _ => ImportError::io("read", path)(error),
     })?;
     let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+    let count = builder.metadata().file_metadata().num_rows();
+    if count > MAX_ROWS {
+        return Err(wrong(format!(
+            "it has {count} rows; at most {MAX_ROWS} of a table are read"
+        )));
+    }
     let mut wanted = vec!["episode_index", "timestamp"];
     wanted.extend(components.iter().map(|component| component.feature.as_str()));
     let fields = builder.schema().fields();
