@@ -336,7 +336,7 @@ class FlowNetwork:
         pose, nothing = self.pose_in(state), np.zeros(3, np.float32)
         _, rate = self.by_unit(self.states)
         inputs = []
-        for back in range(3):
+        for back in range(self.spec["flow"].get("frames_read", 3)):
             frame = frames[max(len(frames) - 1 - back, 0)]
             if back and rate is not None and self.camera:
                 turn = state[rate] * self.spec["frame_period_s"] * back
@@ -354,7 +354,22 @@ class FlowNetwork:
 
     def predict(self, frames, actions, state):
         motions, coarse = self.motions(state, actions), self.encode(frames, state)
+        if self.spec["flow"].get("recurrent", False):
+            return self.predict_recurrently(frames[-1], coarse, state)
         return [self.step(step, frames[-1], coarse, motions[step], (actions, state)) for step in range(len(motions))]
+
+    def predict_recurrently(self, last, z, state):
+        """Each step continues from the state and the frame of the step before."""
+        nothing, own, predicted = np.zeros(3, np.float32), own_places(self.shape), []
+        scene = self.scene(state, nothing, self.pose_in(state))
+        for step in range(self.spec["horizon"]):
+            seen = unshuffle(unshuffle(last[..., None]))
+            inputs = np.concatenate([z, unshuffle(scene[..., :8]), seen], 2).astype(np.float32)
+            z = z + dense(inputs, self.tensors, "flow.advance")
+            z = self.refined(z, self.modulation(step, nothing, None, state))
+            last = self.drawn(z, last, scene, own, own)
+            predicted.append(last)
+        return predicted
 
     def modulation(self, step, motion, actions, state):
         horizon = self.spec["horizon"]
@@ -384,8 +399,11 @@ class FlowNetwork:
         warped = np.where(near[..., None], sample(coarse, coarse_places), 0)
         scene = self.scene(state, motion, pose)
         modulation = self.modulation(step, motion, actions, state)
-        channels = self.spec["flow"]["channels"]
         z = dense(np.concatenate([warped, unshuffle(scene[..., :8])], 2).astype(np.float32), self.tensors, "flow.mix")
+        return self.drawn(self.refined(z, modulation), last, scene, room, turned)
+
+    def refined(self, z, modulation):
+        channels = self.spec["flow"]["channels"]
         for block in range(self.spec["flow"]["decoder_blocks"]):
             inner = z
             for part, name in enumerate(("first", "second")):
@@ -393,6 +411,10 @@ class FlowNetwork:
                 scale, shift = modulation[at : at + channels], modulation[at + channels : at + 2 * channels]
                 inner = conv3(silu(inner * (1 + scale) + shift), self.tensors, f"flow.decoder.{block}.{name}")
             z = z + inner
+        return z
+
+    def drawn(self, z, last, scene, room, turned):
+        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed."""
         enlarged = shuffle(dense(silu(z), self.tensors, "flow.enlarge"))
         inside = (outside(room, self.shape) == 0).astype(np.float32)[..., None]
         moved_pixels = unshuffle(sample(last, room)[..., None])

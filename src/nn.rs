@@ -107,6 +107,15 @@ pub enum NnError {
         /// Largest side.
         max: u32,
     },
+    /// The recurrent form of the flow network takes no actions.
+    #[error(
+        "model specification: flow.recurrent is true and the conditioning is \"{conditioning}\"; the recurrent form takes no \
+         actions: use \"none\" or \"state\", or flow.recurrent=false"
+    )]
+    RecurrentActions {
+        /// The conditioning.
+        conditioning: Conditioning,
+    },
     /// No camera has this field of view or tilt.
     #[error("model specification: {0}")]
     Camera(#[source] crate::frame::FrameError),

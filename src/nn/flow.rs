@@ -1,9 +1,10 @@
 //! The flow network: it moves the pixels of the last frame instead of painting new ones.
 //!
-//! An encoder reads the last three frames once, in the last one's view. Then, for each predicted step: `motion` says how
+//! An encoder reads the last frames once, in the last one's view. Then, for each predicted step: `motion` says how
 //! the camera will have moved, the encoder's features are sampled as that camera sees them, a block of convolutions that
 //! is modulated by actions, state and step refines them, and `compose` mixes moved pixels with new content. The content
-//! comes from the `scene`, a learned function of the camera's pose that remembers what the surroundings look like.
+//! comes from the `scene`, a learned function of the camera's pose that remembers what the surroundings look like. In the
+//! `recurrent` form, each step continues from the one before it.
 //!
 //! Sizes beside those of [`crate::nn`]: M items (N futures of K steps each, step after step), C channels on the grid of a
 //! quarter of the frame's sides.
@@ -22,6 +23,8 @@ use super::sampling::{ImageSize, sample_features};
 use super::scene::Scene;
 use super::tensors::with_values;
 use super::{FlowLayers, ModelSpec, NnError};
+
+mod recurrent;
 
 /// Futures that are computed together without gradients, so that many take no more memory than few.
 const FUTURES_AT_ONCE: usize = 16;
@@ -121,7 +124,7 @@ impl FlowModel {
                 find.dense("flow.modulation.inputs")?,
                 find.dense("flow.modulation.output")?,
             ],
-            mix: find.dense("flow.mix")?,
+            mix: find.dense(&format!("flow.{}", layers.mix_name()))?,
             refine: refine.collect::<Result<_, NnError>>()?,
             enlarge: find.dense("flow.enlarge")?,
             fine: find.convolution("flow.fine", ConvShape::PLAIN)?,
@@ -158,6 +161,9 @@ impl FlowModel {
     }
 
     fn predict_rows(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<FlowPrediction, NnError> {
+        if self.layers.recurrent {
+            return self.predict_recurrently(spec, rows);
+        }
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
         let motion = self.motion.forward(spec, rows)?;
@@ -176,17 +182,8 @@ impl FlowModel {
         let modulation = self.modulate(spec, rows, &motion)?;
         let features = scene.narrow(3, 0, SCENE_FEATURES)?.contiguous()?;
         let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
-        let channels = self.layers.channels;
-        let mut state = Self::per_place(&self.mix, &mixed, quarter)?;
-        for (index, [first, second]) in self.refine.iter().enumerate() {
-            let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
-            let inner = first.forward(&modulated_silu(&state, &modulation(0)?)?)?;
-            let inner = second.forward(&modulated_silu(&inner, &modulation(1)?)?)?;
-            state = (state + inner)?;
-        }
-        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(&state)?, quarter)?)?;
-        let inputs = Tensor::cat(&[&enlarged, &moved, &scene], 3)?;
-        let head = self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?;
+        let state = self.refined(Self::per_place(&self.mix, &mixed, quarter)?, &modulation)?;
+        let head = self.head(&state, &moved, &scene, quarter)?;
 
         let composition = Composition {
             size,
@@ -203,16 +200,31 @@ impl FlowModel {
         })
     }
 
+    /// The states `[M, H/4, W/4, C]` after the decoder's modulated blocks.
+    fn refined(&self, mut state: Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
+        let channels = self.layers.channels;
+        for (index, [first, second]) in self.refine.iter().enumerate() {
+            let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
+            let inner = first.forward(&modulated_silu(&state, &modulation(0)?)?)?;
+            let inner = second.forward(&modulated_silu(&inner, &modulation(1)?)?)?;
+            state = (state + inner)?;
+        }
+        Ok(state)
+    }
+
+    /// The head's values of each item `[M, H/2, W/2, 4 · HEAD_VALUES]` from its state, the pixels to move and the scene.
+    fn head(&self, state: &Tensor, moved: &Tensor, scene: &Tensor, quarter: ImageSize) -> Result<Tensor, NnError> {
+        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(state)?, quarter)?)?;
+        let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
+        self.head.forward(&silu(&self.fine.forward(&inputs)?)?)
+    }
+
     /// Features of each context `[contexts, H/4, W/4, C]`.
     fn encode(&self, spec: &ModelSpec, contexts: &EncoderViews) -> Result<Tensor, NnError> {
         let half = spec.image_size().shrunk(2);
         let seen = self.scene.content_now(spec, contexts)?;
         let inputs = contexts.inputs(spec, &seen);
-        let inputs = Tensor::from_vec(
-            inputs,
-            (contexts.count(), half.height, half.width, EncoderViews::CHANNELS),
-            &Device::Cpu,
-        )?;
+        let inputs = Tensor::from_vec(inputs, (contexts.count(), half.height, half.width, ()), &Device::Cpu)?;
         let mut coarse = self.halving.forward(&silu(&self.stem.forward(&inputs)?)?)?;
         for [first, second] in &self.blocks {
             let inner = second.forward(&silu(&first.forward(&silu(&coarse)?)?)?)?;

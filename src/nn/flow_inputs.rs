@@ -12,9 +12,6 @@ use super::sampling::ImageSize;
 use super::tensors::with_values;
 use super::{ModelSpec, NnError};
 
-/// Frames that the encoder reads: the last and those before it.
-const FRAMES_READ: usize = 3;
-
 /// The futures to predict: windows, actions and states in their own units.
 pub(super) struct FutureRows {
     /// Frames of all windows `[B, context, P]`.
@@ -147,7 +144,7 @@ impl FutureRows {
     /// The contexts that the futures follow. Futures of one window and state share one.
     pub(super) fn contexts(&self, spec: &ModelSpec) -> EncoderViews {
         let size = spec.image_size();
-        let (pixels, context) = (size.pixels(), spec.context);
+        let (pixels, context, frames_read) = (size.pixels(), spec.context, spec.flow_layers().frames_read);
         let (mut row_of, mut firsts) = (Vec::with_capacity(self.count()), Vec::<usize>::new());
         for row in 0..self.count() {
             let same =
@@ -160,6 +157,7 @@ impl FutureRows {
         }
         let mut views = EncoderViews {
             row_of,
+            frames_read,
             last_frames: Vec::with_capacity(firsts.len() * pixels),
             earlier: Vec::new(),
             states: Vec::new(),
@@ -171,7 +169,7 @@ impl FutureRows {
                 &self.frames[place * pixels..(place + 1) * pixels]
             };
             views.last_frames.extend_from_slice(frame(0));
-            for back in 1..FRAMES_READ {
+            for back in 1..frames_read {
                 views.earlier.extend_from_slice(frame(back));
             }
             views.states.push(self.state(row).to_vec());
@@ -190,9 +188,11 @@ pub(super) fn repeated(row_of: &[u32], steps: usize) -> Vec<u32> {
 pub(super) struct EncoderViews {
     /// The context of each future.
     pub(super) row_of: Vec<u32>,
+    /// How many frames are read of each.
+    frames_read: usize,
     /// The last frame of each `[contexts, P]`.
     pub(super) last_frames: Vec<f32>,
-    /// The frames before it, latest first `[contexts, FRAMES_READ - 1, P]`.
+    /// The frames before it, latest first `[contexts, frames_read - 1, P]`; the oldest repeats where the context is shorter.
     earlier: Vec<f32>,
     /// The state at the last frame of each.
     pub(super) states: Vec<Vec<f32>>,
@@ -207,23 +207,26 @@ impl EncoderViews {
     }
 
     /// Channels of [`EncoderViews::inputs`]: 2×2 blocks of the frames read and of the scene, and the place in the frame.
-    pub(super) const CHANNELS: usize = 4 * (FRAMES_READ + 1) + 2;
+    pub(super) fn channels(frames_read: usize) -> usize {
+        4 * (frames_read + 1) + 2
+    }
 
-    /// The encoder's inputs `[contexts, H/2, W/2, CHANNELS]`: blocks of the last frames, the earlier ones turned into the
+    /// The encoder's inputs `[contexts, H/2, W/2, channels]`: blocks of the last frames, the earlier ones turned into the
     /// last one's view by the measured yaw rate, and of what the scene looks like without what moves (`seen`,
     /// `[contexts, H/2, W/2, 4]`).
     pub(super) fn inputs(&self, spec: &ModelSpec, seen: &[f32]) -> Vec<f32> {
         let size = spec.image_size();
         let (half, pixels) = (size.shrunk(2), size.pixels());
         let own = own_places(size);
-        let mut inputs = vec![0.0; self.count() * half.pixels() * Self::CHANNELS];
-        for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * Self::CHANNELS).enumerate() {
+        let (frames_read, channels) = (self.frames_read, Self::channels(self.frames_read));
+        let mut inputs = vec![0.0; self.count() * half.pixels() * channels];
+        for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * channels).enumerate() {
             let turns = StateChannels::of(spec)
                 .yaw_rate_in(&self.states[index])
                 .zip(spec.camera);
             write_blocks(&self.last_frames[index * pixels..], size, &own, inputs, 0);
-            for back in 1..FRAMES_READ {
-                let frame = &self.earlier[(index * (FRAMES_READ - 1) + back - 1) * pixels..];
+            for back in 1..frames_read {
+                let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..];
                 let places = turns.map(|(rate, camera)| {
                     let viewer = Viewer::new(camera, size);
                     viewer.turned(&viewer.rays(), rate * spec.frame_period_s as f32 * back as f32)
@@ -231,14 +234,10 @@ impl EncoderViews {
                 write_blocks(frame, size, places.as_ref().unwrap_or(&own), inputs, 4 * back);
             }
             let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];
-            for (place, (out, seen)) in inputs
-                .chunks_exact_mut(Self::CHANNELS)
-                .zip(seen.chunks_exact(4))
-                .enumerate()
-            {
-                out[4 * FRAMES_READ..4 * FRAMES_READ + 4].copy_from_slice(seen);
-                out[Self::CHANNELS - 2] = centred(place % half.width, half.width);
-                out[Self::CHANNELS - 1] = centred(place / half.width, half.height);
+            for (place, (out, seen)) in inputs.chunks_exact_mut(channels).zip(seen.chunks_exact(4)).enumerate() {
+                out[4 * frames_read..4 * frames_read + 4].copy_from_slice(seen);
+                out[channels - 2] = centred(place % half.width, half.width);
+                out[channels - 1] = centred(place / half.width, half.height);
             }
         }
         inputs

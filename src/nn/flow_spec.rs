@@ -15,6 +15,8 @@ use super::{ModelSpec, NnError};
 
 /// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.
 const MOVED_CHANNELS: usize = 5;
+/// Channels of a frame on the grid of a quarter of the sides: a 4×4 block.
+const FRAME_CHANNELS: usize = 16;
 /// Hidden units of the modulation.
 const MODULATION_HIDDEN: usize = 64;
 /// Least and greatest side of a frame; both sides are multiples of the least.
@@ -39,6 +41,11 @@ pub struct FlowLayers {
     pub fine_channels: usize,
     /// Units of the scene's two hidden layers.
     pub scene_hidden: usize,
+    /// Frames that the encoder reads: the last ones of the context.
+    pub frames_read: usize,
+    /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
+    /// true frame. Only for models that take no actions.
+    pub recurrent: bool,
 }
 
 impl Default for FlowLayers {
@@ -51,6 +58,8 @@ impl Default for FlowLayers {
             enlarged_channels: 12,
             fine_channels: 16,
             scene_hidden: 48,
+            frames_read: 3,
+            recurrent: false,
         }
     }
 }
@@ -64,7 +73,7 @@ struct LayerSize {
 }
 
 impl FlowLayers {
-    /// Errors: `OutOfRange` at the first size that is out of range, `FrameSides`.
+    /// Errors: `OutOfRange` at the first size that is out of range, `RecurrentActions`, `FrameSides`.
     pub(super) fn validate(&self, spec: &ModelSpec) -> Result<(), NnError> {
         let sizes = [
             ("flow.channels", self.channels, 512),
@@ -74,10 +83,16 @@ impl FlowLayers {
             ("flow.enlarged_channels", self.enlarged_channels, 512),
             ("flow.fine_channels", self.fine_channels, 512),
             ("flow.scene_hidden", self.scene_hidden, 1024),
+            ("flow.frames_read", self.frames_read, 256),
         ];
         for (field, size, most) in sizes {
             let least = f64::from(u8::from(!field.ends_with("blocks")));
             in_range(field, size as f64, least, f64::from(most))?;
+        }
+        if self.recurrent && spec.action_inputs().is_some() {
+            return Err(NnError::RecurrentActions {
+                conditioning: spec.conditioning,
+            });
         }
         let [least, most] = SIDES_PX;
         let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);
@@ -90,6 +105,12 @@ impl FlowLayers {
             min: least,
             max: most,
         })
+    }
+
+    /// The layer that makes a step's state. In the recurrent form it adds to the state, so it starts small and has another
+    /// name.
+    pub(super) fn mix_name(&self) -> &'static str {
+        if self.recurrent { "advance" } else { "mix" }
     }
 
     fn sizes(&self, spec: &ModelSpec) -> Vec<LayerSize> {
@@ -106,7 +127,12 @@ impl FlowLayers {
                 rows,
             });
         };
-        layer("stem", TAPS * EncoderViews::CHANNELS, self.stem_channels, half);
+        layer(
+            "stem",
+            TAPS * EncoderViews::channels(self.frames_read),
+            self.stem_channels,
+            half,
+        );
         layer("halving", TAPS * self.stem_channels, channels, quarter);
         for index in 0..self.encoder_blocks {
             for part in ["first", "second"] {
@@ -138,7 +164,8 @@ impl FlowLayers {
             layer("scene.hidden", self.scene_hidden, self.scene_hidden, rows);
             layer("scene.output", self.scene_hidden, SCENE_CHANNELS, rows);
         }
-        layer("mix", channels + 4 * SCENE_FEATURES, channels, horizon * quarter);
+        let mixed = channels + 4 * SCENE_FEATURES + if self.recurrent { FRAME_CHANNELS } else { 0 };
+        layer(self.mix_name(), mixed, channels, horizon * quarter);
         for index in 0..self.decoder_blocks {
             for part in ["first", "second"] {
                 let name = format!("decoder.{index}.{part}");

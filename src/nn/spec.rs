@@ -221,7 +221,8 @@ impl Default for ModelSpec {
 }
 
 impl ModelSpec {
-    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`, `Camera`, `FrameSides`.
+    /// Checks the range of every field. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`, `Camera`, `RecurrentActions`,
+    /// `FrameSides`.
     pub fn validate(&self) -> Result<(), NnError> {
         let side = f64::from(MAX_MODEL_SIDE_PX);
         in_range("frame_width_px", f64::from(self.frame_width_px), 1.0, side)?;

@@ -6,13 +6,14 @@ use crate::registry::Manifest;
 use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// Name and text of each preset.
-const PRESETS: [(&str, &str); 6] = [
+const PRESETS: [(&str, &str); 7] = [
     ("paper", include_str!("presets/paper.toml")),
     ("static", include_str!("presets/static.toml")),
     ("moving", include_str!("presets/moving.toml")),
     ("static-flow", include_str!("presets/static-flow.toml")),
     ("moving-flow", include_str!("presets/moving-flow.toml")),
     ("recording", include_str!("presets/recording.toml")),
+    ("moving-mnist", include_str!("presets/moving-mnist.toml")),
 ];
 
 /// The command that lists all settings.
@@ -149,7 +150,8 @@ mod tests {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
         assert_eq!(
             error,
-            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow, recording"
+            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow, recording, \
+             moving-mnist"
         );
     }
 

@@ -53,11 +53,25 @@ fn small(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
     }
 }
 
+/// The same in the recurrent form, whose encoder reads one frame more than the context has.
+fn recurrent(conditioning: Conditioning) -> ModelSpec {
+    let spec = small(conditioning, None);
+    ModelSpec {
+        flow: Some(FlowLayers {
+            frames_read: 4,
+            recurrent: true,
+            ..spec.flow_layers()
+        }),
+        ..spec
+    }
+}
+
 fn kinds() -> Vec<ModelSpec> {
     let mut kinds = Vec::new();
     for conditioning in [Conditioning::None, Conditioning::Action, Conditioning::StateAction] {
         kinds.extend([None, Some(CAMERA)].map(|camera| small(conditioning, camera)));
     }
+    kinds.extend([recurrent(Conditioning::None), recurrent(Conditioning::State)]);
     kinds
 }
 
@@ -153,6 +167,29 @@ fn the_cost_is_that_of_its_layers() {
 }
 
 #[test]
+fn the_recurrent_form_reads_every_frame_of_its_context() {
+    let spec = recurrent(Conditioning::None);
+    let parameters = Parameters::initialize(&spec, Seed(2)).unwrap();
+    // The head starts near zero; make what the encoder sees visible.
+    for (index, (_, var)) in parameters.iter().enumerate() {
+        let noise = (values(var.dims(), index as f32) * 0.1).unwrap();
+        var.set(&(var.as_detached_tensor() + noise).unwrap()).unwrap();
+    }
+    let model = Model::detached(spec.clone(), &parameters).unwrap();
+    let predict = |frames: &Tensor| model.predict_frames(frames, &condition(&spec, 1)).unwrap();
+    let seen = frames(&spec, 1);
+    for frame in 0..spec.context {
+        let mut parts: Vec<Tensor> = (0..spec.context).map(|at| seen.narrow(1, at, 1).unwrap()).collect();
+        parts[frame] = (&parts[frame] * 0.5).unwrap();
+        let changed = Tensor::cat(&parts, 1).unwrap();
+        assert!(
+            largest_difference(&predict(&seen), &predict(&changed)) > 1e-5,
+            "frame {frame}"
+        );
+    }
+}
+
+#[test]
 fn what_does_not_suit_the_network_is_refused_in_one_sentence() {
     let refused = |change: &dyn Fn(&mut ModelSpec)| {
         let mut spec = small(Conditioning::None, None);
@@ -163,6 +200,8 @@ fn what_does_not_suit_the_network_is_refused_in_one_sentence() {
         refused(&|spec| spec.frame_width_px = 10),
         "model specification: frames are 10×8 px; each side must be a multiple of 4 from 4 to 256"
     );
+    let error = recurrent(Conditioning::Action).validate().unwrap_err().to_string();
+    assert!(error.contains("the recurrent form takes no actions"), "{error}");
     let camera = CameraModel {
         horizontal_fov_rad: 4.0,
         ..CAMERA
