@@ -39,6 +39,7 @@ use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::uncertainty::NoveltyScores;
 use crate::dataset::Dataset;
+use crate::dataset::moving_mnist::MOVING_MNIST;
 use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::nn::{Architecture, ModelSpec};
 use crate::registry::LoadedModel;
@@ -53,6 +54,8 @@ pub enum Purpose {
     /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
     #[default]
     Test,
+    /// To publish: all of a data set that holds nothing but test data, as the files of published benchmarks do.
+    WholeSet,
 }
 
 impl Purpose {
@@ -62,6 +65,7 @@ impl Purpose {
         match self {
             Self::Validation => &[Split::Validation],
             Self::Test => &[Split::Test, Split::UnseenPairs, Split::UnseenGains],
+            Self::WholeSet => &[Split::Test],
         }
     }
 }
@@ -69,7 +73,7 @@ impl Purpose {
 /// What to test on, and how closely.
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
-    /// Validation or test.
+    /// Which part of the data set.
     pub purpose: Purpose,
     /// Seed of the split; that of the model's training if none is given.
     pub split_seed: Option<Seed>,
@@ -210,9 +214,9 @@ impl EvaluationContext<'_> {
     }
 }
 
-/// Scores the model on the splits that [`EvaluateConfig::purpose`] names: the validation split, or the three test sets
-/// (trials, start/goal pairs and gains that training never saw). Errors: model and data set that don't fit together, settings out of range, nothing held out, `Cancelled`, those of the
-/// network.
+/// Scores the model on the splits that [`EvaluateConfig::purpose`] names: the validation split, the three test sets
+/// (trials, start/goal pairs and gains that training never saw), or the whole data set. Errors: model and data set that
+/// don't fit together, settings out of range, nothing held out, `TrainedOn`, `Cancelled`, those of the network.
 pub fn run(
     loaded: &LoadedModel,
     dataset: &Dataset,
@@ -228,7 +232,13 @@ pub fn run(
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
-    let splits = Splits::new(dataset, split_seed);
+    let splits = match config.purpose {
+        Purpose::WholeSet => {
+            compatible::check_untrained(loaded, dataset)?;
+            Splits::all_for_test(dataset)
+        }
+        _ => Splits::new(dataset, split_seed),
+    };
     let tests = config.purpose.splits();
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {
@@ -237,7 +247,7 @@ pub fn run(
         });
     }
     let spec = loaded.model.spec();
-    let mut baselines = Baselines::fit(dataset, &splits, window_shape(spec))?;
+    let mut baselines = fitted_baselines(loaded, (dataset, &splits), config.purpose)?;
     if spec.architecture == Architecture::Flow {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
@@ -262,6 +272,28 @@ pub fn run(
         sets,
         figures: Vec::new(),
     })
+}
+
+/// The baselines for this data set. Where all of it is for testing, they are fitted to its own frames, and there is no
+/// training window to find. Errors: those of [`Splits::windows`].
+fn fitted_baselines(
+    loaded: &LoadedModel,
+    (dataset, splits): (&Dataset, &Splits),
+    purpose: Purpose,
+) -> Result<Baselines, EvaluationError> {
+    let shape = window_shape(loaded.model.spec());
+    let mut baselines = match purpose {
+        Purpose::WholeSet => {
+            let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
+            Baselines::fit(dataset, &own, shape)?.without(Method::NearestWindow)
+        }
+        _ => Baselines::fit(dataset, splits, shape)?,
+    };
+    let of = |scenario: &Option<String>| scenario.as_deref() == Some(MOVING_MNIST);
+    if of(&loaded.manifest.dataset.scenario) || of(&dataset.info().scenario) {
+        baselines = baselines.for_benchmark();
+    }
+    Ok(baselines)
 }
 
 /// How well novelty tells the other data sets from the windows with the novelty `own`.
@@ -313,8 +345,11 @@ fn score_split(
         return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
     let windows = score::evenly(&available, config.max_windows);
-    let scores = score::score(loaded, dataset, &windows, baselines, watched)?;
-    let mut scores = SetScores::new(baselines.methods(), &scores, &watched.bootstrap);
+    let windows_scored = score::score(loaded, dataset, &windows, baselines, watched)?;
+    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &watched.bootstrap);
+    if baselines.are_of_benchmark() {
+        metrics::add_benchmark(&mut scores.methods, &windows_scored, spec.pixels());
+    }
     scores.windows_available = available.len();
     if spec.action_inputs().is_some() {
         let errors = actions::compare(loaded, &config.twins, dataset, &windows, watched)?;

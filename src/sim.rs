@@ -17,6 +17,7 @@ pub mod config;
 mod driver;
 pub mod environment;
 mod error;
+pub mod moving_digits;
 mod navigator;
 mod physics;
 pub mod pid;

@@ -1,16 +1,19 @@
 //! `foreframe collect`
 
+use std::fmt;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use clap::value_parser;
 
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, interrupt, print_line, progress::ProgressLine};
-use crate::dataset::collect::{CollectConfig, collect};
+use crate::dataset::collect::{CollectConfig, CollectProgress, collect};
+use crate::dataset::moving_mnist::{DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits};
 use crate::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
 use crate::jobs::spec::MAX_TRIALS;
-use crate::sim::{Look, Scenario, WorldConfig};
+use crate::sim::{Look, Scenario, SimError, WorldConfig};
 use crate::training::TrainConfig;
 use crate::training::config::WindowBudget;
 use crate::types::Seed;
@@ -22,20 +25,59 @@ const MAX_COUNTED_BYTES: u64 = 400 << 20;
 /// Trials that are enough for a training.
 const ENOUGH_TRIALS: u64 = 40;
 
+/// What to collect.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum CollectSubject {
+    /// A simulated scenario.
+    Simulated(Scenario),
+    /// Digits that move.
+    MovingMnist,
+}
+
+impl FromStr for CollectSubject {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        if name == MOVING_MNIST {
+            return Ok(Self::MovingMnist);
+        }
+        let scenario = name.parse().map(Self::Simulated);
+        scenario.map_err(|error: SimError| format!("{error}, {MOVING_MNIST}"))
+    }
+}
+
+impl fmt::Display for CollectSubject {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Simulated(scenario) => scenario.fmt(out),
+            Self::MovingMnist => out.write_str(MOVING_MNIST),
+        }
+    }
+}
+
 /// Simulate trials and store their frames, actions and states as a data set.
 ///
 /// The data set is stored as Parquet files in the LeRobot v3 layout. Ctrl-C keeps the trials that are finished; the same
-/// command continues, and the result is the same as without the interruption.
+/// command continues, and the result is the same as without the interruption. Of moving-mnist, the last tenth of the trials is
+/// the test split, with digits of their own, and the tenth before it the validation split.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe collect --trials 200
   foreframe collect --scenario moving-observer --trials 500
-  foreframe collect --trials 60 --seed 2 --out data/datasets/small")]
+  foreframe collect --trials 60 --seed 2 --out data/datasets/small
+  foreframe collect --scenario moving-mnist --digits mnist/ --trials 10000")]
 pub(super) struct CollectArgs {
-    /// static-observer (the camera stands, one robot drives), moving-observer (the camera robot drives too) or crowded
-    /// (several robots drive)
+    /// static-observer (the camera stands, one robot drives), moving-observer (the camera robot drives too), crowded
+    /// (several robots drive) or moving-mnist (two digits move over a black square; needs --digits)
     #[arg(long, default_value = "static-observer")]
-    scenario: Scenario,
+    scenario: CollectSubject,
+    /// For moving-mnist: an IDX file of digits (.gz or not), a folder with MNIST's train-images and t10k-images files, or a
+    /// folder of 28×28 PNG images
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["frame_size", "noise", "look", "threads"])]
+    digits: Option<PathBuf>,
+    /// For moving-mnist: frames of a trial
+    #[arg(long, requires = "digits", default_value_t = DEFAULT_FRAMES as u16, value_parser = value_parser!(u16).range(2..=MAX_FRAMES as i64))]
+    frames: u16,
     /// How many trials to simulate
     #[arg(long, default_value_t = 1000, value_parser = value_parser!(u64).range(1..=MAX_TRIALS))]
     trials: u64,
@@ -67,20 +109,37 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
         Some(out) => out.clone(),
         None => workspace.datasets_dir().join(args.scenario.to_string()),
     };
-    let mut config = CollectConfig::new(args.scenario, args.trials, Seed(args.seed), &out);
-    config.world.frame_width_px = args.frame_size;
-    config.world.frame_height_px = args.frame_size;
-    config.world.camera.noise_std = args.noise;
-    config.world.look = args.look;
-    config.threads = args.threads.unwrap_or_default().into();
-    config.validate()?;
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("trials"));
-    progress.label(&format!("collecting {}", config.scenario));
-    let collected = collect(
-        &config,
-        &|now| progress.update(now.done, now.total, String::new),
-        &cancelled,
-    );
+    progress.label(&format!("collecting {}", args.scenario));
+    let on_progress = |now: CollectProgress| progress.update(now.done, now.total, String::new);
+    let collected = match (args.scenario, &args.digits) {
+        (CollectSubject::Simulated(scenario), None) => {
+            let config = simulation(args, scenario, &out);
+            config.validate()?;
+            collect(&config, &on_progress, &cancelled)
+        }
+        (CollectSubject::MovingMnist, Some(digits)) => {
+            let config = MovingMnistConfig {
+                digits: digits.clone(),
+                trials: args.trials,
+                frames: args.frames.into(),
+                seed: Seed(args.seed),
+                out: out.clone(),
+            };
+            collect_digits(&config, &on_progress, &cancelled)
+        }
+        (CollectSubject::Simulated(scenario), Some(_)) => {
+            return Err(CliError::Usage(format!(
+                "--digits is for --scenario {MOVING_MNIST}; {scenario} is simulated without digits"
+            )));
+        }
+        (CollectSubject::MovingMnist, None) => {
+            return Err(CliError::Usage(format!(
+                "--scenario {MOVING_MNIST} needs --digits: a folder with train-images-idx3-ubyte.gz and \
+                 t10k-images-idx3-ubyte.gz, or with PNG images"
+            )));
+        }
+    };
     progress.finish();
     match collected {
         Ok(info) => {
@@ -100,12 +159,24 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     }
 }
 
+/// The collection of a simulated scenario.
+fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConfig {
+    let mut config = CollectConfig::new(scenario, args.trials, Seed(args.seed), out);
+    config.world.frame_width_px = args.frame_size;
+    config.world.frame_height_px = args.frame_size;
+    config.world.camera.noise_std = args.noise;
+    config.world.look = args.look;
+    config.threads = args.threads.unwrap_or_default().into();
+    config
+}
+
 /// A training command that works on the data set, or what to do if it is too small to train on.
 fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<String, CliError> {
     let presets: &[&str] = match args.scenario {
-        Scenario::StaticObserver => &["paper", "static"],
-        Scenario::MovingObserver => &["moving"],
-        Scenario::Crowded => &["static"],
+        CollectSubject::Simulated(Scenario::StaticObserver) => &["paper", "static"],
+        CollectSubject::Simulated(Scenario::MovingObserver) => &["moving"],
+        CollectSubject::Simulated(Scenario::Crowded) => &["static"],
+        CollectSubject::MovingMnist => &[MOVING_MNIST],
     };
     let is_large = info.decoded_bytes() > MAX_COUNTED_BYTES;
     let dataset = (!is_large).then(|| Dataset::open(out)).transpose()?;
@@ -117,6 +188,13 @@ fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<Strin
         {
             return Ok(format!("foreframe train --preset {preset} --dataset {}", out.display()));
         }
+    }
+    if args.scenario == CollectSubject::MovingMnist && usize::from(args.frames) < DEFAULT_FRAMES {
+        return Ok(format!(
+            "collect longer trials into another directory, as with --frames {DEFAULT_FRAMES}; those of {} frames are too short to \
+             train on",
+            args.frames
+        ));
     }
     let trials = ENOUGH_TRIALS.max(args.trials + 1);
     Ok(format!(

@@ -20,7 +20,8 @@ use crate::types::Seed;
 #[command(after_help = "Examples:
   foreframe evaluate --model paper --dataset static-observer
   foreframe evaluate --model runs/moving/model --twin runs/plain/model --out reports/moving
-  foreframe evaluate --model mine@2 --dataset small --data-dir /var/lib/foreframe")]
+  foreframe evaluate --model mine@2 --dataset small --data-dir /var/lib/foreframe
+  foreframe evaluate --model runs/moving-mnist/model --dataset mnist-test-seq --split all")]
 pub(super) struct EvaluateArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
@@ -39,7 +40,7 @@ pub(super) struct EvaluateArgs {
     /// and resized; may be given several times
     #[arg(long, value_name = "DATASET")]
     novel_dataset: Vec<PathBuf>,
-    /// What to score: the validation split, or the test sets
+    /// What to score
     #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
     split: SplitChoice,
     /// Windows of each set at most, spread evenly over its trials
@@ -68,6 +69,8 @@ enum SplitChoice {
     Validation,
     /// The test sets, for the final numbers
     Test,
+    /// Every window of a data set that holds nothing but test data, such as the published file of a benchmark
+    All,
 }
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
@@ -94,6 +97,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         purpose: match args.split {
             SplitChoice::Validation => Purpose::Validation,
             SplitChoice::Test => Purpose::Test,
+            SplitChoice::All => Purpose::WholeSet,
         },
         max_windows: args.windows,
         bootstrap_samples: args.resamples,

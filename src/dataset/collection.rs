@@ -38,9 +38,7 @@ impl Arguments<'_> {
             trials_per_shard: config.trials_per_shard,
             world: &config.world,
         };
-        let text = serde_json::to_string_pretty(&arguments);
-        text.map(|text| text + "\n")
-            .map_err(|error| DatasetError::Description(error.to_string()))
+        arguments_text(&arguments)
     }
 }
 
@@ -63,19 +61,8 @@ impl CollectionStatus {
     /// Errors: `OutExists`, `OtherArguments`, as [`super::collect()`].
     pub fn of(config: &CollectConfig) -> Result<Self, DatasetError> {
         let out = &config.out;
-        let Some(found) = read_arguments(out)? else {
-            return if is_unused(out, ARGUMENTS)? {
-                Ok(Self::New)
-            } else {
-                Err(DatasetError::OutExists { path: out.clone() })
-            };
-        };
-        let wanted = Arguments::text(config)?;
-        if found != wanted {
-            return Err(DatasetError::OtherArguments {
-                path: out.clone(),
-                differences: differences(&found, &wanted),
-            });
+        if !has_arguments(out, &Arguments::text(config)?)? {
+            return Ok(Self::New);
         }
         if out.join(INFO).exists() {
             return Ok(Self::Finished(Box::new(DatasetMetadata::read(out)?.info_in(out)?)));
@@ -94,6 +81,51 @@ impl CollectionStatus {
             trials: in_shards + beside,
         })
     }
+}
+
+/// The arguments that determine a data set's bytes, as they are written to its directory. Errors: `Description`.
+pub(super) fn arguments_text(arguments: &impl Serialize) -> Result<String, DatasetError> {
+    let text = serde_json::to_string_pretty(arguments);
+    text.map(|text| text + "\n")
+        .map_err(|error| DatasetError::Description(error.to_string()))
+}
+
+/// Whether a directory was begun with these arguments; false for an unused one. Errors: `OutExists`, `OtherArguments`, `Io`.
+pub(super) fn has_arguments(out: &Path, wanted: &str) -> Result<bool, DatasetError> {
+    match read_arguments(out)? {
+        Some(found) if found == wanted => Ok(true),
+        Some(found) => Err(DatasetError::OtherArguments {
+            path: out.to_owned(),
+            differences: differences(&found, wanted),
+        }),
+        None if is_unused(out, ARGUMENTS)? => Ok(false),
+        None => Err(DatasetError::OutExists { path: out.to_owned() }),
+    }
+}
+
+/// Writes the arguments to a new directory, and locks it while this process writes the data set. Errors: `Busy`, `Io`.
+pub(super) fn lock(out: &Path, arguments: &str) -> Result<File, DatasetError> {
+    let path = out.join(ARGUMENTS);
+    if !path.exists() {
+        write_atomically(&path, arguments.as_bytes())?;
+    }
+    let lock = File::open(&path).map_err(DatasetError::io("read", &path))?;
+    try_lock(&lock).map_err(|error| match error {
+        TryLockError::WouldBlock => DatasetError::Busy { path: out.to_owned() },
+        TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
+    })?;
+    remove_stale_partials(out);
+    Ok(lock)
+}
+
+/// A shard that an earlier call wrote, with this number of trials; none if it is missing or damaged.
+pub(super) fn finished_shard(out: &Path, shard: usize, trials: usize) -> Option<FinishedShard> {
+    let path = out.join(shard_path(shard));
+    let finished = FinishedShard {
+        records: records(&path).ok()?,
+        sha256: sha256_of_file(&path).ok()?,
+    };
+    (finished.records.len() == trials).then_some(finished)
 }
 
 fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
@@ -146,18 +178,7 @@ pub(super) struct Collection<'a> {
 impl<'a> Collection<'a> {
     /// Locks a new or unfinished collection's directory and finds its finished shards. Errors: `Busy`, `Io`.
     pub(super) fn open(config: &'a CollectConfig) -> Result<Self, DatasetError> {
-        let path = config.out.join(ARGUMENTS);
-        if !path.exists() {
-            write_atomically(&path, Arguments::text(config)?.as_bytes())?;
-        }
-        let lock = File::open(&path).map_err(DatasetError::io("read", &path))?;
-        try_lock(&lock).map_err(|error| match error {
-            TryLockError::WouldBlock => DatasetError::Busy {
-                path: config.out.clone(),
-            },
-            TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
-        })?;
-        remove_stale_partials(&config.out);
+        let lock = lock(&config.out, &Arguments::text(config)?)?;
         let mut collection = Self {
             info: description(config),
             config,
@@ -213,10 +234,7 @@ impl<'a> Collection<'a> {
         if shard >= self.config.shard_count() {
             return None;
         }
-        let path = self.config.out.join(shard_path(shard));
-        let records = records(&path).ok()?;
-        let sha256 = sha256_of_file(&path).ok()?;
-        (records.len() == self.config.shard_trials(shard).count()).then_some(FinishedShard { sha256, records })
+        finished_shard(&self.config.out, shard, self.config.shard_trials(shard).count())
     }
 
     fn push(&mut self, shard: FinishedShard) {

@@ -268,6 +268,14 @@ pub enum DatasetError {
         /// The simulator's error.
         source: SimError,
     },
+    /// The file or folder of digits cannot be used.
+    #[error("{} cannot be used as digits: {reason}", path.display())]
+    Digits {
+        /// The file or folder.
+        path: PathBuf,
+        /// What was wrong, and what would be right.
+        reason: String,
+    },
     /// The collection is not complete.
     #[error(
         "the data set in {path} is unfinished; run the same `foreframe collect` or `foreframe import` again to resume it: {arguments}",

@@ -161,7 +161,9 @@ impl DatasetMetadata {
 /// The part of a collection's arguments that is used later.
 #[derive(Deserialize)]
 struct CollectedWith {
-    world: WorldConfig,
+    /// None where no world was simulated.
+    #[serde(default)]
+    world: Option<WorldConfig>,
 }
 
 /// The world settings of a collection; `None` for other data sets. Errors: `Corrupt`, `Io`.
@@ -175,7 +177,7 @@ fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError
         path,
         reason: error.to_string(),
     })?;
-    Ok(Some(arguments.world))
+    Ok(arguments.world)
 }
 
 /// The SHA-256 of the shards' hexadecimal hashes, one after another, in hexadecimal.

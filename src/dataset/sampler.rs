@@ -126,6 +126,20 @@ impl Splits {
         splits
     }
 
+    /// Every episode in the test split, for a data set that holds nothing but test data.
+    #[must_use]
+    pub fn all_for_test(dataset: &Dataset) -> Self {
+        let mut splits = Self {
+            episodes: Default::default(),
+            segments: Default::default(),
+            max_step_s: GAP_PERIODS * median_period_s(dataset),
+        };
+        for episode in dataset.episodes() {
+            splits.add(dataset, Split::Test, episode.index, &episode.frames());
+        }
+        splits
+    }
+
     /// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
     /// them, with at least a tenth, for validation; the others for training.
     fn add_whole_episodes(&mut self, dataset: &Dataset) {

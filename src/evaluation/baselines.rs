@@ -1,15 +1,15 @@
-//! The simple predictors that a model must beat, and the names of all that is compared in a table.
+//! The simple predictors that a model must beat.
 
 mod affine_flow;
 mod cut_out;
 mod ego_motion;
+mod method;
 mod nearest;
-
-use serde::{Deserialize, Serialize};
 
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
+pub use self::method::Method;
 use self::nearest::TrainingWindows;
 use super::EvaluationError;
 use super::score::{evenly, training_mean};
@@ -17,72 +17,6 @@ use crate::dataset::sampler::{Split, Splits, WindowShape};
 use crate::dataset::{Dataset, DatasetError, Window};
 use crate::frame::motion::{Shift, phase_correlation, shifted};
 use crate::frame::preprocess::scale;
-
-/// One row of a table: who made the prediction.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Method {
-    /// The model under test.
-    Model,
-    /// The last input frame, repeated.
-    CopyLast,
-    /// The mean of the input frames, repeated.
-    MeanOfInputs,
-    /// The mean of all frames of the training split, repeated.
-    MeanTrainingFrame,
-    /// The least-squares line through each pixel's inputs, continued and clamped to 0…1.
-    LinearExtrapolation,
-    /// The last frame moved on by the shift between the last two inputs (phase correlation).
-    ConstantShift,
-    /// The last frame warped by the camera's own motion, which follows from the commanded actions.
-    EgoMotion,
-    /// The moving object cut out of the last frame and moved on at constant velocity over the background.
-    MovingCutOut,
-    /// The future of the training window whose inputs differ least.
-    NearestWindow,
-    /// The true future frame through the model's own frame encoder and decoder: about the best it can draw. It reads
-    /// them smoothed; a prediction that learnt to sharpen can come out better.
-    CodecOnly,
-}
-
-impl Method {
-    /// All rows, in the order of the tables.
-    pub const ALL: [Self; 10] = [
-        Self::Model,
-        Self::CopyLast,
-        Self::MeanOfInputs,
-        Self::MeanTrainingFrame,
-        Self::LinearExtrapolation,
-        Self::ConstantShift,
-        Self::EgoMotion,
-        Self::MovingCutOut,
-        Self::NearestWindow,
-        Self::CodecOnly,
-    ];
-
-    /// Whether it predicts without a model.
-    #[must_use]
-    pub fn is_baseline(self) -> bool {
-        !matches!(self, Self::Model | Self::CodecOnly)
-    }
-
-    /// The row's name in words.
-    #[must_use]
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::Model => "model",
-            Self::CopyLast => "copy last frame",
-            Self::MeanOfInputs => "mean of the inputs",
-            Self::MeanTrainingFrame => "mean training frame",
-            Self::LinearExtrapolation => "linear extrapolation",
-            Self::ConstantShift => "constant global shift",
-            Self::EgoMotion => "commanded ego-motion",
-            Self::MovingCutOut => "moving cut-out",
-            Self::NearestWindow => "nearest training window",
-            Self::CodecOnly => "codec on the true frame",
-        }
-    }
-}
 
 /// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
 #[derive(Clone, Debug)]
@@ -147,6 +81,7 @@ impl Baselines {
         let methods = Method::ALL.into_iter().filter(|method| match method {
             Method::EgoMotion => ego_motion.is_some(),
             Method::NearestWindow => nearest.is_some(),
+            Method::Black => false,
             _ => true,
         });
         Ok(Self {
@@ -164,6 +99,20 @@ impl Baselines {
     pub fn without(mut self, method: Method) -> Self {
         self.methods.retain(|&other| other != method);
         self
+    }
+
+    /// The same with what a benchmark of mostly black frames adds: the black frame, and the scores that its papers print.
+    #[must_use]
+    pub fn for_benchmark(mut self) -> Self {
+        let codec = self.methods.iter().position(|&method| method == Method::CodecOnly);
+        self.methods.insert(codec.unwrap_or(self.methods.len()), Method::Black);
+        self
+    }
+
+    /// Whether the scores of published benchmarks are computed too.
+    #[must_use]
+    pub fn are_of_benchmark(&self) -> bool {
+        self.methods.contains(&Method::Black)
     }
 
     /// The rows of the tables: the model, the baselines that apply to this data set, the codec.
@@ -200,6 +149,7 @@ impl Baselines {
                 Some(windows) => windows.predict(dataset, input.inputs, horizon)?,
                 None => Vec::new(),
             },
+            Method::Black => vec![vec![0.0; last.len()]; horizon],
             Method::Model | Method::CodecOnly => Vec::new(),
         })
     }

@@ -58,6 +58,17 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
     Ok(())
 }
 
+/// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.
+pub fn check_untrained(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), EvaluationError> {
+    if loaded.manifest.dataset.content_hash == dataset.info().content_hash {
+        return Err(EvaluationError::TrainedOn {
+            model: loaded.manifest.name.clone(),
+            dataset: dataset.info().name.clone(),
+        });
+    }
+    Ok(())
+}
+
 /// The seed of the split to test with: that of the model's training, unless another is asked for.
 /// Errors: `SplitSeed` where that would test on training data.
 pub fn split_seed(loaded: &LoadedModel, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {

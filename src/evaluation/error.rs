@@ -13,6 +13,16 @@ use crate::types::ValueError;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum EvaluationError {
+    /// The model was trained on the data set that is to be scored as a whole.
+    #[error(
+        "model \"{model}\" was trained on data set \"{dataset}\", so not all of it can test the model; score its test split"
+    )]
+    TrainedOn {
+        /// The model's name.
+        model: String,
+        /// The data set's name.
+        dataset: String,
+    },
     /// The frames have another size.
     #[error(
         "data set \"{dataset}\" has frames of {width}×{height} px; model \"{model}\" takes {wanted_width}×{wanted_height}"

@@ -65,6 +65,13 @@ fn headline(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
             "These are validation scores, for choosing between models and settings. Publish test scores.\n"
         )?;
     }
+    if report.stamp.purpose == Purpose::WholeSet {
+        writeln!(
+            out,
+            "All of the data set is for testing. The mean frame and the background of the baselines are its own, and there is \
+             no nearest training window.\n"
+        )?;
+    }
     writeln!(
         out,
         "| Set | Windows | Trials | Skill | 95 % interval | MSE | MSE on moving robots | SSIM | Strongest baseline (MSE) |"
@@ -145,6 +152,7 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
         |row| Some(&row.ssim),
         |value| format!("{value:.4}"),
     )?;
+    benchmark_tables(out, methods)?;
     if methods.iter().any(|row| row.mover_mse.is_some()) {
         let name = "MSE on the pixels of moving robots, ×10⁻⁴";
         table(out, name, methods, |row| row.mover_mse.as_ref(), in_mse_units)?;
@@ -174,6 +182,32 @@ fn set_section(out: &mut String, scores: &SetScores) -> std::fmt::Result {
     scores.plans.as_ref().map_or(Ok(()), |plans| plan_section(out, plans))?;
     let uncertainty = scores.uncertainty.as_ref();
     uncertainty.map_or(Ok(()), |scores| uncertainty::section(out, scores))
+}
+
+/// The scores that papers on Moving MNIST print, where they were computed.
+fn benchmark_tables(out: &mut String, methods: &[MethodScores]) -> std::fmt::Result {
+    if methods.iter().all(|row| row.benchmark.is_none()) {
+        return Ok(());
+    }
+    writeln!(
+        out,
+        "As papers on Moving MNIST print them: squared errors summed over the pixels of a frame, and SSIM with scikit-image's \
+         even windows of 7×7 px for a data range of 1.\n"
+    )?;
+    table(
+        out,
+        "Squared error, sum over a frame",
+        methods,
+        |row| row.benchmark.as_ref().map(|scores| &scores.squared_error),
+        |value| format!("{value:.1}"),
+    )?;
+    table(
+        out,
+        "SSIM, even 7×7 windows",
+        methods,
+        |row| row.benchmark.as_ref().map(|scores| &scores.ssim),
+        |value| format!("{value:.4}"),
+    )
 }
 
 fn plan_section(out: &mut String, plans: &PlanOutcome) -> std::fmt::Result {

@@ -55,7 +55,7 @@ impl EvaluationReport {
             let Some(scores) = set.outcome.scores() else { continue };
             let Some(model) = scores.methods.first() else { continue };
             let interval = scores.skill.mean_interval.as_ref();
-            let summary = json!({
+            let mut summary = json!({
                 "skill": scores.skill.skill.mean,
                 "strongest_baseline": scores.skill.best_mean_baseline,
                 "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
@@ -69,6 +69,10 @@ impl EvaluationReport {
                 "trials": scores.trials,
                 "dataset_content_hash": self.stamp.dataset_content_hash,
             });
+            if let Some(benchmark) = &model.benchmark {
+                summary["squared_error_per_frame"] = json!(benchmark.squared_error.mean);
+                summary["ssim_even_windows"] = json!(benchmark.ssim.mean);
+            }
             headline.insert(set.split.clone(), summary);
         }
         Value::Object(headline)

@@ -97,8 +97,13 @@ fn score_window(
             };
             let compared = predictions.iter().zip(&truth).zip(&masks);
             let score = compared.map(|((prediction, pixels), mask)| {
-                let mask = mask.as_deref();
-                FrameScore::of(prediction, &TargetFrame { pixels, mask, width })
+                let target = TargetFrame {
+                    pixels,
+                    mask: mask.as_deref(),
+                    width,
+                    for_benchmark: baselines.are_of_benchmark(),
+                };
+                FrameScore::of(prediction, &target)
             });
             Ok(score.collect())
         })

@@ -9,6 +9,9 @@ const SSIM_SIGMA_PX: f32 = 1.5;
 const SSIM_C1: f32 = 0.01 * 0.01;
 const SSIM_C2: f32 = 0.03 * 0.03;
 
+/// Side of the even window of scikit-image.
+const EVEN_WINDOW_PX: usize = 7;
+
 /// Mean squared error per pixel.
 #[must_use]
 pub fn mse(a: &[f32], b: &[f32]) -> f64 {
@@ -27,6 +30,48 @@ pub fn psnr_db(mse: f64) -> f64 {
 #[must_use]
 pub fn ssim(a: &[f32], b: &[f32], width: usize) -> f64 {
     SsimTerms::new(a, b, width).sum() / a.len().max(1) as f64
+}
+
+/// Structural similarity as scikit-image computes it by default (for a data range of 1): even windows of 7×7 px instead of
+/// Gaussian ones, sample variances, averaged over the windows that lie inside the image. Benchmarks are published with it.
+/// NaN for images with a side below 7 px.
+#[must_use]
+pub fn ssim_even(a: &[f32], b: &[f32], width: usize) -> f64 {
+    let window_mean = |p: &[f32], q: Option<&[f32]>| -> Vec<f64> {
+        let values: Vec<f64> = match q {
+            Some(q) => p.iter().zip(q).map(|(p, q)| f64::from(*p) * f64::from(*q)).collect(),
+            None => p.iter().map(|&p| f64::from(p)).collect(),
+        };
+        even_means(&values, width)
+    };
+    let count = (EVEN_WINDOW_PX * EVEN_WINDOW_PX) as f64;
+    let sample = count / (count - 1.0);
+    let [mean_a, mean_b] = [window_mean(a, None), window_mean(b, None)];
+    let [aa, bb, ab] = [(a, a), (b, b), (a, b)].map(|(p, q)| window_mean(p, Some(q)));
+    let (c1, c2) = (f64::from(SSIM_C1), f64::from(SSIM_C2));
+    let sum: f64 = (0..mean_a.len())
+        .map(|at| {
+            let (ma, mb) = (mean_a[at], mean_b[at]);
+            let variances = sample * (aa[at] - ma * ma + bb[at] - mb * mb);
+            let covariance = sample * (ab[at] - ma * mb);
+            (2.0 * ma * mb + c1) * (2.0 * covariance + c2) / ((ma * ma + mb * mb + c1) * (variances + c2))
+        })
+        .sum();
+    sum / mean_a.len() as f64
+}
+
+/// The mean of every window of 7×7 px that lies inside the image.
+fn even_means(values: &[f64], width: usize) -> Vec<f64> {
+    let along: Vec<f64> = values
+        .chunks_exact(width)
+        .flat_map(|row| row.windows(EVEN_WINDOW_PX).map(|window| window.iter().sum::<f64>()))
+        .collect();
+    let columns = (width + 1).saturating_sub(EVEN_WINDOW_PX).max(1);
+    let rows: Vec<&[f64]> = along.chunks_exact(columns).collect();
+    let area = (EVEN_WINDOW_PX * EVEN_WINDOW_PX) as f64;
+    rows.windows(EVEN_WINDOW_PX)
+        .flat_map(|window| (0..columns).map(move |column| window.iter().map(|row| row[column]).sum::<f64>() / area))
+        .collect()
 }
 
 /// What the structural similarity of two images is made of at each pixel.

@@ -108,6 +108,7 @@ const USED_IN: &[(&str, &[&str])] = &[
     ("tokio", &["server", "jobs", "versions", "store", "serving", "cli"]),
     ("sqlx", &["store"]),
     ("rusqlite", &["dataset"]),
+    ("flate2::", &["dataset"]),
     ("zip::", &["dataset"]),
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
