@@ -102,7 +102,13 @@ fn requests_are_counted_by_route_and_logged_with_ids() {
     )
     .unwrap();
     stream.read_to_end(&mut Vec::new()).unwrap();
-    let metrics = server.get("/metrics");
+    // A batch is recorded after its answers; this is its last metric.
+    let recorded = "foreframe_prediction_queue_wait_seconds_count{model=\"plain\"} 1";
+    let deadline = Instant::now() + TIMEOUT;
+    let mut metrics = server.get("/metrics");
+    while !metrics.contains(recorded) && Instant::now() < deadline {
+        metrics = server.get("/metrics");
+    }
     for line in [
         "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"200\"} 1",
         "foreframe_http_requests_total{method=\"GET\",route=\"/v1/models/{model}\",status=\"404\"} 2",
