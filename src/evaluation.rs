@@ -68,6 +68,14 @@ impl Purpose {
             Self::WholeSet => &[Split::Test],
         }
     }
+
+    /// How the data set is split for it.
+    fn split(self, dataset: &Dataset, seed: Seed) -> Splits {
+        match self {
+            Self::WholeSet => Splits::all_for_test(dataset),
+            Self::Validation | Self::Test => Splits::new(dataset, seed),
+        }
+    }
 }
 
 /// What to test on, and how closely.
@@ -232,13 +240,10 @@ pub fn run(
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
-    let splits = match config.purpose {
-        Purpose::WholeSet => {
-            compatible::check_untrained(loaded, dataset)?;
-            Splits::all_for_test(dataset)
-        }
-        _ => Splits::new(dataset, split_seed),
-    };
+    if config.purpose == Purpose::WholeSet {
+        compatible::check_untrained(loaded, dataset)?;
+    }
+    let splits = config.purpose.split(dataset, split_seed);
     let tests = config.purpose.splits();
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {

@@ -8,7 +8,7 @@ use super::inference::{ActionSource, predict, reconstruct};
 use super::markdown::set_title;
 use super::report::{EvaluationReport, SampleWindow, SetScores};
 use crate::dataset::Dataset;
-use crate::dataset::sampler::{Split, Splits, WindowShape};
+use crate::dataset::sampler::{Split, WindowShape};
 use crate::frame::Frame;
 use crate::registry::LoadedModel;
 
@@ -102,7 +102,7 @@ fn animate(
         context: spec.context,
         horizon: spec.horizon,
     };
-    let splits = Splits::new(dataset, report.stamp.split_seed);
+    let splits = report.stamp.purpose.split(dataset, report.stamp.split_seed);
     let mut windows = splits.windows(dataset, split, shape, 1)?;
     windows.retain(|window| window.episode == median.episode);
     windows.truncate(MAX_MOMENTS);
