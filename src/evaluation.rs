@@ -70,7 +70,7 @@ impl Purpose {
     }
 
     /// How the data set is split for it.
-    fn split(self, dataset: &Dataset, seed: Seed) -> Splits {
+    fn divide(self, dataset: &Dataset, seed: Seed) -> Splits {
         match self {
             Self::WholeSet => Splits::all_for_test(dataset),
             Self::Validation | Self::Test => Splits::new(dataset, seed),
@@ -243,7 +243,7 @@ pub fn run(
     if config.purpose == Purpose::WholeSet {
         compatible::check_untrained(loaded, dataset)?;
     }
-    let splits = config.purpose.split(dataset, split_seed);
+    let splits = config.purpose.divide(dataset, split_seed);
     let tests = config.purpose.splits();
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {

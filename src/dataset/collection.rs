@@ -7,13 +7,12 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::collect::CollectConfig;
-use super::files::{is_unused, sha256_of_file, write_atomically};
+use super::files::{is_unused, write_atomically};
 use super::layout::{ARGUMENTS, DatasetMetadata, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
-use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo, unfinished};
-use crate::files::{remove_stale_partials, sha256_hex, try_lock};
+use crate::files::{remove_stale_partials, try_lock};
 use crate::sim::{Scenario, WorldConfig, action_channels, state_channels};
 use crate::types::Seed;
 
@@ -109,23 +108,24 @@ pub(super) fn lock(out: &Path, arguments: &str) -> Result<File, DatasetError> {
     if !path.exists() {
         write_atomically(&path, arguments.as_bytes())?;
     }
-    let lock = File::open(&path).map_err(DatasetError::io("read", &path))?;
-    try_lock(&lock).map_err(|error| match error {
-        TryLockError::WouldBlock => DatasetError::Busy { path: out.to_owned() },
-        TryLockError::Error(source) => DatasetError::io("lock", &path)(source),
-    })?;
+    let lock = lock_file(&path, out)?;
     remove_stale_partials(out);
     Ok(lock)
 }
 
+/// Locks the file of the arguments of the data set in `out`. Errors: `Busy`, `Io`.
+pub(super) fn lock_file(path: &Path, out: &Path) -> Result<File, DatasetError> {
+    let file = File::open(path).map_err(DatasetError::io("read", path))?;
+    match try_lock(&file) {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(DatasetError::Busy { path: out.to_owned() }),
+        Err(TryLockError::Error(source)) => Err(DatasetError::io("lock", path)(source)),
+    }
+}
+
 /// A shard that an earlier call wrote, with this number of trials; none if it is missing or damaged.
 pub(super) fn finished_shard(out: &Path, shard: usize, trials: usize) -> Option<FinishedShard> {
-    let path = out.join(shard_path(shard));
-    let finished = FinishedShard {
-        records: records(&path).ok()?,
-        sha256: sha256_of_file(&path).ok()?,
-    };
-    (finished.records.len() == trials).then_some(finished)
+    FinishedShard::read(&out.join(shard_path(shard))).filter(|finished| finished.records.len() == trials)
 }
 
 fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
@@ -247,15 +247,8 @@ impl<'a> Collection<'a> {
 
     /// Writes the next shard.
     pub(super) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
-        let built = build(&self.info, self.start, episodes)?;
-        write_atomically(&self.config.out.join(shard_path(self.shards.len())), &built.bytes)?;
-        // Parse the text as a resumed run would, so that a resumed collection has the same digits.
-        let records =
-            serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
-        self.push(FinishedShard {
-            sha256: sha256_hex(&built.bytes),
-            records,
-        });
+        let path = self.config.out.join(shard_path(self.shards.len()));
+        self.push(FinishedShard::write(&path, &build(&self.info, self.start, episodes)?)?);
         Ok(())
     }
 

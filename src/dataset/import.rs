@@ -301,8 +301,8 @@ fn read_text(path: &Path) -> Result<String, ImportError> {
 /// Reads the records of a source, after finding out of which kind it is.
 fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
     let (source, options) = (&config.source, &config.options);
-    if !source.exists() {
-        return Err(ImportError::io("read", source)(std::io::ErrorKind::NotFound.into()));
+    if !source.is_dir() {
+        open_file(source)?;
     }
     if donkeycar::is_tub(source) {
         return donkeycar::open(source, options);

@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use rand::seq::IndexedRandom;
@@ -16,10 +16,8 @@ use serde::Serialize;
 use super::collect::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
 use super::collection::{arguments_text, finished_shard, has_arguments, lock};
 use super::digits::DigitPools;
-use super::files::{sha256_of_file, write_atomically};
 use super::layout::{DatasetMetadata, INFO, shard_path};
 use super::shard::{EncodedEpisode, ShardStart, build};
-use super::shard_reader::records;
 use super::store::{FinishedShard, complete};
 use super::{DatasetError, DatasetInfo, EpisodeData, Split};
 use crate::sim::moving_digits::{DIGITS_FRAME_SIDE_PX, moving_digits};
@@ -189,10 +187,5 @@ fn write_shard(
         .into_par_iter()
         .map(|trial| EncodedEpisode::new(info, trial as usize, config.trial(pools, trial)))
         .collect::<Result<_, _>>()?;
-    let path: &Path = &config.out.join(shard_path(shard));
-    write_atomically(path, &build(info, start, &episodes)?.bytes)?;
-    Ok(FinishedShard {
-        sha256: sha256_of_file(path)?,
-        records: records(path)?,
-    })
+    FinishedShard::write(&config.out.join(shard_path(shard)), &build(info, start, &episodes)?)
 }

@@ -7,12 +7,12 @@ use arrow_array::types::Int64Type;
 use rayon::prelude::*;
 
 use super::check::check_numbers;
-use super::files::{verify, write_atomically};
+use super::files::{sha256_of_file, verify, write_atomically};
 use super::frame_file::{FrameFile, FrameFilePlace};
 use super::frame_store::{FrameStore, HeldFrames};
 use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, ShardEntry, TASKS};
-use super::shard::EpisodeRecord;
-use super::shard_reader::{Column, FrameTarget, ShardNumbers, ShardSlot, batches, read};
+use super::shard::{EpisodeRecord, ShardBytes};
+use super::shard_reader::{Column, FrameTarget, ShardNumbers, ShardSlot, batches, read, records};
 use super::tables::{self, EpisodeRow};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, TrialParameters};
 use crate::files::sha256_hex;
@@ -183,6 +183,25 @@ pub(super) struct FinishedShard {
 }
 
 impl FinishedShard {
+    /// Writes a shard. Errors: `Io`, `Description`.
+    pub(super) fn write(path: &Path, built: &ShardBytes) -> Result<Self, DatasetError> {
+        write_atomically(path, &built.bytes)?;
+        // Parse the text as a resumed run would, so that a resumed data set has the same digits.
+        let records = serde_json::from_str(&built.records);
+        Ok(Self {
+            sha256: sha256_hex(&built.bytes),
+            records: records.map_err(|error| DatasetError::Description(error.to_string()))?,
+        })
+    }
+
+    /// A shard that was written before; none if it is missing or damaged.
+    pub(super) fn read(path: &Path) -> Option<Self> {
+        Some(Self {
+            records: records(path).ok()?,
+            sha256: sha256_of_file(path).ok()?,
+        })
+    }
+
     /// Number of frames in the shard.
     pub(super) fn frames(&self) -> usize {
         self.records.iter().map(|record| record.frames).sum()
@@ -299,11 +318,7 @@ mod tests {
         let start = ShardStart { episode: 0, frame: 0 };
         let mut built = build(&info(), start, &[encoded]).unwrap();
         change_bytes(&mut built.bytes);
-        let shard = FinishedShard {
-            sha256: sha256_hex(&built.bytes),
-            records: serde_json::from_str(&built.records).unwrap(),
-        };
-        write_atomically(&directory.path().join(layout::shard_path(0)), &built.bytes).unwrap();
+        let shard = FinishedShard::write(&directory.path().join(layout::shard_path(0)), &built).unwrap();
         complete(directory.path(), described, &[shard]).unwrap();
         Dataset::open(directory.path())
     }

@@ -102,7 +102,7 @@ fn animate(
         context: spec.context,
         horizon: spec.horizon,
     };
-    let splits = report.stamp.purpose.split(dataset, report.stamp.split_seed);
+    let splits = report.stamp.purpose.divide(dataset, report.stamp.split_seed);
     let mut windows = splits.windows(dataset, split, shape, 1)?;
     windows.retain(|window| window.episode == median.episode);
     windows.truncate(MAX_MOMENTS);

@@ -36,7 +36,7 @@ pub(super) struct PlannedFrame {
     pub(super) action: Vec<f32>,
 }
 
-/// Cuts a recording into episodes. Errors: `Record` if time does not grow, `Empty`.
+/// Cuts a recording into episodes. Errors: `Record` if time does not grow, `Option` if its steps are out of range, `Empty`.
 pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<ImportPlan, ImportError> {
     drop_backward_times(&mut recording, options)?;
     let records = &recording.records;
@@ -89,20 +89,18 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     })
 }
 
-/// Data sets store the times since the episode's start with 24 bits. Errors: `Record` if two of them would be the same.
+/// Data sets store the times since the episode's start with 24 bits. Errors: `Option` if two of them would be the same.
 fn check_stored_times(records: &[Record], frames: &[PlannedFrame]) -> Result<(), ImportError> {
     let time_s = |frame: &PlannedFrame| records[frame.record].timestamp_s;
     let since_start = |frame: &PlannedFrame| (time_s(frame) - time_s(&frames[0])) as f32;
     let mut pairs = frames.windows(2);
     match pairs.find(|pair| since_start(&pair[1]) <= since_start(&pair[0])) {
         None => Ok(()),
-        Some(pair) => Err(ImportError::record(
-            records[pair[1].record].place.clone(),
-            format!(
-                "its time is too near to the one before, {} s after the start of its episode; use fewer frames per second",
-                since_start(&pair[0])
-            ),
-        )),
+        Some(pair) => Err(ImportError::Option(format!(
+            "{}: its time is too near to the one before, {} s after the start of its episode; use fewer frames per second",
+            records[pair[1].record].place,
+            since_start(&pair[0])
+        ))),
     }
 }
 
@@ -117,40 +115,42 @@ fn longest_episode(options: &ImportOptions) -> usize {
 fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Result<(), ImportError> {
     let mut kept: Vec<Record> = Vec::with_capacity(recording.records.len());
     for record in std::mem::take(&mut recording.records) {
-        match kept.last() {
-            Some(last) if last.session == record.session && record.timestamp_s <= last.timestamp_s => {
-                let before = kept.len().checked_sub(2).map(|index| &kept[index]);
-                let fits = before
-                    .is_none_or(|before| before.session != record.session || before.timestamp_s < record.timestamp_s);
-                if options.skip_bad && fits && record.timestamp_s < last.timestamp_s {
-                    recording.skipped.push(SkippedItem {
-                        place: last.place.clone(),
-                        reason: format!(
-                            "its time {} s is not before the one after, {} s",
-                            last.timestamp_s, record.timestamp_s
-                        ),
-                    });
-                    kept.pop();
-                    kept.push(record);
-                    continue;
-                }
-                let error = ImportError::record(
-                    record.place.clone(),
-                    format!(
-                        "its time {} s is not after the one before, {} s; times must grow",
-                        record.timestamp_s, last.timestamp_s
-                    ),
-                );
-                match error.skippable().filter(|_| options.skip_bad) {
-                    Some(item) => recording.skipped.push(item),
-                    None => return Err(error),
-                }
-            }
-            _ => kept.push(record),
+        let last = kept.last().filter(|last| last.session == record.session);
+        let Some(last) = last.filter(|last| record.timestamp_s <= last.timestamp_s) else {
+            kept.push(record);
+            continue;
+        };
+        if options.skip_bad && record.timestamp_s < last.timestamp_s && fits_after(kept.iter().rev().nth(1), &record) {
+            recording.skipped.push(SkippedItem {
+                place: last.place.clone(),
+                reason: format!(
+                    "its time {} s is not before the one after, {} s",
+                    last.timestamp_s, record.timestamp_s
+                ),
+            });
+            kept.pop();
+            kept.push(record);
+            continue;
+        }
+        let error = ImportError::record(
+            record.place.clone(),
+            format!(
+                "its time {} s is not after the one before, {} s; times must grow",
+                record.timestamp_s, last.timestamp_s
+            ),
+        );
+        match error.skippable().filter(|_| options.skip_bad) {
+            Some(item) => recording.skipped.push(item),
+            None => return Err(error),
         }
     }
     recording.records = kept;
     Ok(())
+}
+
+/// Whether the record's time may follow that of `before`.
+fn fits_after(before: Option<&Record>, record: &Record) -> bool {
+    before.is_none_or(|before| before.session != record.session || before.timestamp_s < record.timestamp_s)
 }
 
 fn median_period(records: &[Record]) -> Option<f64> {

@@ -1,7 +1,7 @@
 //! Writes the planned episodes as shards. What is on disk depends on the source and the options alone, so an import that was
 //! killed continues after its last whole shard.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -10,16 +10,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::super::files::{is_unused, sha256_of_file, write_atomically};
+use super::super::collection::lock_file;
+use super::super::files::{is_unused, write_atomically};
 use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use super::super::shard::{EncodedEpisode, ShardStart, build};
-use super::super::shard_reader::records;
 use super::super::store::{FinishedShard, complete};
-use super::super::{DatasetError, DatasetInfo, EpisodeData};
+use super::super::{DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording};
 use super::timing::{ImportPlan, PlannedFrame};
 use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
-use crate::files::{remove_partials, sha256_hex, try_lock};
+use crate::files::remove_partials;
 use crate::frame::fit::fit;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.
@@ -49,14 +49,18 @@ impl<'a> Directory<'a> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
         // The file may be replaced, so the old one is locked first: another import may still use it.
-        let old = if path.is_file() { Some(lock(&path, out)?) } else { None };
+        let old = if path.is_file() {
+            Some(lock_file(&path, out)?)
+        } else {
+            None
+        };
         let lock = match (Self::check(config)?, old) {
             (None, Some(lock)) => lock,
             (text, _) => {
                 if let Some(text) = text {
                     write_atomically(&path, text.as_bytes())?;
                 }
-                lock(&path, out)?
+                lock_file(&path, out)?
             }
         };
         remove_partials(out);
@@ -194,16 +198,6 @@ impl<'a> Directory<'a> {
     }
 }
 
-/// Locks the file of the arguments. Errors: `Dataset` (busy), `Io`.
-fn lock(path: &Path, out: &Path) -> Result<File, ImportError> {
-    let file = File::open(path).map_err(ImportError::io("read", path))?;
-    match try_lock(&file) {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(ImportError::Dataset(DatasetError::Busy { path: out.to_owned() })),
-        Err(TryLockError::Error(source)) => Err(ImportError::io("lock", path)(source)),
-    }
-}
-
 /// How many shards an unfinished import has written.
 pub(super) fn saved_shards(out: &Path) -> usize {
     let mut shards = 0;
@@ -251,10 +245,9 @@ struct ShardWriter<'a> {
 impl ShardWriter<'_> {
     /// Takes the next shard from disk if an earlier run wrote it.
     fn resume(&mut self) -> bool {
-        let path = self.out.join(shard_path(self.written.len()));
-        let found = records(&path).ok().zip(sha256_of_file(&path).ok());
-        found.is_some_and(|(records, sha256)| {
-            self.push(FinishedShard { sha256, records });
+        let found = FinishedShard::read(&self.out.join(shard_path(self.written.len())));
+        found.is_some_and(|shard| {
+            self.push(shard);
             true
         })
     }
@@ -268,14 +261,8 @@ impl ShardWriter<'_> {
     }
 
     fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), ImportError> {
-        let built = build(self.info, self.start, episodes)?;
-        write_atomically(&self.out.join(shard_path(self.written.len())), &built.bytes)?;
-        let records =
-            serde_json::from_str(&built.records).map_err(|error| DatasetError::Description(error.to_string()))?;
-        self.push(FinishedShard {
-            sha256: sha256_hex(&built.bytes),
-            records,
-        });
+        let path = self.out.join(shard_path(self.written.len()));
+        self.push(FinishedShard::write(&path, &build(self.info, self.start, episodes)?)?);
         Ok(())
     }
 

@@ -39,7 +39,7 @@ fn uri(path: &Path) -> PathBuf {
     PathBuf::from(format!("file:{root}{escaped}{option}"))
 }
 
-/// Tables whose rows are computed could have no end. Errors: `Record`.
+/// Tables whose rows are computed could have no end. Errors: `Option`; `Record` if the database is damaged.
 fn check_tables(connection: &Connection, path: &Path) -> Result<(), ImportError> {
     let computed = "SELECT count(*) FROM sqlite_master WHERE name IN ('messages', 'topics') AND (type <> 'table' \
          OR sql LIKE '%virtual%' OR sql LIKE '% as %(%')";
@@ -47,8 +47,10 @@ fn check_tables(connection: &Connection, path: &Path) -> Result<(), ImportError>
         .query_row(computed, [], |row| row.get(0))
         .map_err(|error| unreadable(path, &error))?;
     if count > 0 {
-        let reason = "its messages or topics are computed (a view, a virtual table or a generated column); a bag has plain tables";
-        return Err(ImportError::record(path.display().to_string(), reason));
+        return Err(ImportError::Option(format!(
+            "{}: its messages or topics are computed (a view, a virtual table or a generated column); a bag has plain tables",
+            path.display()
+        )));
     }
     Ok(())
 }

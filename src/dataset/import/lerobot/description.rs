@@ -89,7 +89,7 @@ pub(super) struct VideoPart {
 }
 
 impl Description {
-    /// Errors: `Io`, `Record`, `Option` if it is of another version.
+    /// Errors: `Io`, `Record`, `Option` if it is of another version or has too large features.
     pub(super) fn read(source: &Path) -> Result<Self, ImportError> {
         let path = source.join(INFO);
         let text = read_file(&path)?;
@@ -107,13 +107,11 @@ impl Description {
         }
         let mut vectors = info.features.iter().filter(|(_, feature)| feature.is_vector());
         if let Some((name, feature)) = vectors.find(|(_, feature)| feature.size() > MAX_COMPONENTS) {
-            return Err(ImportError::record(
-                path.display().to_string(),
-                format!(
-                    "feature \"{name}\" has {} components; at most {MAX_COMPONENTS} are read",
-                    feature.size()
-                ),
-            ));
+            return Err(ImportError::Option(format!(
+                "{}: feature \"{name}\" has {} components; at most {MAX_COMPONENTS} are read",
+                path.display(),
+                feature.size()
+            )));
         }
         Ok(Self {
             source: source.to_owned(),
@@ -404,7 +402,7 @@ fn parquet_files(dir: &Path) -> Result<Vec<PathBuf>, ImportError> {
             let path = entry.map_err(ImportError::io("list", &dir))?.path();
             if path.is_dir() {
                 open.push(path);
-            } else if path.extension().is_some_and(|extension| extension == "parquet") {
+            } else if path.is_file() && path.extension().is_some_and(|extension| extension == "parquet") {
                 found.push(path);
             }
         }

@@ -1,6 +1,5 @@
 //! The numbers of a table's rows. Images are not read.
 
-use std::fs::File;
 use std::path::Path;
 
 use arrow_array::cast::AsArray;
@@ -11,7 +10,7 @@ use arrow_array::{Array, ArrayRef, RecordBatch};
 use arrow_schema::DataType;
 use parquet::arrow::ProjectionMask;
 
-use super::super::ImportError;
+use super::super::{ImportError, open_file};
 use super::description::Component;
 use crate::dataset::parquet_file;
 
@@ -32,9 +31,11 @@ const MAX_ROWS: i64 = 5_000_000;
 /// Reads the chosen components of all rows. Errors: `Io`, `Record`.
 pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> Result<Vec<Row>, ImportError> {
     let wrong = |reason: String| ImportError::record(path.display().to_string(), reason);
-    let file = File::open(path).map_err(|error| match error.kind() {
-        std::io::ErrorKind::NotFound => wrong(format!("the table {} is missing", name.display())),
-        _ => ImportError::io("read", path)(error),
+    let file = open_file(path).map_err(|error| match error {
+        ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
+            wrong(format!("the table {} is missing", name.display()))
+        }
+        other => other,
     })?;
     let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
     let count = builder.metadata().file_metadata().num_rows();
