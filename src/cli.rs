@@ -33,6 +33,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use self::error::CliError;
+use crate::error_text::printable;
 
 /// Predicts the next camera frames of a robot from its frames, its state and its actions.
 ///
@@ -82,7 +83,7 @@ pub fn main() -> ExitCode {
     };
     let (sentence, code) = error.report();
     // If standard error is closed, there is nowhere left to report to.
-    let _ = writeln!(std::io::stderr(), "{sentence}");
+    let _ = writeln!(std::io::stderr(), "{}", printable(&sentence));
     code
 }
 
@@ -111,7 +112,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
 
 /// Writes a line to standard output.
 fn print_line(line: impl Display) -> Result<(), CliError> {
-    writeln!(std::io::stdout(), "{line}")
+    writeln!(std::io::stdout(), "{}", printable(&line.to_string()))
         .map_err(|error| CliError::Failed(format!("could not write to standard output: {error}")))
 }
 

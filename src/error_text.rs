@@ -18,6 +18,21 @@ pub fn with_causes(error: &dyn Error) -> String {
     joined
 }
 
+/// The text as a terminal may show it: control characters other than line breaks and tabs are written as escapes, since
+/// names from a recording could otherwise change what is on the screen.
+#[must_use]
+pub fn printable(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        if character.is_control() && !['\n', '\t'].contains(&character) {
+            shown.extend(character.escape_default());
+        } else {
+            shown.push(character);
+        }
+    }
+    shown
+}
+
 /// The items, separated by commas.
 #[must_use]
 pub fn comma_separated<T: Display>(items: &[T]) -> String {
@@ -47,6 +62,11 @@ mod tests {
     #[derive(Debug, thiserror::Error)]
     #[error("the shard is lost: {0}")]
     struct WithCause(#[source] WithoutCause);
+
+    #[test]
+    fn control_characters_are_shown_as_escapes() {
+        assert_eq!(printable("a\u{1b}[2Jü\tb\r\n"), "a\\u{1b}[2Jü\tb\\r\n");
+    }
 
     #[test]
     fn every_cause_appears_once() {

@@ -1,5 +1,6 @@
 //! `foreframe import`
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
 
 use super::settings::CommonArgs;
@@ -13,6 +14,16 @@ use crate::registry::is_valid_name;
 
 /// How many left-out items are printed.
 const LISTED_ITEMS: usize = 10;
+
+/// Errors of reading that say something about the recording, not about the machine.
+const DAMAGED_INPUT: [ErrorKind; 6] = [
+    ErrorKind::NotFound,
+    ErrorKind::NotADirectory,
+    ErrorKind::IsADirectory,
+    ErrorKind::InvalidInput,
+    ErrorKind::InvalidData,
+    ErrorKind::UnexpectedEof,
+];
 
 /// Turn a recording into a data set.
 ///
@@ -49,7 +60,7 @@ pub(super) struct ImportArgs {
     /// Frames per second: of the data set or, where the source has no times, of the recording
     #[arg(long, value_name = "HZ")]
     rate: Option<f64>,
-    /// Keep every Nth frame
+    /// Keep every Nth frame, 1 to 1000000
     #[arg(long, value_name = "N", default_value_t = 1)]
     every: usize,
     /// The CSV file, if it is not the only one in the folder
@@ -200,7 +211,7 @@ impl From<ImportError> for CliError {
             | ImportError::Empty(_)
             | ImportError::OutExists { .. } => Self::Usage(text),
             ImportError::Dataset(error) => error.into(),
-            ImportError::Io { ref source, .. } if source.kind() == std::io::ErrorKind::NotFound => Self::Usage(text),
+            ImportError::Io { ref source, .. } if DAMAGED_INPUT.contains(&source.kind()) => Self::Usage(text),
             _ => Self::Failed(text),
         }
     }

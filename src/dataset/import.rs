@@ -28,6 +28,11 @@ use super::{DatasetError, DatasetInfo};
 use crate::frame::fit::Fit;
 use crate::frame::{FrameError, MAX_SIDE_PX};
 
+/// The largest [`ImportOptions::every`].
+const MAX_EVERY: usize = 1_000_000;
+/// The largest file that is read in one piece: an image, or a text that describes the recording.
+const MAX_FILE_BYTES: u64 = 256 << 20;
+
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportConfig {
@@ -51,7 +56,7 @@ pub struct ImportOptions {
     pub fit: Fit,
     /// Frames per second of the data set. Without timestamps: of the recording. `None` keeps the recording's rate.
     pub rate_hz: Option<f64>,
-    /// Keeps every Nth frame; actions in between are averaged.
+    /// Keeps every Nth frame, 1 to 1,000,000; actions in between are averaged.
     pub every: usize,
     /// A CSV file with one line per image.
     pub csv: Option<PathBuf>,
@@ -265,8 +270,27 @@ pub fn import(
         return Ok(finished);
     }
     let recording = open(config)?;
+    check_channels(&recording)?;
     let plan = timing::plan(recording, options)?;
     directory.write(&plan, on_progress, cancelled)
+}
+
+/// Errors: `Option` if two components of the action or of the state have the same name.
+fn check_channels(recording: &Recording) -> Result<(), ImportError> {
+    for (what, channels) in [
+        ("action", &recording.action_channels),
+        ("state", &recording.state_channels),
+    ] {
+        for (index, channel) in channels.iter().enumerate() {
+            if channels[..index].iter().any(|earlier| earlier.name == channel.name) {
+                return Err(ImportError::Option(format!(
+                    "two components of the {what} are named \"{}\"; choose and name them with --{what}, each once",
+                    channel.name
+                )));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Opens a file of a recording. Errors: `Io`, also for what is no regular file: reading a named pipe could take forever.
@@ -286,8 +310,13 @@ fn open_file(path: &Path) -> Result<File, ImportError> {
 
 fn read_file(path: &Path) -> Result<Vec<u8>, ImportError> {
     let mut bytes = Vec::new();
-    let mut file = open_file(path)?;
+    let mut file = open_file(path)?.take(MAX_FILE_BYTES + 1);
     file.read_to_end(&mut bytes).map_err(ImportError::io("read", path))?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        let reason = format!("it has more than {} MiB", MAX_FILE_BYTES >> 20);
+        let error = std::io::Error::new(std::io::ErrorKind::InvalidData, reason);
+        return Err(ImportError::io("read", path)(error));
+    }
     Ok(bytes)
 }
 
@@ -334,8 +363,8 @@ impl ImportOptions {
                 right: right.to_owned(),
             })
         };
-        if self.every == 0 {
-            return wrong("every", &self.every, "it must be at least 1");
+        if !(1..=MAX_EVERY).contains(&self.every) {
+            return wrong("every", &self.every, &format!("it must be 1 to {MAX_EVERY}"));
         }
         if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
             return wrong("rate", &rate, "it must be 0.01 to 1000 frames per second");

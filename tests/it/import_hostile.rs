@@ -118,6 +118,56 @@ fn lines_are_counted_with_empty_ones() {
 }
 
 #[test]
+fn columns_may_be_separated_by_semicolons_and_tabs() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    let text = fs::read_to_string(source.join("log.csv")).unwrap();
+    let hash = |separator: &str| {
+        fs::write(source.join("log.csv"), text.replace(',', separator)).unwrap();
+        let out = tempfile::tempdir().unwrap();
+        run(&source, &out.path().join("set"), small())
+            .unwrap()
+            .info
+            .content_hash
+    };
+    let with_commas = hash(",");
+    assert_eq!([hash(";"), hash("\t")], [with_commas.clone(), with_commas]);
+    // As spreadsheets write it where decimals have commas.
+    fs::write(source.join("log.csv"), "time;file;action.x\n0,1;0.png;0\n0,2;1.png;0\n").unwrap();
+    let error = refused(&source, small());
+    assert!(
+        error.contains("line 2") && error.contains("\"0,1\"; it must be a finite number, as in 0.5"),
+        "{error}"
+    );
+}
+
+#[test]
+fn components_with_the_same_name_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    change_line(&source, 1, |text| text.replace("state.heading", "action.speed [km/h]"));
+    let error = refused(&source, small());
+    assert!(
+        error.contains("two components of the action are named \"action.speed\""),
+        "{error}"
+    );
+}
+
+#[test]
+fn enormous_files_are_not_read_as_images() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    let sparse = fs::File::create(source.join("3.png")).unwrap();
+    sparse.set_len(60 << 30).unwrap();
+    let error = refused(&source, small());
+    assert!(
+        error.contains("log.csv line 5") && error.contains("it has more than 256 MiB"),
+        "{error}"
+    );
+    assert_eq!(skipping(&source).skipped.len(), 1);
+}
+
+#[test]
 fn stated_sizes_of_arrays_take_no_memory() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.npz");

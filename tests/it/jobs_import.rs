@@ -110,7 +110,7 @@ async fn wrong_imports_are_refused_with_the_field() {
         (
             "walk",
             json!({"every": 0}),
-            "every: 0 is not valid; it must be at least 1",
+            "every: 0 is not valid; it must be 1 to 1000000",
         ),
         (
             "walk",

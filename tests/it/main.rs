@@ -43,6 +43,7 @@ mod lerobot;
 mod malformed_requests;
 mod malformed_streams;
 mod metrics;
+mod model_cards;
 mod moving_mnist;
 mod nn_cell;
 mod nn_fixtures;

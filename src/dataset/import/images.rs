@@ -1,5 +1,6 @@
 //! A folder of images, with or without a CSV file that gives each its time, action and state.
 
+use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
 use super::recording::{Images, Record, Recording};
@@ -20,6 +21,9 @@ const TIME_COLUMNS: [(&str, f64); 8] = [
     ("timestamp_us", 1e-6),
     ("timestamp_ns", 1e-9),
 ];
+
+/// Where the end of a CSV file's first line is looked for.
+const MAX_HEADER_BYTES: u64 = 1 << 20;
 
 /// Reads the records of a folder. Errors: `Option`, `Io`, `Record`.
 pub(super) fn open(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
@@ -107,6 +111,7 @@ struct Columns {
 fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     let unreadable = |error: csv::Error| ImportError::record(csv.display().to_string(), error.to_string());
     let mut reader = csv::ReaderBuilder::new()
+        .delimiter(separator(csv)?)
         .trim(csv::Trim::All)
         .from_reader(open_file(csv)?);
     let header: Vec<String> = reader
@@ -152,6 +157,18 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
     }
     recording.images = Images::Files(paths);
     Ok(recording)
+}
+
+/// What separates the columns: the most frequent of comma, semicolon and tab in the first line.
+fn separator(csv: &Path) -> Result<u8, ImportError> {
+    let mut header = Vec::new();
+    let mut beginning = BufReader::new(open_file(csv)?.take(MAX_HEADER_BYTES));
+    beginning
+        .read_until(b'\n', &mut header)
+        .map_err(ImportError::io("read", csv))?;
+    let count = |separator: &u8| header.iter().filter(|byte| *byte == separator).count();
+    // The last of equals: a comma, if there is none of them.
+    Ok(*b"\t;,".iter().max_by_key(|separator| count(separator)).unwrap_or(&b','))
 }
 
 /// Splits `speed [m/s]` or `speed (m/s)` into name and unit.
@@ -257,7 +274,7 @@ impl Columns {
                 .filter(|value| (*value as f32).is_finite());
             value.ok_or_else(|| {
                 let reason = format!(
-                    "column {} is {:?}; it must be a finite number",
+                    "column {} is {:?}; it must be a finite number, as in 0.5",
                     column + 1,
                     text(column)
                 );
