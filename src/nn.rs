@@ -9,9 +9,9 @@
 //! → [`lstm`] (sequences; `recurrence` and `gates` are its fast f32 implementation) → [`conditioned`] (actions and state)
 //! → [`autoencoder`] (the dense network) → [`loss`]. [`costs`] compares the model's cost with other networks.
 //!
-//! The second architecture is [`flow`]: `conv`, `modulation`, `sampling` and `compose` are its operations, `rays` and `room`
-//! its geometry, `motion` and `scene` compute the camera's motion and the look of the surroundings. [`model`] is the type
-//! that the rest of the program uses for both architectures.
+//! The second architecture is [`flow`]: `conv`, `pixel_shuffle`, `modulation`, `sampling` and `compose` are its operations,
+//! `rays` and `room` its geometry, `motion` and `scene` compute the camera's motion and the look of the surroundings.
+//! [`model`] is the type that the rest of the program uses for both architectures.
 
 mod activation;
 pub mod autoencoder;
@@ -35,6 +35,7 @@ pub mod model;
 mod modulation;
 mod motion;
 pub mod parameters;
+mod pixel_shuffle;
 mod predictor_output;
 mod rays;
 mod recurrence;

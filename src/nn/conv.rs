@@ -1,11 +1,12 @@
-//! 3×3 convolutions of images stored row by row with their channels last (NHWC): the neighbours of each place become one
-//! row of a matrix, and one matrix product gives all output channels. candle's own CPU convolution is several times
-//! slower forth and back.
+//! 3×3 convolutions of images stored row by row with their channels last (NHWC). With a border of zeros around the image,
+//! the neighbours of all places in one row of the kernel are a matrix whose rows overlap in memory, so one matrix product a
+//! kernel row gives all output channels, and nothing is copied. candle's own CPU convolution is several times slower forth
+//! and back.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use pulp::Arch;
 
 use super::tensors::{add_columns, slice, with_values};
@@ -67,6 +68,25 @@ struct ImageGeometry {
     shape: ConvShape,
 }
 
+/// Output places that one matrix product computes.
+struct Block {
+    /// The first row of output places.
+    row: usize,
+    /// Where the kernel of the first place begins, in the values of the bordered image.
+    from: usize,
+    /// Places, those that are not used included.
+    places: usize,
+}
+
+/// Taps of the kernel whose values lie side by side.
+struct Run {
+    /// From the beginning of the kernel, in the values of the bordered image.
+    offset: usize,
+    /// Rows of the weight.
+    first: usize,
+    length: usize,
+}
+
 impl ImageGeometry {
     fn of(dims: (usize, usize, usize, usize), shape: ConvShape) -> Self {
         let (_, height, width, channels) = dims;
@@ -94,76 +114,109 @@ impl ImageGeometry {
         self.height * self.width * self.channels
     }
 
-    fn columns(self) -> usize {
-        TAPS * self.channels
+    /// Places in a row of the bordered image: `dilation` more on each side.
+    fn pitch(self) -> usize {
+        self.width + 2 * self.shape.dilation
     }
 
-    /// Calls `visit` with the place of each run of values in the matrix, its length, and its place in the image; `None` outside
-    /// the image. With neighbours side by side, the three of a row of the kernel are one run.
-    #[inline(always)]
-    fn visit(self, mut visit: impl FnMut(usize, usize, Option<usize>)) {
-        let ConvShape { stride, dilation } = self.shape;
-        let (channels, width) = (self.channels, self.width);
-        let mut at = 0;
-        for row in 0..self.out_height() {
-            for column in 0..self.out_width() {
-                for kernel_row in 0..SIDE {
-                    let y = row * stride + kernel_row * dilation;
-                    let first = (dilation..self.height + dilation)
-                        .contains(&y)
-                        .then(|| (y - dilation) * width);
-                    let x = column * stride;
-                    if let (1, 1.., Some(first)) = (dilation, x, first)
-                        && x + 1 < width
-                    {
-                        visit(at, SIDE * channels, Some((first + x - 1) * channels));
-                        at += SIDE * channels;
-                        continue;
-                    }
-                    for kernel_column in 0..SIDE {
-                        let x = x + kernel_column * dilation;
-                        let is_inside = (dilation..width + dilation).contains(&x);
-                        let place = first
-                            .filter(|_| is_inside)
-                            .map(|first| (first + x - dilation) * channels);
-                        visit(at, channels, place);
-                        at += channels;
-                    }
-                }
+    /// The image of zeros with its border.
+    fn bordered(self) -> CpuStorage {
+        let height = self.height + 2 * self.shape.dilation;
+        CpuStorage::F32(vec![0.0; height * self.pitch() * self.channels])
+    }
+
+    /// Where the first place inside the border begins.
+    fn inside(self) -> usize {
+        self.shape.dilation * (self.pitch() + 1) * self.channels
+    }
+
+    /// Writes an image into a bordered one. An image of `spread` times smaller sides is spread over every `spread`th place.
+    fn write(self, image: &[f32], spread: usize, bordered: &mut CpuStorage) {
+        let CpuStorage::F32(bordered) = bordered else { return };
+        let length = self.width.div_ceil(spread) * self.channels;
+        for (row, values) in image.chunks_exact(length).enumerate() {
+            let from = self.inside() + row * spread * self.pitch() * self.channels;
+            if spread == 1 {
+                bordered[from..from + length].copy_from_slice(values);
+                continue;
+            }
+            for (column, value) in values.chunks_exact(self.channels).enumerate() {
+                let from = from + column * spread * self.channels;
+                bordered[from..from + self.channels].copy_from_slice(value);
             }
         }
     }
 
-    /// The neighbours of every place, one place a row.
-    fn unfold(self, image: &[f32], matrix: &mut [f32]) {
-        self.visit(|at, length, place| {
-            let out = &mut matrix[at..at + length];
-            match place {
-                Some(place) => out.copy_from_slice(&image[place..place + length]),
-                None => out.fill(0.0),
-            }
-        });
+    /// All output places. Without a stride they are one block, in which the borders between rows count as places.
+    fn blocks(self) -> impl Iterator<Item = Block> {
+        let ConvShape { stride, dilation } = self.shape;
+        let count = if stride == 1 { 1 } else { self.out_height() };
+        (0..count).map(move |row| Block {
+            row,
+            from: row * stride * self.pitch() * self.channels,
+            places: match stride {
+                1 => self.height * self.pitch() - 2 * dilation,
+                _ => self.out_width(),
+            },
+        })
     }
 
-    /// Adds each row's values to the places that [`ImageGeometry::unfold`] reads them from.
-    fn fold(self, matrix: &[f32], image: &mut [f32]) {
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                self.visit(
-                    #[inline(always)]
-                    |at, length, place| {
-                        if let Some(place) = place {
-                            let sums = &mut image[place..place + length];
-                            for (sum, value) in sums.iter_mut().zip(&matrix[at..at + length]) {
-                                *sum += value;
-                            }
-                        }
-                    },
-                );
-            },
-        );
+    /// The taps: whole rows of the kernel where they are neighbours.
+    fn runs(self) -> impl Iterator<Item = Run> {
+        let (channels, dilation) = (self.channels, self.shape.dilation);
+        let columns = if dilation == 1 { 1 } else { SIDE };
+        (0..SIDE).flat_map(move |row| {
+            (0..columns).map(move |column| Run {
+                offset: (row * self.pitch() + column) * dilation * channels,
+                first: (row * SIDE + column) * channels,
+                length: SIDE / columns * channels,
+            })
+        })
     }
+
+    /// The matrix of a run's values at the places of a block, one place a row.
+    fn neighbours(self, block: &Block, run: &Run) -> Layout {
+        let steps = vec![self.shape.stride * self.channels, 1];
+        Layout::new(Shape::from((block.places, run.length)), steps, block.from + run.offset)
+    }
+
+    /// Adds the convolution of a bordered image to `sums` `[places, outputs]`. The weight begins at `from` in its storage.
+    fn add_to(self, sums: &mut [f32], bordered: &CpuStorage, (weight, from): (&CpuStorage, usize)) -> Result<()> {
+        let outputs = sums.len() / self.places();
+        let used = self.out_width() * outputs;
+        for block in self.blocks() {
+            let pitch = if self.shape.stride == 1 {
+                self.pitch() * outputs
+            } else {
+                used
+            };
+            for run in self.runs() {
+                let weights = Layout::contiguous_with_offset((run.length, outputs), from + run.first * outputs);
+                let sizes = (1, block.places, outputs, run.length);
+                let product = bordered.matmul(weight, sizes, &self.neighbours(&block, &run), &weights)?;
+                let CpuStorage::F32(product) = product else {
+                    bail!("a convolution takes f32 tensors");
+                };
+                let rows = sums[block.row * used..].chunks_exact_mut(used);
+                for (sums, product) in rows.zip(product.chunks(pitch)) {
+                    add(sums, &product[..used]);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Adds values to sums.
+fn add(sums: &mut [f32], values: &[f32]) {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            for (sum, value) in sums.iter_mut().zip(values) {
+                *sum += value;
+            }
+        },
+    );
 }
 
 impl CustomOp3 for Convolution {
@@ -183,33 +236,21 @@ impl CustomOp3 for Convolution {
         let dims = x_layout.shape().dims4()?;
         let image = ImageGeometry::of(dims, self.shape);
         let (rows, outputs) = weight_layout.shape().dims2()?;
-        if rows != image.columns() {
+        let taps = TAPS * image.channels;
+        if rows != taps || !weight_layout.is_contiguous() {
             bail!(
-                "a convolution of {} channels takes {} weights, got {rows}",
-                image.channels,
-                image.columns()
+                "a convolution of {} channels takes {taps} rows of weights, got {rows}",
+                image.channels
             );
         }
         let (values, bias) = (slice(x, x_layout)?, slice(bias, bias_layout)?);
-        let mut sums = Vec::with_capacity(dims.0 * image.places() * outputs);
-        let layout = Layout::contiguous((image.places(), rows));
-        let mut matrix = CpuStorage::F32(vec![0.0; image.places() * rows]);
-        for values in values.chunks_exact(image.inputs()) {
-            unfold_into(&mut matrix, image, values);
-            let product = matrix.matmul(weight, (1, image.places(), outputs, rows), &layout, weight_layout)?;
-            let CpuStorage::F32(product) = product else {
-                bail!("a convolution takes f32 tensors");
-            };
-            sums.extend_from_slice(&product);
+        let mut sums = bias.repeat(dims.0 * image.places());
+        let mut bordered = image.bordered();
+        let images = values.chunks_exact(image.inputs());
+        for (values, sums) in images.zip(sums.chunks_exact_mut(image.places() * outputs)) {
+            image.write(values, 1, &mut bordered);
+            image.add_to(sums, &bordered, (weight, weight_layout.start_offset()))?;
         }
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for row in sums.chunks_exact_mut(outputs) {
-                    add_columns(row, bias);
-                }
-            },
-        );
         let shape = (dims.0, image.out_height(), image.out_width(), outputs);
         Ok((CpuStorage::F32(sums), Shape::from(shape)))
     }
@@ -224,51 +265,29 @@ impl CustomOp3 for Convolution {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let image = ImageGeometry::of(x.dims4()?, self.shape);
         let (rows, outputs) = weight.dims2()?;
-        let (weight, gradient) = (weight.detach(), gradient.contiguous()?);
-        let (places, device) = (image.places(), x.device());
+        let device = x.device();
         let mut for_bias = vec![0.0; outputs];
         let mut for_weight = vec![0.0; rows * outputs];
-        let mut for_x = if self.wants_input_gradient {
-            vec![0.0; x.elem_count()]
-        } else {
-            Vec::new()
-        };
-        let (weight_storage, weight_layout) = weight.storage_and_layout();
-        let candle_core::Storage::Cpu(weight_storage) = &*weight_storage else {
-            bail!("a convolution takes tensors on the CPU");
-        };
-        let transposed_weight = weight_layout.transpose(0, 1)?;
-        let matrix_layout = Layout::contiguous((places, rows));
-        let transposed_matrix = matrix_layout.transpose(0, 1)?;
-        let gradient_layout = Layout::contiguous((places, outputs));
-        let mut matrix = CpuStorage::F32(vec![0.0; places * rows]);
+        let mut for_x = self.wants_input_gradient.then(|| vec![0.0; x.elem_count()]);
+        let turned = CpuStorage::F32(with_values(weight, |weight| turned_kernel(weight, image.channels))?);
         with_values(x, |values| {
-            with_values(&gradient, |gradient| -> Result<()> {
+            with_values(gradient, |gradient| -> Result<()> {
                 add_all_columns(&mut for_bias, gradient);
-                let images = values
-                    .chunks_exact(image.inputs())
-                    .zip(gradient.chunks_exact(places * outputs));
-                for (index, (values, gradient)) in images.enumerate() {
-                    let gradient = CpuStorage::F32(gradient.to_vec());
-                    unfold_into(&mut matrix, image, values);
-                    let sizes = (1, rows, outputs, places);
-                    let product = matrix.matmul(&gradient, sizes, &transposed_matrix, &gradient_layout)?;
-                    add_to(&mut for_weight, &product);
-                    if self.wants_input_gradient {
-                        let sizes = (1, places, rows, outputs);
-                        let product = gradient.matmul(weight_storage, sizes, &gradient_layout, &transposed_weight)?;
-                        let from = index * image.inputs();
-                        if let CpuStorage::F32(product) = &product {
-                            image.fold(product, &mut for_x[from..from + image.inputs()]);
-                        }
+                let mut backward = Backward::new(image, outputs);
+                let gradients = gradient.chunks_exact(image.places() * outputs);
+                for (index, (values, gradient)) in values.chunks_exact(image.inputs()).zip(gradients).enumerate() {
+                    backward.read(values, gradient);
+                    backward.add_weight_gradient(&mut for_weight)?;
+                    if let Some(for_x) = &mut for_x {
+                        let for_x = &mut for_x[index * image.inputs()..(index + 1) * image.inputs()];
+                        backward.spread.add_to(for_x, &backward.gradient, (&turned, 0))?;
                     }
                 }
                 Ok(())
             })
         })???;
-        let for_x = self
-            .wants_input_gradient
-            .then(|| Tensor::from_vec(for_x, x.dims(), device))
+        let for_x = for_x
+            .map(|for_x| Tensor::from_vec(for_x, x.dims(), device))
             .transpose()?;
         Ok((
             for_x,
@@ -278,10 +297,67 @@ impl CustomOp3 for Convolution {
     }
 }
 
-fn unfold_into(matrix: &mut CpuStorage, image: ImageGeometry, values: &[f32]) {
-    if let CpuStorage::F32(matrix) = matrix {
-        image.unfold(values, matrix);
+/// An image and the gradient of its convolution, both with borders.
+struct Backward {
+    image: ImageGeometry,
+    bordered: CpuStorage,
+    /// The gradient's image: as large as the input, so that a convolution of it gives the input's gradient.
+    spread: ImageGeometry,
+    gradient: CpuStorage,
+}
+
+impl Backward {
+    fn new(image: ImageGeometry, outputs: usize) -> Self {
+        let spread = ImageGeometry {
+            channels: outputs,
+            shape: ConvShape::dilated(image.shape.dilation),
+            ..image
+        };
+        Self {
+            image,
+            bordered: image.bordered(),
+            spread,
+            gradient: spread.bordered(),
+        }
     }
+
+    fn read(&mut self, values: &[f32], gradient: &[f32]) {
+        self.image.write(values, 1, &mut self.bordered);
+        self.spread.write(gradient, self.image.shape.stride, &mut self.gradient);
+    }
+
+    /// Adds the gradient of the weight `[9 · C, O]`. What is no output place has a gradient of zero.
+    fn add_weight_gradient(&self, sums: &mut [f32]) -> Result<()> {
+        let (image, outputs) = (self.image, self.spread.channels);
+        let stride = image.shape.stride;
+        for block in image.blocks() {
+            let from = self.spread.inside() + block.row * stride * self.spread.pitch() * outputs;
+            let steps = vec![stride * outputs, 1];
+            let gradients = Layout::new(Shape::from((block.places, outputs)), steps, from);
+            for run in image.runs() {
+                let neighbours = image.neighbours(&block, &run).transpose(0, 1)?;
+                let sizes = (1, run.length, outputs, block.places);
+                let product = self.bordered.matmul(&self.gradient, sizes, &neighbours, &gradients)?;
+                if let CpuStorage::F32(product) = product {
+                    add(&mut sums[run.first * outputs..], &product);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The weight `[9 · O, C]` of the convolution that turns the output's gradient into the input's.
+fn turned_kernel(weight: &[f32], channels: usize) -> Vec<f32> {
+    let outputs = weight.len() / (TAPS * channels);
+    let mut turned = vec![0.0; weight.len()];
+    for (row, weights) in weight.chunks_exact(outputs).enumerate() {
+        let (tap, channel) = (TAPS - 1 - row / channels, row % channels);
+        for (output, weight) in weights.iter().enumerate() {
+            turned[(tap * outputs + output) * channels + channel] = *weight;
+        }
+    }
+    turned
 }
 
 fn add_all_columns(sums: &mut [f32], values: &[f32]) {
@@ -289,87 +365,6 @@ fn add_all_columns(sums: &mut [f32], values: &[f32]) {
         #[inline(always)]
         || add_columns(sums, values),
     );
-}
-
-fn add_to(sums: &mut [f32], values: &CpuStorage) {
-    if let CpuStorage::F32(values) = values {
-        for (sum, value) in sums.iter_mut().zip(values) {
-            *sum += value;
-        }
-    }
-}
-
-/// Spreads 4 · C channels over twice the sides: `[N, H, W, 4 · C]` → `[N, 2H, 2W, C]`. Channel group `2 · row + column` goes
-/// to that row and column of each 2×2 block.
-pub(super) fn pixel_shuffle(x: &Tensor) -> Result<Tensor> {
-    PixelShuffle { is_inverse: false }.apply(x)
-}
-
-/// The inverse of [`pixel_shuffle`]: `[N, 2H, 2W, C]` → `[N, H, W, 4 · C]`.
-pub(super) fn pixel_unshuffle(x: &Tensor) -> Result<Tensor> {
-    PixelShuffle { is_inverse: true }.apply(x)
-}
-
-#[derive(Clone, Copy)]
-struct PixelShuffle {
-    is_inverse: bool,
-}
-
-impl PixelShuffle {
-    fn apply(self, x: &Tensor) -> Result<Tensor> {
-        let x = x.contiguous()?;
-        if x.track_op() {
-            x.apply_op1(self)
-        } else {
-            x.apply_op1_no_bwd(&self)
-        }
-    }
-}
-
-impl CustomOp1 for PixelShuffle {
-    fn name(&self) -> &'static str {
-        "pixel-shuffle"
-    }
-
-    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (count, height, width, channels) = layout.shape().dims4()?;
-        let values = slice(x, layout)?;
-        let mut out = vec![0.0; values.len()];
-        // Rows, columns and channels on the fine side.
-        let (rows, columns, depth) = if self.is_inverse {
-            (height, width, channels)
-        } else {
-            (2 * height, 2 * width, channels / 4)
-        };
-        let half = columns / 2 * 4 * depth;
-        for row in 0..count * rows {
-            // Both rows of a block lie in the same row of blocks; sides are even, so items need no care.
-            let blocks = row / 2 * half + row % 2 * 2 * depth;
-            for column in 0..columns {
-                let coarse = blocks + column / 2 * 4 * depth + column % 2 * depth;
-                let fine = (row * columns + column) * depth;
-                let (from, to) = if self.is_inverse {
-                    (fine, coarse)
-                } else {
-                    (coarse, fine)
-                };
-                out[to..to + depth].copy_from_slice(&values[from..from + depth]);
-            }
-        }
-        let shape = if self.is_inverse {
-            (count, height / 2, width / 2, 4 * channels)
-        } else {
-            (count, rows, columns, depth)
-        };
-        Ok((CpuStorage::F32(out), Shape::from(shape)))
-    }
-
-    fn bwd(&self, _x: &Tensor, _y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let inverse = Self {
-            is_inverse: !self.is_inverse,
-        };
-        Ok(Some(inverse.apply(&gradient.detach())?))
-    }
 }
 
 #[cfg(test)]
@@ -411,18 +406,5 @@ mod tests {
                 convolve(&inputs[0], &inputs[1], &inputs[2], shape)
             });
         }
-    }
-
-    #[test]
-    fn pixel_shuffle_is_undone_by_its_inverse() {
-        let x = noise(&[2, 3, 2, 8], 4);
-        let fine = pixel_shuffle(&x).unwrap();
-        assert_eq!(fine.dims(), [2, 6, 4, 2]);
-        let back = pixel_unshuffle(&fine).unwrap();
-        assert_eq!(
-            back.flatten_all().unwrap().to_vec1::<f32>().unwrap(),
-            x.flatten_all().unwrap().to_vec1::<f32>().unwrap()
-        );
-        assert_gradients(&[x], 1e-2, |inputs| pixel_shuffle(&inputs[0]));
     }
 }

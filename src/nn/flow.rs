@@ -13,11 +13,12 @@ use candle_core::{Device, Tensor};
 
 use super::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
 use super::conditioned::ConditioningTensors;
-use super::conv::{ConvShape, convolve, pixel_shuffle, pixel_unshuffle};
+use super::conv::{ConvShape, convolve};
 use super::dense::{Activation, Dense};
 use super::flow_inputs::{EncoderViews, FutureRows, fold_pixels, repeated, sampled_blocks};
 use super::modulation::{modulated_silu, silu};
 use super::motion::MotionHead;
+use super::pixel_shuffle::{pixel_shuffle, pixel_unshuffle};
 use super::rays::{CameraPose, Viewer, own_places, turning_places};
 use super::sampling::{ImageSize, sample_features};
 use super::scene::Scene;

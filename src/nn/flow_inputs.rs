@@ -290,6 +290,6 @@ pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], s
 
 /// 2×2 blocks of pixels `[M, H/2, W/2, 4]` as frames `[M, P]`.
 pub(super) fn fold_pixels(blocks: &Tensor) -> Result<Tensor, NnError> {
-    let frames = super::conv::pixel_shuffle(blocks)?;
+    let frames = super::pixel_shuffle::pixel_shuffle(blocks)?;
     Ok(frames.flatten_from(1)?)
 }

@@ -5,8 +5,8 @@
 use candle_core::{DType, Device, Tensor};
 
 use super::super::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
-use super::super::conv::pixel_unshuffle;
 use super::super::flow_inputs::{FutureRows, fold_pixels, sampled_blocks};
+use super::super::pixel_shuffle::pixel_unshuffle;
 use super::super::rays::{CameraPose, own_places};
 use super::super::sampling::sample_features;
 use super::super::tensors::with_values;
