@@ -1,10 +1,11 @@
-//! Changes of training windows that a robot could have seen as well: mirrored, brighter, darker.
+//! Changes of training windows that a robot could have seen as well: mirrored, brighter, darker, nearer.
 
 use rand::Rng;
 
 use super::TrainError;
 use super::config::{DataConfig, Mirror};
 use crate::dataset::DatasetInfo;
+use crate::frame::warp::sample;
 use crate::types::{Channel, Seed};
 
 /// The kinds of channels.
@@ -18,7 +19,40 @@ pub(super) struct Augmentation {
     mirror: Option<[Vec<usize>; 2]>,
     /// The largest relative change of brightness.
     brightness: f32,
+    /// The largest share of each side that is cut off.
+    crop: f32,
     seed: Seed,
+}
+
+/// The part of a frame that is enlarged to the whole.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct CutOut {
+    /// Width and height, as a share of the frame's, above 0, at most 1.
+    pub(super) side: f32,
+    /// Where it lies between the left and the right border, 0 to 1.
+    pub(super) across: f32,
+    /// Where it lies between the upper and the lower border, 0 to 1.
+    pub(super) down: f32,
+}
+
+impl CutOut {
+    /// The part of a frame, enlarged to the frame's size. Pixels between those of the frame are interpolated.
+    fn enlarge(self, values: &mut [f32], width: usize) {
+        let height = values.len() / width;
+        let place = |index: usize, length: usize, at: f32| {
+            let length = length as f32;
+            (at * (1.0 - self.side) * length + (index as f32 + 0.5) * self.side - 0.5).clamp(0.0, length - 1.0)
+        };
+        let grid: Vec<[f32; 2]> = (0..values.len())
+            .map(|index| {
+                [
+                    place(index % width, width, self.across),
+                    place(index / width, height, self.down),
+                ]
+            })
+            .collect();
+        values.copy_from_slice(&sample(values, width, height, &grid).0);
+    }
 }
 
 /// The change of one window.
@@ -27,6 +61,8 @@ pub(super) struct WindowChange {
     pub(super) is_mirrored: bool,
     /// Factor of all intensities.
     pub(super) gain: f32,
+    /// The part that is seen, after mirroring; `None` for all of it.
+    pub(super) cut_out: Option<CutOut>,
 }
 
 impl WindowChange {
@@ -34,12 +70,16 @@ impl WindowChange {
     pub(super) const NONE: Self = Self {
         is_mirrored: false,
         gain: 1.0,
+        cut_out: None,
     };
 
     /// Changes a frame's intensities, 0 to 1, row by row; `inverted` ones if the model inverts.
     pub(super) fn apply(self, values: &mut [f32], width: usize, is_inverted: bool) {
         if self.is_mirrored {
             values.chunks_exact_mut(width).for_each(<[f32]>::reverse);
+        }
+        if let Some(cut_out) = self.cut_out {
+            cut_out.enlarge(values, width);
         }
         if self.gain == 1.0 {
             return;
@@ -53,21 +93,29 @@ impl WindowChange {
 }
 
 impl Augmentation {
-    /// As the settings say. Errors: `Config` for a channel that the data set does not have.
+    /// As the settings say. Errors: `Config` for a channel that the data set does not have, and for cut-outs of frames whose
+    /// camera model is known.
     pub(super) fn new(config: &DataConfig, info: &DatasetInfo, seed: Seed) -> Result<Self, TrainError> {
+        if config.crop > 0.0 && info.camera.is_some() {
+            return Err(TrainError::Config(format!(
+                "data.crop is {}; it must be 0 for a data set with a camera model, which a part of the frame does not fit",
+                config.crop
+            )));
+        }
         Ok(Self {
             mirror: match &config.mirror {
                 Mirror::Off(_) => None,
                 Mirror::Channels(names) => Some(signed_channels(names, info)?),
             },
             brightness: config.brightness,
+            crop: config.crop,
             seed: seed.derive("augment", 0),
         })
     }
 
     /// The change of the window at this position of this step's batch.
     pub(super) fn draw(&self, step: usize, position: usize) -> WindowChange {
-        if self.mirror.is_none() && self.brightness == 0.0 {
+        if self.mirror.is_none() && self.brightness == 0.0 && self.crop == 0.0 {
             return WindowChange::NONE;
         }
         let mut rng = self
@@ -78,6 +126,11 @@ impl Augmentation {
         WindowChange {
             is_mirrored: rng.random::<bool>() && self.mirror.is_some(),
             gain: 1.0 + self.brightness * rng.random_range(-1.0f32..=1.0),
+            cut_out: (self.crop > 0.0).then(|| CutOut {
+                side: 1.0 - self.crop * rng.random::<f32>(),
+                across: rng.random(),
+                down: rng.random(),
+            }),
         }
     }
 
@@ -126,17 +179,37 @@ mod tests {
         let mut values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
         let change = WindowChange {
             is_mirrored: true,
-            gain: 1.0,
+            ..WindowChange::NONE
         };
         change.apply(&mut values, 3, false);
         assert_eq!(values, [0.3, 0.2, 0.1, 0.6, 0.5, 0.4]);
     }
 
     #[test]
+    fn a_cut_out_is_enlarged_to_the_whole_frame() {
+        let mut ramp: Vec<f32> = (0..32).map(|index| (index % 8) as f32).collect();
+        let upper_right = CutOut {
+            side: 0.5,
+            across: 1.0,
+            down: 0.0,
+        };
+        upper_right.enlarge(&mut ramp, 8);
+        let row = [3.75, 4.25, 4.75, 5.25, 5.75, 6.25, 6.75, 7.0];
+        assert_eq!(ramp, row.repeat(4));
+        let whole = CutOut {
+            side: 1.0,
+            ..upper_right
+        };
+        let mut same = ramp.clone();
+        whole.enlarge(&mut same, 8);
+        assert_eq!(same, ramp);
+    }
+
+    #[test]
     fn brightness_changes_the_camera_s_intensities() {
         let change = WindowChange {
-            is_mirrored: false,
             gain: 2.0,
+            ..WindowChange::NONE
         };
         let mut plain = [0.25, 0.75];
         change.apply(&mut plain, 2, false);

@@ -282,6 +282,25 @@ fn a_mirror_needs_channels_that_exist() {
 }
 
 #[test]
+fn windows_can_be_cut_out_where_no_camera_model_is_known() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    let (whole, cut, refused) = (dir.path().join("whole"), dir.path().join("cut"), dir.path().join("no"));
+    train(&small_config(&[]), &dataset, &whole).unwrap();
+    let config = small_config(&["data.crop=0.2"]);
+    train(&config, &dataset, &cut).unwrap();
+    assert!(weights(&whole) != weights(&cut));
+    let error = train(&config, &standing(CameraModel::new(1.0, 0.2).ok()), &refused).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("it must be 0 for a data set with a camera model"),
+        "{error}"
+    );
+    let error = TrainConfig::layered("recording", None, &["data.crop=0.6".to_owned()]).unwrap_err();
+    assert_eq!(error.to_string(), "data.crop is 0.6; it must be 0 to 0.5");
+}
+
+#[test]
 fn a_finished_run_is_not_trained_again() {
     let (dataset, config, dir) = (squares(20), small_config(&[]), tempfile::tempdir().unwrap());
     train(&config, &dataset, dir.path()).unwrap();
@@ -382,7 +401,7 @@ fn a_truncated_checkpoint_is_not_used() {
 }
 
 /// Recordings of a camera that stands still: the actions are always 0.
-fn standing(episodes: usize) -> Dataset {
+fn standing(camera: Option<CameraModel>) -> Dataset {
     let data = |episode: usize| EpisodeData {
         pixels: (0..14 * 144).map(|at| ((at * 7 + episode * 13) % 251) as u8).collect(),
         actions: vec![0.0; 14],
@@ -395,15 +414,21 @@ fn standing(episodes: usize) -> Dataset {
         frame_height_px: 12,
         frame_period_s: 0.2,
         action_channels: vec![Channel::new("speed", "m/s")],
+        camera,
         ..DatasetInfo::default()
     };
-    Dataset::from_episodes(info, (0..episodes).map(data).collect()).unwrap()
+    Dataset::from_episodes(info, (0..20).map(data).collect()).unwrap()
 }
 
 #[test]
 fn actions_that_never_change_are_refused_unless_allowed() {
     let dir = tempfile::tempdir().unwrap();
-    let refused = train(&small_config(&["model.conditioning=action"]), &standing(20), dir.path()).unwrap_err();
+    let refused = train(
+        &small_config(&["model.conditioning=action"]),
+        &standing(None),
+        dir.path(),
+    )
+    .unwrap_err();
     assert_eq!(
         refused.to_string(),
         "data set \"standing\" has actions that never change (its camera stands still); a model with conditioning \"action\" \
@@ -411,7 +436,7 @@ fn actions_that_never_change_are_refused_unless_allowed() {
          data.constant_actions=true"
     );
     let allowed = small_config(&["model.conditioning=action", "data.constant_actions=true", "fit.steps=2"]);
-    train(&allowed, &standing(20), dir.path()).unwrap();
+    train(&allowed, &standing(None), dir.path()).unwrap();
 }
 
 #[test]
