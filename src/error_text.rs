@@ -18,14 +18,14 @@ pub fn with_causes(error: &dyn Error) -> String {
     joined
 }
 
-/// The text as a terminal may show it: control characters other than line breaks and tabs are written as escapes, since
-/// names from a recording could otherwise change what is on the screen.
+/// The text as a terminal may show it: control characters other than line breaks and tabs are written as escapes, which JSON
+/// and TOML understand too. Names from a recording could otherwise change what is on the screen.
 #[must_use]
 pub fn printable(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
         if character.is_control() && !['\n', '\t'].contains(&character) {
-            shown.extend(character.escape_default());
+            shown.push_str(&format!("\\u{:04x}", u32::from(character)));
         } else {
             shown.push(character);
         }
@@ -65,7 +65,7 @@ mod tests {
 
     #[test]
     fn control_characters_are_shown_as_escapes() {
-        assert_eq!(printable("a\u{1b}[2Jü\tb\r\n"), "a\\u{1b}[2Jü\tb\\r\n");
+        assert_eq!(printable("a\u{1b}[2Jü\tb\r\n"), "a\\u001b[2Jü\tb\\u000d\n");
     }
 
     #[test]

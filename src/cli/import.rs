@@ -38,7 +38,7 @@ const DAMAGED_INPUT: [ErrorKind; 6] = [
   foreframe import frames/ --csv log.csv --action speed --action turn --unit turn=rad/s
   foreframe import pusht/ --image front --size 96x96
   foreframe import drive.mcap --image /camera/image_raw --action /cmd_vel --state /odom --rate 10
-  foreframe import mnist_test_seq.npy --name moving-mnist --rate 10
+  foreframe import mnist_test_seq.npy --name mnist-test-seq --rate 10
 then
   foreframe inspect mycar
   foreframe train --preset recording --dataset mycar --set name=mycar")]

@@ -237,7 +237,10 @@ impl CustomOp3 for Convolution {
         let image = ImageGeometry::of(dims, self.shape);
         let (rows, outputs) = weight_layout.shape().dims2()?;
         let taps = TAPS * image.channels;
-        if rows != taps || !weight_layout.is_contiguous() {
+        if !weight_layout.is_contiguous() {
+            bail!("a convolution takes contiguous weights");
+        }
+        if rows != taps {
             bail!(
                 "a convolution of {} channels takes {taps} rows of weights, got {rows}",
                 image.channels

@@ -1,4 +1,4 @@
-//! The flow network: it moves the pixels of the last frame instead of painting new ones.
+//! The flow network: it moves the pixels of the last frame instead of computing new ones.
 //!
 //! An encoder reads the last frames once, in the last one's view. Then, for each predicted step: `motion` says how
 //! the camera will have moved, the encoder's features are sampled as that camera sees them, a block of convolutions that

@@ -154,6 +154,34 @@ fn components_with_the_same_name_are_refused() {
 }
 
 #[test]
+fn headers_tell_separator_and_unit_of_time() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    let period_s = |header: &str| {
+        change_line(&source, 1, |_| header.to_owned());
+        let out = tempfile::tempdir().unwrap();
+        let imported = run(&source, &out.path().join("set"), small()).unwrap();
+        (imported.info.frame_period_s * 1e6).round() / 1e6
+    };
+    let quoted = "timestamp,file,\"action.speed [a;b;c;d]\",state.heading";
+    assert_eq!(period_s(quoted), 0.1);
+    assert_eq!(period_s("\u{feff}timestamp [s],file,action.speed,state.heading"), 0.1);
+    for line in 2..14 {
+        change_line(&source, line, |text| {
+            let (time, rest) = text.split_once(',').unwrap();
+            format!("{},{rest}", time.parse::<f64>().unwrap() * 1000.0)
+        });
+    }
+    assert_eq!(period_s("timestamp [ms],file,action.speed,state.heading"), 0.1);
+    change_line(&source, 1, |_| {
+        "timestamp [h],file,action.speed,state.heading".to_owned()
+    });
+    assert!(refused(&source, small()).contains("its unit must be s, ms, us or ns"));
+    fs::write(source.join("log.csv"), "").unwrap();
+    assert!(refused(&source, small()).contains("is empty; its first line must name the columns"));
+}
+
+#[test]
 fn enormous_files_are_not_read_as_images() {
     let dir = tempfile::tempdir().unwrap();
     let source = folder(dir.path());

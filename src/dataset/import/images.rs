@@ -1,6 +1,6 @@
 //! A folder of images, with or without a CSV file that gives each its time, action and state.
 
-use std::io::{BufRead as _, BufReader, Read as _};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use super::recording::{Images, Record, Recording};
@@ -22,8 +22,10 @@ const TIME_COLUMNS: [(&str, f64); 8] = [
     ("timestamp_ns", 1e-9),
 ];
 
-/// Where the end of a CSV file's first line is looked for.
-const MAX_HEADER_BYTES: u64 = 1 << 20;
+/// What can separate the columns of a CSV file.
+const SEPARATORS: [u8; 3] = *b",;\t";
+/// The largest CSV file.
+const MAX_CSV_BYTES: u64 = 1 << 30;
 
 /// Reads the records of a folder. Errors: `Option`, `Io`, `Record`.
 pub(super) fn open(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
@@ -109,17 +111,7 @@ struct Columns {
 }
 
 fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
-    let unreadable = |error: csv::Error| ImportError::record(csv.display().to_string(), error.to_string());
-    let mut reader = csv::ReaderBuilder::new()
-        .delimiter(separator(csv)?)
-        .trim(csv::Trim::All)
-        .from_reader(open_file(csv)?);
-    let header: Vec<String> = reader
-        .headers()
-        .map_err(unreadable)?
-        .iter()
-        .map(str::to_owned)
-        .collect();
+    let (mut reader, header) = reader(csv, options)?;
     let columns = Columns::find(&header, csv, options)?;
     let mut recording = Recording {
         name: name_of(folder),
@@ -159,16 +151,73 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
     Ok(recording)
 }
 
-/// What separates the columns: the most frequent of comma, semicolon and tab in the first line.
-fn separator(csv: &Path) -> Result<u8, ImportError> {
-    let mut header = Vec::new();
-    let mut beginning = BufReader::new(open_file(csv)?.take(MAX_HEADER_BYTES));
-    beginning
-        .read_until(b'\n', &mut header)
-        .map_err(ImportError::io("read", csv))?;
-    let count = |separator: &u8| header.split(|byte| byte == separator).count();
-    // The last of equals: a comma, if there is none of them.
-    Ok(*b"\t;,".iter().max_by_key(|separator| count(separator)).unwrap_or(&b','))
+/// A CSV file after its header, and the header. Its columns are separated by what gives the images' column, or else the
+/// most columns. Errors: `Option`, `Io`.
+fn reader(csv: &Path, options: &ImportOptions) -> Result<(csv::Reader<File>, Vec<String>), ImportError> {
+    let bytes = open_file(csv)?.metadata().map_err(ImportError::io("read", csv))?.len();
+    if bytes > MAX_CSV_BYTES {
+        let (size, most) = (bytes >> 20, MAX_CSV_BYTES >> 20);
+        let reason = format!("{} has {size} MiB; at most {most} MiB are possible", csv.display());
+        return Err(ImportError::Option(reason));
+    }
+    let mut best: Option<(csv::Reader<File>, Vec<String>)> = None;
+    for separator in SEPARATORS {
+        let mut reader = csv::ReaderBuilder::new()
+            .delimiter(separator)
+            .trim(csv::Trim::All)
+            .from_reader(open_file(csv)?);
+        let header = reader.headers().map_err(|error| {
+            let reason = format!("the header of {} cannot be read: {error}", csv.display());
+            ImportError::Option(reason)
+        })?;
+        let header: Vec<String> = header.iter().map(str::to_owned).collect();
+        if image_column(&header, options).is_some() {
+            return Ok((reader, header));
+        }
+        if best.as_ref().is_none_or(|(_, other)| header.len() > other.len()) {
+            best = Some((reader, header));
+        }
+    }
+    best.filter(|(_, header)| !header.is_empty()).ok_or_else(|| {
+        ImportError::Option(format!(
+            "{} is empty; its first line must name the columns",
+            csv.display()
+        ))
+    })
+}
+
+/// The column of that name, with or without its unit.
+fn position(header: &[String], name: &str) -> Option<usize> {
+    header
+        .iter()
+        .position(|text| text == name || name_and_unit(text).0 == name)
+}
+
+/// The column with the images' files.
+fn image_column(header: &[String], options: &ImportOptions) -> Option<usize> {
+    match &options.image {
+        Some(name) => position(header, name),
+        None => FILE_COLUMNS.iter().find_map(|name| position(header, name)),
+    }
+}
+
+/// The column with the times and its unit in seconds: the unit in the header, or else the one that the name says.
+/// Errors: `Option` for another unit.
+fn time_column(header: &[String], column: usize, by_name_s: f64) -> Result<(usize, f64), ImportError> {
+    let unit_s = match name_and_unit(&header[column]).1 {
+        "" => by_name_s,
+        "s" => 1.0,
+        "ms" => 1e-3,
+        "us" | "µs" | "μs" => 1e-6,
+        "ns" => 1e-9,
+        _ => {
+            return Err(ImportError::Option(format!(
+                "the column of times is {:?}; its unit must be s, ms, us or ns",
+                header[column]
+            )));
+        }
+    };
+    Ok((column, unit_s))
 }
 
 /// Splits `speed [m/s]` or `speed (m/s)` into name and unit.
@@ -192,16 +241,19 @@ fn channels(header: &[String], columns: &[usize], options: &ImportOptions) -> Ve
 
 impl Columns {
     fn find(header: &[String], csv: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
-        let position = |name: &str| {
+        let listed = || {
             header
                 .iter()
-                .position(|text| text == name || name_and_unit(text).0 == name)
+                .map(|name| name.escape_debug().to_string())
+                .collect::<Vec<_>>()
+                .join(", ")
         };
+        let position = |name: &str| position(header, name);
         let missing = |name: &str, option: &str| {
             ImportError::Option(format!(
                 "{} has no column \"{name}\" ({option}); its columns are: {}",
                 csv.display(),
-                header.join(", ")
+                listed()
             ))
         };
         let wanted = |names: &[String], option: &str| -> Result<Vec<usize>, ImportError> {
@@ -215,27 +267,27 @@ impl Columns {
             };
             (0..header.len()).filter(|&column| is_of(&header[column])).collect()
         };
-        let file = match &options.image {
-            Some(name) => position(name).ok_or_else(|| missing(name, "--image"))?,
-            None => FILE_COLUMNS
-                .iter()
-                .find_map(|name| position(name))
-                .ok_or_else(|| missing("file", "name the images' column with --image"))?,
-        };
+        let file = image_column(header, options).ok_or_else(|| match &options.image {
+            Some(name) => missing(name, "--image"),
+            None => missing("file", "name the images' column with --image"),
+        })?;
         let time = match &options.time {
             Some(name) => Some((
                 position(name).ok_or_else(|| missing(name, "--time"))?,
-                seconds_per_unit(name),
+                seconds_per_unit(name_and_unit(name).0),
             )),
             None => TIME_COLUMNS
                 .iter()
                 .find_map(|(name, unit_s)| position(name).map(|column| (column, *unit_s))),
         };
+        let time = time
+            .map(|(column, unit_s)| time_column(header, column, unit_s))
+            .transpose()?;
         if time.is_none() && options.rate_hz.is_none() {
             return Err(ImportError::Option(format!(
                 "{} has no column of times (its columns are: {}); name it with --time, or give --rate",
                 csv.display(),
-                header.join(", ")
+                listed()
             )));
         }
         let (mut actions, mut states) = (

@@ -1,7 +1,7 @@
 //! The records of a recording before they are brought to one frame rate.
 
 use std::fs::File;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::PoisonError;
 
@@ -94,15 +94,7 @@ impl Images {
         match self {
             Self::Files(paths) => {
                 let path = &paths[image];
-                let bytes = read_file(path).map_err(|error| match error {
-                    ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
-                        ImportError::record(place, format!("the image {} is missing", path.display()))
-                    }
-                    ImportError::Io { source, .. } if !may_pass(&source) => {
-                        ImportError::record(place, format!("the image {} cannot be read: {source}", path.display()))
-                    }
-                    other => other,
-                })?;
+                let bytes = read_image(path, place)?;
                 codec::decode(&bytes).map_err(|source| ImportError::Image {
                     place: place.to_owned(),
                     path: path.clone(),
@@ -114,6 +106,19 @@ impl Images {
             Self::Bag(bag) => bag.read(image, place),
         }
     }
+}
+
+/// The bytes of an image file. Errors: `Record` if it is missing or cannot be read, `Io` where trying again may help.
+pub(super) fn read_image(path: &Path, place: &str) -> Result<Vec<u8>, ImportError> {
+    read_file(path).map_err(|error| match error {
+        ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
+            ImportError::record(place, format!("the image {} is missing", path.display()))
+        }
+        ImportError::Io { source, .. } if !may_pass(&source) => {
+            ImportError::record(place, format!("the image {} cannot be read: {source}", path.display()))
+        }
+        other => other,
+    })
 }
 
 impl RawImages {

@@ -10,8 +10,8 @@ use arrow_array::{Array, RecordBatch};
 use parquet::arrow::ProjectionMask;
 
 use super::super::images::inside;
-use super::super::recording::{PixelType, RawImages};
-use super::super::{ImportError, open_file, read_file, video};
+use super::super::recording::{PixelType, RawImages, read_image};
+use super::super::{ImportError, open_file, video};
 use crate::dataset::parquet_file;
 use crate::frame::{Frame, codec};
 
@@ -79,7 +79,7 @@ impl ImageTable {
             StoredImage::Bytes(bytes) => (bytes, path.clone()),
             StoredImage::File(name) => {
                 let path = inside(&self.source, &name, place)?;
-                (read_file(&path)?, path)
+                (read_image(&path, place)?, path)
             }
             StoredImage::Missing => {
                 return Err(ImportError::record(place, format!("{} has no image", self.column)));
