@@ -25,7 +25,8 @@ pub fn printable(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
         if character.is_control() && !['\n', '\t'].contains(&character) {
-            shown.push_str(&format!("\\u{:04x}", u32::from(character)));
+            let escape = format!("\\u{:04x}", u32::from(character));
+            shown.push_str(&escape);
         } else {
             shown.push(character);
         }

@@ -107,8 +107,8 @@ impl Augmentation {
                 Mirror::Off(_) => None,
                 Mirror::Channels(names) => Some(signed_channels(names, info)?),
             },
-            brightness: config.brightness,
-            crop: config.crop,
+            brightness: config.brightness as f32,
+            crop: config.crop as f32,
             seed: seed.derive("augment", 0),
         })
     }

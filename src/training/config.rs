@@ -94,11 +94,11 @@ pub struct DataConfig {
     pub mirror: Mirror,
     /// Each training window is made brighter or darker by up to this share, 0 to 0.9.
     #[serde(default)]
-    pub brightness: f32,
+    pub brightness: f64,
     /// Each training window shows a part of the frames, enlarged: up to this share of each side is cut off, 0 to 0.5. Only for
     /// data sets without a camera model.
     #[serde(default)]
-    pub crop: f32,
+    pub crop: f64,
     /// Whether a model may be conditioned on actions that never change in the training windows.
     #[serde(default)]
     pub constant_actions: bool,
@@ -299,8 +299,8 @@ impl TrainConfig {
             ("fit.ssim_weight", fit.ssim_weight, 100.0),
             ("fit.scene_weight", fit.scene_weight, 100.0),
             ("fit.motion_weight", fit.motion_weight, 100.0),
-            ("data.brightness", f64::from(self.data.brightness), 0.9),
-            ("data.crop", f64::from(self.data.crop), 0.5),
+            ("data.brightness", self.data.brightness, 0.9),
+            ("data.crop", self.data.crop, 0.5),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
             ("run.clip_norm", run.clip_norm, 1e6),
         ];

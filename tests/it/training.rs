@@ -289,6 +289,7 @@ fn windows_can_be_cut_out_where_no_camera_model_is_known() {
     let config = small_config(&["data.crop=0.2"]);
     train(&config, &dataset, &cut).unwrap();
     assert!(weights(&whole) != weights(&cut));
+    let config = small_config(&["data.crop=0.2", "model.conditioning=none"]);
     let error = train(&config, &standing(CameraModel::new(1.0, 0.2).ok()), &refused).unwrap_err();
     assert!(
         error
