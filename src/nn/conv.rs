@@ -69,7 +69,7 @@ struct ImageGeometry {
 }
 
 /// Output places that one matrix product computes.
-struct Block {
+struct PlaceBlock {
     /// The first row of output places.
     row: usize,
     /// Where the kernel of the first place begins, in the values of the bordered image.
@@ -79,7 +79,7 @@ struct Block {
 }
 
 /// Taps of the kernel whose values lie side by side.
-struct Run {
+struct TapRun {
     /// From the beginning of the kernel, in the values of the bordered image.
     offset: usize,
     /// Rows of the weight.
@@ -148,10 +148,10 @@ impl ImageGeometry {
     }
 
     /// All output places. Without a stride they are one block, in which the borders between rows count as places.
-    fn blocks(self) -> impl Iterator<Item = Block> {
+    fn blocks(self) -> impl Iterator<Item = PlaceBlock> {
         let ConvShape { stride, dilation } = self.shape;
         let count = if stride == 1 { 1 } else { self.out_height() };
-        (0..count).map(move |row| Block {
+        (0..count).map(move |row| PlaceBlock {
             row,
             from: row * stride * self.pitch() * self.channels,
             places: match stride {
@@ -162,11 +162,11 @@ impl ImageGeometry {
     }
 
     /// The taps: whole rows of the kernel where they are neighbours.
-    fn runs(self) -> impl Iterator<Item = Run> {
+    fn runs(self) -> impl Iterator<Item = TapRun> {
         let (channels, dilation) = (self.channels, self.shape.dilation);
         let columns = if dilation == 1 { 1 } else { SIDE };
         (0..SIDE).flat_map(move |row| {
-            (0..columns).map(move |column| Run {
+            (0..columns).map(move |column| TapRun {
                 offset: (row * self.pitch() + column) * dilation * channels,
                 first: (row * SIDE + column) * channels,
                 length: SIDE / columns * channels,
@@ -175,7 +175,7 @@ impl ImageGeometry {
     }
 
     /// The matrix of a run's values at the places of a block, one place a row.
-    fn neighbours(self, block: &Block, run: &Run) -> Layout {
+    fn neighbours(self, block: &PlaceBlock, run: &TapRun) -> Layout {
         let steps = vec![self.shape.stride * self.channels, 1];
         Layout::new(Shape::from((block.places, run.length)), steps, block.from + run.offset)
     }

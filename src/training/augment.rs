@@ -26,7 +26,7 @@ pub(super) struct Augmentation {
 
 /// The part of a frame that is enlarged to the whole.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct CutOut {
+pub(super) struct FramePart {
     /// Width and height, as a share of the frame's, above 0, at most 1.
     pub(super) side: f32,
     /// Where it lies between the left and the right border, 0 to 1.
@@ -35,13 +35,12 @@ pub(super) struct CutOut {
     pub(super) down: f32,
 }
 
-impl CutOut {
+impl FramePart {
     /// The part of a frame, enlarged to the frame's size. Pixels between those of the frame are interpolated.
     fn enlarge(self, values: &mut [f32], width: usize) {
         let height = values.len() / width;
         let place = |index: usize, length: usize, at: f32| {
-            let length = length as f32;
-            (at * (1.0 - self.side) * length + (index as f32 + 0.5) * self.side - 0.5).clamp(0.0, length - 1.0)
+            at * (1.0 - self.side) * length as f32 + (index as f32 + 0.5) * self.side
         };
         let grid: Vec<[f32; 2]> = (0..values.len())
             .map(|index| {
@@ -62,7 +61,7 @@ pub(super) struct WindowChange {
     /// Factor of all intensities.
     pub(super) gain: f32,
     /// The part that is seen, after mirroring; `None` for all of it.
-    pub(super) cut_out: Option<CutOut>,
+    pub(super) part: Option<FramePart>,
 }
 
 impl WindowChange {
@@ -70,7 +69,7 @@ impl WindowChange {
     pub(super) const NONE: Self = Self {
         is_mirrored: false,
         gain: 1.0,
-        cut_out: None,
+        part: None,
     };
 
     /// Changes a frame's intensities, 0 to 1, row by row; `inverted` ones if the model inverts.
@@ -78,8 +77,8 @@ impl WindowChange {
         if self.is_mirrored {
             values.chunks_exact_mut(width).for_each(<[f32]>::reverse);
         }
-        if let Some(cut_out) = self.cut_out {
-            cut_out.enlarge(values, width);
+        if let Some(part) = self.part {
+            part.enlarge(values, width);
         }
         if self.gain == 1.0 {
             return;
@@ -93,7 +92,7 @@ impl WindowChange {
 }
 
 impl Augmentation {
-    /// As the settings say. Errors: `Config` for a channel that the data set does not have, and for cut-outs of frames whose
+    /// As the settings say. Errors: `Config` for a channel that the data set does not have, and for parts of frames whose
     /// camera model is known.
     pub(super) fn new(config: &DataConfig, info: &DatasetInfo, seed: Seed) -> Result<Self, TrainError> {
         if config.crop > 0.0 && info.camera.is_some() {
@@ -126,7 +125,7 @@ impl Augmentation {
         WindowChange {
             is_mirrored: rng.random::<bool>() && self.mirror.is_some(),
             gain: 1.0 + self.brightness * rng.random_range(-1.0f32..=1.0),
-            cut_out: (self.crop > 0.0).then(|| CutOut {
+            part: (self.crop > 0.0).then(|| FramePart {
                 side: 1.0 - self.crop * rng.random::<f32>(),
                 across: rng.random(),
                 down: rng.random(),
@@ -186,9 +185,9 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_out_is_enlarged_to_the_whole_frame() {
+    fn a_part_is_enlarged_to_the_whole_frame() {
         let mut ramp: Vec<f32> = (0..32).map(|index| (index % 8) as f32).collect();
-        let upper_right = CutOut {
+        let upper_right = FramePart {
             side: 0.5,
             across: 1.0,
             down: 0.0,
@@ -196,7 +195,7 @@ mod tests {
         upper_right.enlarge(&mut ramp, 8);
         let row = [3.75, 4.25, 4.75, 5.25, 5.75, 6.25, 6.75, 7.0];
         assert_eq!(ramp, row.repeat(4));
-        let whole = CutOut {
+        let whole = FramePart {
             side: 1.0,
             ..upper_right
         };
