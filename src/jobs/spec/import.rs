@@ -39,9 +39,9 @@ pub struct ImportSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.01, maximum = 1000)]
     pub rate: Option<f64>,
-    /// Keeps every Nth frame; actions in between are averaged.
+    /// Keeps every Nth frame, 1 to 1,000,000; actions in between are averaged.
     #[serde(default = "default_every")]
-    #[schema(default = 1, minimum = 1)]
+    #[schema(default = 1, minimum = 1, maximum = 1_000_000)]
     pub every: usize,
     /// The CSV file, below `import_dir`; by default the only one in the folder.
     #[serde(default, skip_serializing_if = "Option::is_none")]
