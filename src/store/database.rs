@@ -349,17 +349,16 @@ fn sqlite_failed(path: &Path, source: sqlx::Error) -> StoreError {
     }
 }
 
-/// SQLite opens a database on a read-only file system for reading, and such a connection would never write again, also if
-/// the file system can be written later. Errors: the connection cannot write.
+/// SQLite opens a file that cannot be written for reading, and such a connection would never write again, also if the file
+/// can be written later. Errors: the connection cannot write.
 async fn refuse_read_only(connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
     // Without waiting for another writer.
     sqlx::raw_sql("PRAGMA busy_timeout = 0")
         .execute(&mut *connection)
         .await?;
-    match sqlx::raw_sql("BEGIN IMMEDIATE; ROLLBACK")
-        .execute(&mut *connection)
-        .await
-    {
+    // BEGIN alone succeeds where nothing can be written. Nothing of this is kept.
+    let write = "BEGIN IMMEDIATE; CREATE TABLE write_check (id INTEGER); ROLLBACK";
+    match sqlx::raw_sql(write).execute(&mut *connection).await {
         Err(error) if sqlite_code(&error) != Some(SQLITE_BUSY) => return Err(error),
         _ => {}
     }
