@@ -25,7 +25,8 @@ use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcom
   foreframe train --from moving-flow --dataset mine --set name=mine --set fit.steps=300")]
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow,
-    /// moving-flow (flow network; moving-flow takes state and actions) or recording (flow network, with actions)
+    /// moving-flow (flow network; moving-flow takes state and actions), recording (flow network, with actions) or moving-mnist
+    /// (flow network, for the benchmark)
     #[arg(long, default_value = "paper", conflicts_with = "from")]
     preset: String,
     /// Start from the weights and settings of this model: its directory, name or NAME@VERSION. A few hundred steps are often
