@@ -161,6 +161,10 @@ impl Database {
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
             .busy_timeout(BUSY_TIMEOUT);
+        // The pool tries for long and hides the reason; a single connection reports it at once.
+        check_connection(&options)
+            .await
+            .map_err(|source| sqlite_failed(&path, source))?;
         let pool = SqlitePoolOptions::new()
             .max_connections(MAX_CONNECTIONS)
             .acquire_timeout(BUSY_TIMEOUT)
@@ -347,6 +351,13 @@ fn sqlite_failed(path: &Path, source: sqlx::Error) -> StoreError {
             source,
         },
     }
+}
+
+/// Errors: the database cannot be opened or written.
+async fn check_connection(options: &SqliteConnectOptions) -> Result<(), sqlx::Error> {
+    let mut connection = SqliteConnection::connect_with(options).await?;
+    refuse_read_only(&mut connection).await?;
+    connection.close().await
 }
 
 /// SQLite opens a file that cannot be written for reading, and such a connection would never write again, also if the file

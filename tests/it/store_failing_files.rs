@@ -4,14 +4,14 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};
 use crate::jobs_outage::{training, undisturbed};
-use crate::process::RunningServer;
+use crate::process::{RunningServer, foreframe, text};
 use crate::recordings;
 use crate::service::{context, model, spec};
 use crate::store_away::{status, wait_for_status};
@@ -148,6 +148,29 @@ fn all_at_once<T: Send>(call: impl Fn(usize) -> T + Sync) -> Vec<T> {
         let calls: Vec<_> = (0..12).map(|index| scope.spawn(move || call(index))).collect();
         calls.into_iter().map(|call| call.join().unwrap()).collect()
     })
+}
+
+#[test]
+fn a_database_that_cannot_be_written_is_refused_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(library) = compiled(dir.path()) else { return };
+    let data = dir.path().join("data");
+    let list = |database: &Path| {
+        let switch = dir.path().join("switch");
+        std::fs::write(&switch, EROFS.to_string()).unwrap();
+        let arguments = ["models", "list", "--data-dir", data.to_str().unwrap()];
+        let mut command = foreframe(dir.path());
+        command.args(arguments).env("LD_PRELOAD", &library);
+        command.env("FAILING_DIR", database).env("FAILING_SWITCH", switch);
+        command.output().unwrap()
+    };
+    assert!(list(Path::new("/nowhere")).status.success());
+    let started = Instant::now();
+    let refused = list(&data.join("foreframe.db"));
+    let error = text(&refused.stderr);
+    assert!(!refused.status.success(), "{error}");
+    assert!(error.contains("could not open the SQLite database: "), "{error}");
+    assert!(started.elapsed() < Duration::from_secs(8), "{error}");
 }
 
 #[test]
