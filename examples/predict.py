@@ -235,17 +235,27 @@ class FlowNetwork:
         commanded = self.by_unit(self.spec["actions"])
         measured = self.by_unit(self.states)
         before = [None if place is None else state[place] for place in measured]
+        drive = self.tensors.get("flow.motion.drive", np.zeros(2))
+        half_track, acceleration = np.array([0.15, 2.0]) * np.exp(np.clip(drive, -6, 6))
+
+        def wheels(speeds):
+            return np.array([speeds[0] - speeds[1] * half_track, speeds[0] + speeds[1] * half_track])
+
+        def commanded_in(action):
+            known = [before[part] if place is None else action[place] for part, place in enumerate(commanded)]
+            return [speed or 0.0 for speed in known]
+
+        first = commanded_in(actions[0])
+        speed = wheels([first[part] if before[part] is None else before[part] for part in (0, 1)])
         pose, plain = (0.0, 0.0, 0.0), []
         for action in actions:
-            speeds = []
-            for part in (0, 1):
-                now = None if commanded[part] is None else action[commanded[part]]
-                if now is None:
-                    speeds.append(before[part] or 0.0)
-                else:
-                    speeds.append(now if before[part] is None else now + 0.3 * (before[part] - now))
-                    before[part] = now
-            turn, distance = speeds[1] * period, speeds[0] * period
+            target = wheels(commanded_in(action))
+            difference = np.abs(target - speed)
+            change = np.minimum(difference, acceleration * period)
+            lost = change * (2 * difference - change) / (2 * acceleration * period)
+            left, right = target - lost * np.sign(target - speed)
+            speed = speed + change * np.sign(target - speed)
+            turn, distance = (right - left) / (2 * half_track) * period, (left + right) / 2 * period
             pose = moved(pose, (turn, distance * np.cos(turn / 2), distance * np.sin(turn / 2)))
             plain.append([pose[2], pose[0], pose[1]])
         known = np.concatenate([self.scaled_state(state), scaled(actions, self.spec["actions"]).reshape(-1)])

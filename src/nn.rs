@@ -20,6 +20,7 @@ pub mod conditioned;
 mod conv;
 pub mod costs;
 pub mod dense;
+mod drive;
 pub mod flow;
 mod flow_inputs;
 pub mod flow_spec;

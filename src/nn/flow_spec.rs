@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
 use super::conv::TAPS;
 use super::flow_inputs::EncoderViews;
-use super::motion::MOTION_HIDDEN;
+use super::motion::{DRIVE, MOTION_HIDDEN, StateChannels};
 use super::sampling::ImageSize;
 use super::scene::SceneKind;
 use super::spec::in_range;
@@ -185,6 +185,9 @@ impl FlowLayers {
         for layer in self.sizes(spec) {
             shapes.insert(format!("{}.weight", layer.name), vec![layer.inputs, layer.outputs]);
             shapes.insert(format!("{}.bias", layer.name), vec![layer.outputs]);
+        }
+        if StateChannels::of(spec).commands_speeds() {
+            shapes.insert(DRIVE.to_owned(), vec![2]);
         }
         let ImageSize { height, width } = spec.image_size().shrunk(2);
         match SceneKind::of(spec) {

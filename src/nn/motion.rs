@@ -1,9 +1,10 @@
-//! How the camera will have moved at each predicted step: the integral of the commanded and measured speeds, corrected by
-//! a small learned network that knows how the wheels follow their commands.
+//! How the camera will have moved at each predicted step: the integral of the speeds of a [`drive`](super::drive) that
+//! follows its commands, corrected by a small learned network.
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use super::dense::Dense;
+use super::drive::{self, CommandedSpeeds};
 use super::flow::Layers;
 use super::flow_inputs::FutureRows;
 use super::modulation::silu;
@@ -12,10 +13,10 @@ use super::{ChannelScale, ModelSpec, NnError};
 
 /// Hidden units of the correction.
 pub(super) const MOTION_HIDDEN: usize = 64;
+/// The tensor of the drive's learned values.
+pub(super) const DRIVE: &str = "flow.motion.drive";
 /// Radians or metres that one unit of the correction stands for.
 const CORRECTION: f64 = 0.1;
-/// Share of a step for which the speed before it lasts, before anything is learned.
-const LAG: f32 = 0.3;
 /// Pixels that one unit of the affine map moves the frame's corner, as a share of its side.
 const AFFINE: f64 = 0.25;
 
@@ -88,31 +89,29 @@ impl StateChannels {
         }
     }
 
-    /// Yaw, ahead and left at each step, from the plain integral of the speeds.
-    fn integral(self, rows: &FutureRows, row: usize, period_s: f32) -> Vec<f32> {
+    /// Whether the actions command speeds.
+    pub(super) fn commands_speeds(self) -> bool {
+        self.commanded.iter().any(Option::is_some)
+    }
+
+    /// The speeds of a future. One that is not commanded stays as measured; one that is not measured starts as commanded.
+    fn speeds(self, rows: &FutureRows, row: usize) -> CommandedSpeeds {
         let (state, actions) = (rows.state(row), rows.actions(row));
-        let mut pose = CameraPose::default();
-        let mut before: [Option<f32>; 2] = self.measured.map(|channel| channel.map(|channel| state[channel]));
-        let mut motions = Vec::with_capacity(3 * actions.len());
-        for action in actions.chunks_exact(rows.action_count().max(1)) {
-            let speeds: [f32; 2] = std::array::from_fn(|part| {
-                let commanded = self.commanded[part].map(|channel| action[channel]);
-                let mean = match (commanded, before[part]) {
-                    (Some(commanded), Some(before)) => commanded + LAG * (before - commanded),
-                    (Some(speed), None) | (None, Some(speed)) => speed,
-                    (None, None) => 0.0,
-                };
-                before[part] = commanded.or(before[part]);
-                mean
-            });
-            let turn = speeds[1] * period_s;
-            let ahead = speeds[0] * period_s;
-            let (sin, cos) = (turn / 2.0).sin_cos();
-            pose = pose.moved([turn, ahead * cos, ahead * sin]);
-            // Headings are not wrapped, so the pose relative to the first is the motion.
-            motions.extend([pose.heading, pose.x, pose.y]);
+        let measured = self.measured.map(|channel| channel.map(|channel| state[channel]));
+        let commands: Vec<[f32; 2]> = actions
+            .chunks_exact(rows.action_count().max(1))
+            .map(|action| {
+                std::array::from_fn(|part| {
+                    let commanded = self.commanded[part].map(|channel| action[channel]);
+                    commanded.or(measured[part]).unwrap_or(0.0)
+                })
+            })
+            .collect();
+        let first = commands.first().copied().unwrap_or_default();
+        CommandedSpeeds {
+            start: std::array::from_fn(|part| measured[part].unwrap_or(first[part])),
+            commands,
         }
-        motions
     }
 }
 
@@ -120,6 +119,8 @@ impl StateChannels {
 #[derive(Clone, Debug)]
 pub(super) struct MotionHead {
     layers: Option<[Dense; 2]>,
+    /// What was learned of the wheels; `None` where no speeds are commanded.
+    drive: Option<Tensor>,
     affine: Option<Dense>,
 }
 
@@ -129,6 +130,9 @@ impl MotionHead {
         let layers = || Ok::<_, NnError>([find.dense("flow.motion.inputs")?, find.dense("flow.motion.output")?]);
         Ok(Self {
             layers: is_moving.then(layers).transpose()?,
+            drive: (StateChannels::of(spec).commands_speeds())
+                .then(|| find.tensor(DRIVE))
+                .transpose()?,
             affine: (is_moving && spec.camera.is_none())
                 .then(|| find.dense("flow.affine"))
                 .transpose()?,
@@ -144,13 +148,18 @@ impl MotionHead {
     pub(super) fn forward(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<Tensor, NnError> {
         let shape = (rows.count(), spec.horizon, 3);
         let Some([inputs, output]) = &self.layers else {
-            return Ok(Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu)?);
+            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
         let channels = StateChannels::of(spec);
-        let plain: Vec<f32> = (0..rows.count())
-            .flat_map(|row| channels.integral(rows, row, spec.frame_period_s as f32))
-            .collect();
-        let plain = Tensor::from_vec(plain, shape, &Device::Cpu)?;
+        let speeds = (0..rows.count()).map(|row| channels.speeds(rows, row)).collect();
+        let plain = match &self.drive {
+            Some(drive) => drive::integral(drive, speeds, spec.frame_period_s)?,
+            None => drive::integral(
+                &Tensor::zeros(2, DType::F32, &Device::Cpu)?,
+                speeds,
+                spec.frame_period_s,
+            )?,
+        };
         let correction = output.forward(&silu(&inputs.forward(&rows.scaled(spec)?)?)?)?;
         Ok((plain + (correction.reshape(shape)? * CORRECTION)?)?)
     }
@@ -171,10 +180,7 @@ impl MotionHead {
         let sides = Tensor::new(&[size.width as f32, size.height as f32], &Device::Cpu)?;
         let from_middle = (own.broadcast_div(&sides)? * 2.0)?.affine(1.0, -1.0)?;
         let basis = Tensor::cat(
-            &[
-                &from_middle,
-                &Tensor::ones((1, pixels, 1), candle_core::DType::F32, &Device::Cpu)?,
-            ],
+            &[&from_middle, &Tensor::ones((1, pixels, 1), DType::F32, &Device::Cpu)?],
             2,
         )?;
         let map = (affine.forward(motion)? * AFFINE)?.reshape((items, 3, 2))?;
