@@ -421,11 +421,12 @@ pub(super) fn is_unavailable(error: &sqlx::Error) -> bool {
                 code,
                 SQLITE_BUSY | SQLITE_READONLY | SQLITE_IOERR | SQLITE_FULL | SQLITE_CANTOPEN
             ),
-            // Connection exceptions, lack of resources, and operator intervention, for example a shutdown.
+            // Connection exceptions, lack of resources, operator intervention (for example a shutdown), and a server that only
+            // reads for now, as a replica does until it takes over.
             None => error
                 .as_database_error()
                 .and_then(sqlx::error::DatabaseError::code)
-                .is_some_and(|code| ["08", "53", "57"].iter().any(|class| code.starts_with(class))),
+                .is_some_and(|code| ["08", "53", "57", "25006"].iter().any(|class| code.starts_with(class))),
         },
         _ => false,
     }

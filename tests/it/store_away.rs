@@ -179,6 +179,45 @@ fn a_server_survives_a_database_that_goes_away() {
 }
 
 #[test]
+fn a_database_that_only_reads_for_a_while_refuses_writes_until_later() {
+    let Some(postgres) = OwnPostgres::new() else { return };
+    postgres.start();
+    let dir = tempfile::tempdir().unwrap();
+    let url = postgres.url();
+    let server = RunningServer::start(dir.path(), &["--no-jobs", "--database-url", &url]);
+    let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1});
+    let create = |name: &str| server.ask("POST", "/v1/jobs", &collect(name));
+    let read_only = |value: &str| {
+        let setting = format!("ALTER SYSTEM SET default_transaction_read_only = {value}");
+        for statement in [setting.as_str(), "SELECT pg_reload_conf()"] {
+            postgres.succeed("psql", &["-q", "-d", &url, "-c", statement]);
+        }
+    };
+    // The server's connections notice a changed setting between two statements.
+    let wait_until = |name: &str, is_reached: &dyn Fn(&Value) -> bool| {
+        let deadline = Instant::now() + TIMEOUT;
+        loop {
+            let answer = create(name);
+            if is_reached(&answer) {
+                return;
+            }
+            assert!(Instant::now() < deadline, "{answer}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    assert_eq!(create("before")["id"], "job-1");
+
+    read_only("on");
+    wait_until("meanwhile", &|answer| answer["status"] == 503);
+    assert_eq!(status(&server.get("/v1/jobs")), "200");
+    assert_eq!(status(&server.get("/livez")), "200");
+    read_only("off");
+    wait_until("after", &|answer| answer["id"].is_string());
+    let kept = server.get("/v1/jobs");
+    assert!(kept.contains("\"before\"") && kept.contains("\"after\""), "{kept}");
+}
+
+#[test]
 fn a_starting_server_waits_for_its_database() {
     let Some(postgres) = OwnPostgres::new() else { return };
     let dir = tempfile::tempdir().unwrap();
