@@ -47,6 +47,13 @@ def scaled(values, channels):
     return (np.asarray(values, np.float32).reshape(-1, len(channels)) - mean) / std
 
 
+def limited(values, channels):
+    """At most a million standard deviations from the mean."""
+    mean = np.array([channel["mean"] for channel in channels], np.float32)
+    most = 1e6 * np.array([max(channel["std"], LEAST_STD) for channel in channels], np.float32)
+    return np.clip(np.asarray(values, np.float32).reshape(-1, len(channels)), mean - most, mean + most)
+
+
 def dense(x, tensors, name):
     return x @ tensors[name + ".weight"] + tensors[name + ".bias"]
 
@@ -363,6 +370,10 @@ class FlowNetwork:
         return x
 
     def predict(self, frames, actions, state):
+        if self.moves:
+            actions = limited(actions, self.spec["actions"])
+        if self.states:
+            state = limited(state, self.states)[0]
         motions, coarse = self.motions(state, actions), self.encode(frames, state)
         if self.spec["flow"].get("recurrent", False):
             return self.predict_recurrently(frames[-1], coarse, state)

@@ -59,6 +59,14 @@ pub enum RegistryError {
         /// The parser's error.
         source: serde_json::Error,
     },
+    /// A value in the manifest is out of range.
+    #[error("{} is not a valid model manifest: {reason}", path.display())]
+    ManifestValue {
+        /// The file.
+        path: PathBuf,
+        /// Which value, and what it must be.
+        reason: String,
+    },
     /// The weights file has another hash than the manifest states.
     #[error("{} has SHA-256 {found}, but its manifest states {expected}; download the model or train it again", path.display())]
     Hash {
@@ -70,7 +78,10 @@ pub enum RegistryError {
         expected: String,
     },
     /// The weights do not match the model specification in the manifest.
-    #[error("the weights of {} do not match their manifest: {source}", path.display())]
+    #[error(
+        "the weights of {} do not match their manifest: {source}; use the version of Foreframe that trained the model, or train it again",
+        path.display()
+    )]
     Weights {
         /// The weights file.
         path: PathBuf,

@@ -14,6 +14,7 @@ mod pretrain;
 mod principal_components;
 mod random_codec;
 mod stage;
+mod start;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -30,7 +31,6 @@ pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::stage::{StageEnd, StageRunner, TrainState};
 use crate::dataset::sampler::{Split, Splits};
 use crate::dataset::{Dataset, DatasetError, Window};
-use crate::error_text::comma_separated;
 use crate::files::write_atomically;
 use crate::frame::FrameError;
 use crate::nn::spec::MIN_CHANNEL_STD;
@@ -123,10 +123,10 @@ pub enum TrainError {
         /// The first difference.
         source: NnError,
     },
-    /// The model to start from takes other units.
+    /// The model to start from takes other units, or the same channels in another order.
     #[error(
         "the training cannot start from the model {model:?}: it takes the {kind} [{found}], and the data set has [{expected}]; \
-         the units must be the same"
+         units and order must be the same"
     )]
     OtherUnits {
         /// The model.
@@ -224,6 +224,10 @@ pub fn run(
     let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
     // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
+    training
+        .start
+        .map(|start| start::parameters(&plan, start))
+        .transpose()?;
     let _lock = files.lock()?;
     let model_dir = files.model_dir();
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
@@ -293,7 +297,7 @@ fn initial_parameters(
 ) -> Result<Option<Parameters>, TrainError> {
     let config = training.config;
     if let Some(start) = training.start {
-        return start_parameters(plan, start).map(Some);
+        return start::parameters(plan, start).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if plan.spec.architecture == Architecture::Flow {
@@ -313,34 +317,6 @@ fn initial_parameters(
         }
     }
     Ok(Some(parameters))
-}
-
-/// The weights of another model. Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
-fn start_parameters(plan: &TrainingPlan<'_>, start: &StoredWeights) -> Result<Parameters, TrainError> {
-    let (from, to) = (&start.manifest.spec, &plan.spec);
-    let used = [
-        ("action", to.action_inputs(), &from.actions, &to.actions),
-        ("state", to.state_inputs(), &from.states, &to.states),
-    ];
-    for (kind, inputs, found, expected) in used {
-        let differ = found
-            .iter()
-            .zip(expected)
-            .any(|(found, expected)| found.unit != expected.unit);
-        if inputs.is_some() && differ {
-            return Err(TrainError::OtherUnits {
-                model: start.manifest.name.clone(),
-                kind,
-                found: comma_separated(found),
-                expected: comma_separated(expected),
-            });
-        }
-    }
-    let tensors = start.parameters.snapshot()?;
-    Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
-        model: start.manifest.name.clone(),
-        source,
-    })
 }
 
 fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {

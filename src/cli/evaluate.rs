@@ -2,12 +2,15 @@
 
 use std::path::PathBuf;
 
+use clap::value_parser;
+
 use super::output::OutputDirectory;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, print_line, progress::ProgressLine};
 use crate::dataset::Dataset;
 use crate::evaluation::{self, EvaluateConfig, EvaluationReport, Purpose};
+use crate::jobs::spec::MAX_RESAMPLES;
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
 
@@ -47,13 +50,13 @@ pub(super) struct EvaluateArgs {
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
     /// Bootstrap resamples of the trials, for the intervals
-    #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples)]
-    resamples: usize,
+    #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]
+    resamples: u32,
     /// The seed of the resamples and of the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Fail if the skill on any set is lower than this; the report is written anyway
-    #[arg(long, value_name = "SKILL", allow_negative_numbers = true)]
+    #[arg(long, value_name = "SKILL", allow_negative_numbers = true, value_parser = skill)]
     min_skill: Option<f64>,
     /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
@@ -71,6 +74,15 @@ enum SplitChoice {
     Test,
     /// Every window of a data set that holds nothing but test data, such as the published file of a benchmark
     All,
+}
+
+/// Reads a skill, which is at most 1.
+fn skill(text: &str) -> Result<f64, String> {
+    let skill = text
+        .parse()
+        .ok()
+        .filter(|skill: &f64| skill.is_finite() && *skill <= 1.0);
+    skill.ok_or_else(|| "a skill is a number of at most 1, as in 0.2".to_owned())
 }
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
@@ -100,7 +112,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
             SplitChoice::All => Purpose::WholeSet,
         },
         max_windows: args.windows,
-        bootstrap_samples: args.resamples,
+        bootstrap_samples: args.resamples as usize,
         seed: Seed(args.seed),
         twins: twins.iter().collect(),
         novel: novel.iter().collect(),

@@ -271,6 +271,7 @@ pub fn import(
     }
     let recording = open(config)?;
     check_channels(&recording)?;
+    options.check_units(&recording)?;
     let plan = timing::plan(recording, options)?;
     directory.write(&plan, on_progress, cancelled)
 }
@@ -383,6 +384,21 @@ impl ImportOptions {
             return wrong("unit", &given, "write NAME=UNIT, as in speed=m/s");
         }
         Ok(())
+    }
+
+    /// Errors: `Option` if a unit is given for a channel that the recording does not have.
+    fn check_units(&self, recording: &Recording) -> Result<(), ImportError> {
+        let channels = || recording.action_channels.iter().chain(&recording.state_channels);
+        let mut named = self.units.iter().filter_map(|unit| unit.split_once('='));
+        let Some((name, _)) = named.find(|(name, _)| channels().all(|channel| channel.name != *name)) else {
+            return Ok(());
+        };
+        let known: Vec<&str> = channels().map(|channel| channel.name.as_str()).collect();
+        Err(ImportError::Option(format!(
+            "--unit names the channel \"{}\", which is not imported; there are: {}",
+            name.escape_default(),
+            known.join(", ")
+        )))
     }
 
     /// The unit that `--unit NAME=UNIT` gives a channel; empty if none does.

@@ -57,8 +57,8 @@ impl Variant {
     }
 }
 
-/// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, or lacks
-/// neither the action nor the state.
+/// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, has
+/// seen other data, or lacks neither the action nor the state.
 pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant, EvaluationError> {
     let (spec, other) = (loaded.model.spec(), twin.model.spec());
     let refused = |found: String, wanted: String| EvaluationError::Twin {
@@ -70,6 +70,10 @@ pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant,
     let window = |spec: &ModelSpec| format!("{} context frames and {} to predict", spec.context, spec.horizon);
     if window(spec) != window(other) {
         return Err(refused(window(other), window(spec)));
+    }
+    let data = |loaded: &LoadedModel| format!("training data \"{}\"", loaded.manifest.dataset.name);
+    if loaded.manifest.dataset.content_hash != twin.manifest.dataset.content_hash {
+        return Err(refused(data(twin), format!("the same {}", data(loaded))));
     }
     let inputs = |spec: &ModelSpec| (spec.action_inputs().is_some(), spec.state_inputs().is_some());
     match (inputs(spec), inputs(other)) {

@@ -47,20 +47,30 @@ impl ConditioningTensors {
 
 impl ConditioningTensors {
     /// Actions `[B, horizon, A]` and state `[B, S]` as plain values in the channels' units, empty if the conditioning does
-    /// not include them. Errors: `Missing`, `Shape`.
+    /// not include them. Values far outside the training's are limited, so that no prediction is NaN. Errors: `Missing`,
+    /// `Shape`.
     pub(super) fn raw(&self, spec: &ModelSpec, batch: usize) -> Result<(Vec<f32>, Vec<f32>), NnError> {
-        let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
+        let values = |tensor: &Tensor, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
+            let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+            let channels = channels.iter().cycle();
+            Ok(values
+                .iter()
+                .zip(channels)
+                .map(|(value, channel)| channel.limited(*value))
+                .collect())
+        };
         let actions = match spec.action_inputs() {
-            Some(count) => values(checked(
-                spec,
-                "actions",
-                self.actions.as_ref(),
-                &[batch, spec.horizon, count],
-            )?)?,
+            Some(count) => {
+                let shape = [batch, spec.horizon, count];
+                values(checked(spec, "actions", self.actions.as_ref(), &shape)?, &spec.actions)?
+            }
             None => Vec::new(),
         };
         let state = match spec.state_inputs() {
-            Some(count) => values(checked(spec, "state", self.state.as_ref(), &[batch, count])?)?,
+            Some(count) => {
+                let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+                values(state, &spec.states)?
+            }
             None => Vec::new(),
         };
         Ok((actions, state))

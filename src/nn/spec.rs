@@ -35,6 +35,8 @@ pub const MAX_PARAMETERS: u64 = 1 << 28;
 /// Smallest standard deviation used to scale a channel, in the channel's unit. It avoids division by zero for a constant
 /// channel.
 pub const MIN_CHANNEL_STD: f32 = 1e-3;
+/// Standard deviations from the mean beyond which the flow network limits a value.
+const MAX_DEVIATIONS: f32 = 1e6;
 
 macro_rules! named_enum {
     ($(#[$doc:meta])* $name:ident, $kind:literal, $known:literal, { $($(#[$vdoc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
@@ -138,6 +140,12 @@ pub struct ChannelScale {
 }
 
 impl ChannelScale {
+    /// The value, limited to [`MAX_DEVIATIONS`] standard deviations from the mean.
+    pub(super) fn limited(&self, value: f32) -> f32 {
+        let most = MAX_DEVIATIONS * self.std.max(MIN_CHANNEL_STD);
+        value.clamp(self.mean - most, self.mean + most)
+    }
+
     /// The value scaled for the network: (value − mean) / std.
     #[must_use]
     pub fn scaled(&self, value: f32) -> f32 {

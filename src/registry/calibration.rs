@@ -34,6 +34,62 @@ pub struct Calibration {
     pub states: Vec<ValueRange>,
 }
 
+impl Calibration {
+    /// Whether it fits the model: lengths, and factors, scales and ranges that make sense. Errors: which value does not, and
+    /// what it must be.
+    pub fn check(&self, spec: &ModelSpec) -> Result<(), String> {
+        let novelty = &self.novelty;
+        let square =
+            novelty.whitening.iter().all(|row| row.len() <= APPEARANCE) && novelty.whitening.len() == APPEARANCE;
+        let lengths = [
+            ("steps", self.steps.len(), spec.horizon),
+            ("novelty.mean", novelty.mean.len(), APPEARANCE),
+            ("actions", self.actions.len(), spec.action_inputs().unwrap_or(0)),
+            ("states", self.states.len(), spec.state_inputs().unwrap_or(0)),
+        ];
+        for (what, found, wanted) in lengths {
+            if found != wanted {
+                return Err(format!("calibration.{what} has {found} entries; it must have {wanted}"));
+            }
+        }
+        let factors = |step: &StepErrors| {
+            let StepErrors {
+                mean_factor,
+                low_factor,
+                high_factor,
+                ..
+            } = *step;
+            step.weights.len() == ERROR_INPUTS && mean_factor > 0.0 && 0.0 <= low_factor && low_factor <= high_factor
+        };
+        let mut ranges = self.actions.iter().chain(&self.states);
+        let checks = [
+            (
+                "steps",
+                self.steps.iter().all(factors),
+                "each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
+            ),
+            ("novelty.whitening", square, "it must have a row for each statistic"),
+            (
+                "novelty",
+                novelty.appearance_scale > 0.0 && novelty.still_scale > 0.0,
+                "appearance_scale and still_scale must be above 0",
+            ),
+            (
+                "novelty.quantiles",
+                !novelty.quantiles.is_empty() && novelty.quantiles.is_sorted(),
+                "they must be there, in rising order",
+            ),
+            (
+                "actions and states",
+                ranges.all(|range| range.min <= range.max),
+                "min must be at most max",
+            ),
+        ];
+        let failed = checks.iter().find(|(_, holds, _)| !holds);
+        failed.map_or(Ok(()), |(what, _, right)| Err(format!("calibration.{what}: {right}")))
+    }
+}
+
 /// The smallest and the largest value in training.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -249,6 +305,28 @@ mod tests {
 
     fn brightness(mean: f32) -> ContextStatistics {
         ContextStatistics::of(&[mean; 64], &[mean; 64], 8)
+    }
+
+    #[test]
+    fn a_calibration_that_cannot_be_right_is_refused() {
+        let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("models/moving");
+        let manifest = crate::registry::manifest::read(&directory).unwrap();
+        let right = manifest.calibration.clone().unwrap();
+        assert_eq!(right.check(&manifest.spec), Ok(()));
+        let changes: [(fn(&mut Calibration), &str); 6] = [
+            (|c| c.steps.clear(), "steps"),
+            (|c| c.steps[0].mean_factor = -5.0, "steps"),
+            (|c| c.steps[0].weights.clear(), "steps"),
+            (|c| c.novelty.quantiles.clear(), "novelty.quantiles"),
+            (|c| c.novelty.appearance_scale = 0.0, "novelty"),
+            (|c| c.actions[0].min = f32::MAX, "actions"),
+        ];
+        for (change, field) in changes {
+            let mut wrong = right.clone();
+            change(&mut wrong);
+            let reason = wrong.check(&manifest.spec).unwrap_err();
+            assert!(reason.starts_with(&format!("calibration.{field}")), "{reason}");
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use candle_core::{DType, Device, Tensor};
 
 use super::manifest::{self, Manifest};
-use super::{RegistryError, WEIGHTS_FILE, embedded};
+use super::{MANIFEST_FILE, RegistryError, WEIGHTS_FILE, embedded};
 use crate::files::sha256_hex;
 use crate::nn::{Model, NnError, Parameters};
 
@@ -34,7 +34,8 @@ pub struct StoredWeights {
     pub parameters: Parameters,
 }
 
-/// Reads, verifies and builds the model in a directory. Errors: `Io`, `Manifest`, `Hash`, `Safetensors`, `Weights`.
+/// Reads, verifies and builds the model in a directory. Errors: `Io`, `Manifest`, `ManifestValue`, `Hash`, `Safetensors`,
+/// `Weights`.
 pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
     let model = Model::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
@@ -50,6 +51,14 @@ pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
 /// Reads and verifies the weights in a directory. Errors: as [`load`].
 pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let manifest = manifest::read(model_dir)?;
+    let checked = manifest.spec.validate().map_err(|error| error.to_string());
+    let calibrated = |()| (manifest.calibration.iter()).try_for_each(|calibration| calibration.check(&manifest.spec));
+    checked
+        .and_then(calibrated)
+        .map_err(|reason| RegistryError::ManifestValue {
+            path: model_dir.join(MANIFEST_FILE),
+            reason,
+        })?;
     let path = model_dir.join(WEIGHTS_FILE);
     let bytes = match embedded::weights(model_dir) {
         Some(bytes) => Cow::Borrowed(bytes),

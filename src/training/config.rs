@@ -309,6 +309,14 @@ impl TrainConfig {
                 return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {max}")));
             }
         }
+        for (field, value) in [
+            ("fit.learning_rate", fit.learning_rate),
+            ("run.clip_norm", run.clip_norm),
+        ] {
+            if value == 0.0 {
+                return Err(TrainError::Config(format!("{field} is 0, so nothing would be learned")));
+            }
+        }
         for (field, size) in [
             ("pretrain.batch_size", pretrain.batch_size),
             ("fit.batch_size", fit.batch_size),

@@ -8,6 +8,7 @@ use foreframe::files::sha256_hex;
 use foreframe::nn::Conditioning;
 use serde_json::{Value, json};
 
+use crate::process::{output, text};
 use crate::service;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_foreframe");
@@ -489,6 +490,25 @@ fn every_command_finds_what_is_in_the_data_directory() {
     assert_eq!(exit_of(&mut command).0, 0);
     fs::write(dir.path().join("foreframe.toml"), "data_dir = \"d\"\n").unwrap();
     succeed(dir.path(), "inspect mine");
+}
+
+#[test]
+fn an_evaluation_s_numbers_have_limits() {
+    let dir = working_dir();
+    for (option, value, right) in [
+        (
+            "--resamples",
+            "18446744073709551615",
+            "18446744073709551615 is not in 1..=10000",
+        ),
+        ("--resamples", "0", "0 is not in 1..=10000"),
+        ("--min-skill", "nan", "a skill is a number of at most 1"),
+        ("--min-skill", "5", "a skill is a number of at most 1"),
+    ] {
+        let refused = output(dir.path(), &["evaluate", "--model", "plain", option, value]);
+        let error = text(&refused.stderr);
+        assert!(refused.status.code() == Some(2) && error.contains(right), "{error}");
+    }
 }
 
 #[test]

@@ -262,6 +262,13 @@ fn a_mismatched_data_set_is_refused() {
         ..config()
     };
     assert!(refusal(&model, &dataset, &twin).contains("needs conditioning \"none\""));
+    let mut elsewhere = untrained("twin", spec(Conditioning::None), &dataset);
+    std::sync::Arc::make_mut(&mut elsewhere.manifest).dataset.content_hash = "0".repeat(64);
+    let twin = EvaluateConfig {
+        twins: vec![&elsewhere],
+        ..config()
+    };
+    assert!(refusal(&model, &dataset, &twin).contains("it needs the same training data"));
     let none = EvaluateConfig {
         max_windows: 0,
         ..config()

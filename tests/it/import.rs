@@ -328,6 +328,15 @@ fn csv_mistakes_name_column_and_line() {
         error.contains("no column \"turn\"") && error.contains("action.speed"),
         "{error}"
     );
+    let options = ImportOptions {
+        units: vec!["turns=rad/s".to_owned()],
+        ..small()
+    };
+    let error = run(&source, &dir.path().join("u"), options).unwrap_err().to_string();
+    assert!(
+        error.contains("--unit names the channel \"turns\", which is not imported; there are: "),
+        "{error}"
+    );
     let csv = source.join("log.csv");
     let text = fs::read_to_string(&csv).unwrap();
     fs::write(&csv, text.replacen(",0.3,", ",NaN,", 1)).unwrap();

@@ -1,5 +1,7 @@
 //! Frames of many sizes, contexts and horizons of many lengths: both networks train on them and predict.
 
+use std::path::Path;
+
 use candle_core::{Device, Tensor};
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe::nn::ConditioningTensors;
@@ -91,5 +93,27 @@ fn the_dense_network_takes_any_size_and_window() {
 fn the_flow_network_takes_any_size_and_window() {
     for shape in SHAPES {
         trains_and_predicts("static-flow", shape);
+    }
+}
+
+#[test]
+fn no_accepted_value_makes_a_prediction_nan() {
+    for name in ["moving-flow", "donkeycar", "moving"] {
+        let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name);
+        let model = registry::load(&directory).unwrap().model;
+        let spec = model.spec();
+        let filled = |value: f32, shape: &[usize]| Tensor::full(value, shape, &Device::Cpu).unwrap();
+        let frames = filled(0.5, &[1, spec.context, spec.pixels()]);
+        for value in [1e13, 1e30, -1e30] {
+            let conditioning = ConditioningTensors {
+                actions: spec
+                    .action_inputs()
+                    .map(|count| filled(value, &[1, spec.horizon, count])),
+                state: spec.state_inputs().map(|count| filled(value, &[1, count])),
+            };
+            let predicted = model.predict_frames(&frames, &conditioning).unwrap();
+            let predicted: Vec<f32> = predicted.flatten_all().unwrap().to_vec1().unwrap();
+            assert!(predicted.iter().all(|value| value.is_finite()), "{name}, {value}");
+        }
     }
 }

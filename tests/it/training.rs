@@ -244,6 +244,18 @@ fn weights_for_other_units_are_refused() {
         message.contains("takes the action [speed km/h], and the data set has [speed px/frame]"),
         "{message}"
     );
+    // A refused training leaves no files, so that the next one can have the directory.
+    let config = small_config(&[]);
+    let run_dir = dir.path().join("next");
+    let training = Training {
+        config: &config,
+        dataset: &dataset,
+        run_dir: &run_dir,
+        command: "test",
+        start: Some(&start),
+    };
+    run(&training, &mut |_: TrainingEvent| (), &AtomicBool::new(false)).unwrap_err();
+    assert!(!run_dir.join("config.toml").exists());
 }
 
 #[test]
