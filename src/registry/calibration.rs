@@ -309,11 +309,12 @@ mod tests {
 
     #[test]
     fn a_calibration_that_cannot_be_right_is_refused() {
+        type Change = fn(&mut Calibration);
         let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("models/moving");
         let manifest = crate::registry::manifest::read(&directory).unwrap();
         let right = manifest.calibration.clone().unwrap();
         assert_eq!(right.check(&manifest.spec), Ok(()));
-        let changes: [(fn(&mut Calibration), &str); 6] = [
+        let changes: [(Change, &str); 6] = [
             (|c| c.steps.clear(), "steps"),
             (|c| c.steps[0].mean_factor = -5.0, "steps"),
             (|c| c.steps[0].weights.clear(), "steps"),
