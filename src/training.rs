@@ -126,7 +126,7 @@ pub enum TrainError {
     /// The model to start from takes other units, or the same channels in another order.
     #[error(
         "the training cannot start from the model {model:?}: it takes the {kind} [{found}], and the data set has [{expected}]; \
-         units and order must be the same"
+         the units and the order of the channels must be the same"
     )]
     OtherUnits {
         /// The model.

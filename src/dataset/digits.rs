@@ -56,13 +56,18 @@ impl DigitPools {
             Some((train, test)) => (read_images(train)?, Some(read_images(test)?)),
             None => (read_images(path)?, None),
         };
-        let found = match &test {
-            _ if train.len() < PART => format!("{} digits were found; at least {PART} are needed", train.len()),
-            Some(test) if test.is_empty() => "the part for tests has no digits; at least one is needed".to_owned(),
-            _ => String::new(),
-        };
-        if !found.is_empty() {
-            return Err(refused(path, found));
+        if train.len() < PART {
+            let found = train.len();
+            return Err(refused(
+                path,
+                format!("{found} digits were found; at least {PART} are needed"),
+            ));
+        }
+        if test.as_ref().is_some_and(Vec::is_empty) {
+            return Err(refused(
+                path,
+                "the part for tests has no digits; at least one is needed",
+            ));
         }
         for (index, digit) in train.into_iter().enumerate() {
             let pool = match index % PART {

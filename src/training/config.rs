@@ -314,7 +314,9 @@ impl TrainConfig {
             ("run.clip_norm", run.clip_norm),
         ] {
             if value == 0.0 {
-                return Err(TrainError::Config(format!("{field} is 0, so nothing would be learned")));
+                return Err(TrainError::Config(format!(
+                    "{field} is 0, so nothing would be learned; it must be above 0"
+                )));
             }
         }
         for (field, size) in [

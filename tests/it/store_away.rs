@@ -143,6 +143,11 @@ pub(crate) fn wait_for_status(server: &RunningServer, path: &str, expected: &str
     }
 }
 
+/// A job that collects one trial.
+fn collect(name: &str) -> Value {
+    json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1})
+}
+
 #[test]
 fn a_server_survives_a_database_that_goes_away() {
     let Some(postgres) = OwnPostgres::new() else { return };
@@ -150,7 +155,6 @@ fn a_server_survives_a_database_that_goes_away() {
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
     let server = RunningServer::start(dir.path(), &["--no-jobs", "--database-url", &url]);
-    let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1});
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("before"))["id"], "job-1");
 
     postgres.stop();
@@ -185,7 +189,6 @@ fn a_database_that_only_reads_for_a_while_refuses_writes_until_later() {
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
     let server = RunningServer::start(dir.path(), &["--no-jobs", "--database-url", &url]);
-    let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 1});
     let create = |name: &str| server.ask("POST", "/v1/jobs", &collect(name));
     let read_only = |value: &str| {
         let setting = format!("ALTER SYSTEM SET default_transaction_read_only = {value}");
@@ -259,8 +262,7 @@ fn a_job_waits_for_its_object_store() {
     let (dir, shared) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let url = shared.path().display().to_string();
     let server = RunningServer::start(dir.path(), &["--objects-url", &url]);
-    let collect = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 1});
-    assert_eq!(server.ask("POST", "/v1/jobs", &collect)["id"], "job-1");
+    assert_eq!(server.ask("POST", "/v1/jobs", &collect("seen"))["id"], "job-1");
     server.wait_for_job("job-1", |job| job["state"] == "running");
     // Nothing can be written below a file.
     let obstacle = shared.path().join("datasets");
