@@ -9,7 +9,7 @@ use foreframe::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters,
 };
 use foreframe::training::TrainConfig;
-use foreframe::training::optimizer::{Adam, AdamConfig, Gradients};
+use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig};
 use foreframe::types::Seed;
 
 #[global_allocator]
@@ -77,7 +77,7 @@ fn training(c: &mut Criterion) {
     let model = Model::new(spec.clone(), &parameters).unwrap();
     let (context, horizon, pixels, features) = (spec.context, spec.horizon, spec.pixels(), spec.features);
     let (seen, ahead) = (values((WINDOWS, context, pixels)), values((WINDOWS, horizon, pixels)));
-    let mut adam = Adam::new(AdamConfig::default());
+    let mut adam = Optimizer::new(OptimizerConfig::default());
     let mut update = |loss: &Tensor| {
         let gradients = Gradients::of(loss, &parameters, &[]).unwrap();
         adam.update(&parameters, &gradients, 1e-4).unwrap()

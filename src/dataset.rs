@@ -4,6 +4,7 @@
 //! decoded in a file. [`sampler`] divides its [`Window`]s into training, validation and test parts. [`collect()`] simulates a
 //! data set and writes it in LeRobot's v3.0 layout.
 
+pub(crate) mod background;
 mod catalog;
 mod check;
 pub mod collect;

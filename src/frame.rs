@@ -115,6 +115,11 @@ impl Frame {
     pub fn pixels(&self) -> &[u8] {
         &self.pixels
     }
+
+    /// The intensities, to change them.
+    pub(crate) fn pixels_mut(&mut self) -> &mut [u8] {
+        &mut self.pixels
+    }
 }
 
 #[cfg(test)]

@@ -26,7 +26,7 @@ mod flow_inputs;
 pub mod flow_spec;
 mod gates;
 #[cfg(test)]
-mod gradient_check;
+pub(crate) mod gradient_check;
 pub mod init;
 mod long_futures;
 pub mod loss;

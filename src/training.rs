@@ -363,7 +363,7 @@ impl<'a> TrainingPlan<'a> {
         let spec = config.model_spec(dataset, &frames);
         check_actions(config, dataset, &spec)?;
         spec.validate()?;
-        let augmentation = Augmentation::new(&config.data, dataset.info(), config.seed)?;
+        let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
         Ok(Self {
             source: FrameSource::new(dataset, spec.preprocess, config.fit.target, augmentation),
             spec,

@@ -33,7 +33,7 @@ const FUTURES_AT_ONCE: usize = 16;
 /// What the network gives for a batch.
 #[derive(Clone, Debug)]
 pub struct FlowPrediction {
-    /// The predicted frames `[N, horizon, P]`.
+    /// The predicted frames `[N, steps, P]`, those of the whole horizon unless fewer were asked for.
     pub frames: Tensor,
     /// What the scene alone looks like `[N, horizon, P]`, without what moves in it.
     pub scene: Tensor,
@@ -142,14 +142,26 @@ impl FlowModel {
         windows: &[u32],
         conditioning: &ConditioningTensors,
     ) -> Result<FlowPrediction, NnError> {
+        self.predict_first(spec, frames, windows, conditioning, spec.horizon)
+    }
+
+    /// As [`FlowModel::predict`], with the frames of the first `steps` only.
+    pub(super) fn predict_first(
+        &self,
+        spec: &ModelSpec,
+        frames: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<FlowPrediction, NnError> {
         let rows = FutureRows::new(spec, frames, windows, conditioning)?;
         if rows.count() <= FUTURES_AT_ONCE || self.stem.weight.track_op() {
-            return self.predict_rows(spec, &rows);
+            return self.predict_rows(spec, &rows, steps);
         }
         let (mut frames, mut scene, mut motion) = (Vec::new(), Vec::new(), Vec::new());
         for first in (0..rows.count()).step_by(FUTURES_AT_ONCE) {
             let part = rows.part(first..rows.count().min(first + FUTURES_AT_ONCE));
-            let part = self.predict_rows(spec, &part)?;
+            let part = self.predict_rows(spec, &part, steps)?;
             frames.push(part.frames);
             scene.push(part.scene);
             motion.push(part.motion);
@@ -161,9 +173,9 @@ impl FlowModel {
         })
     }
 
-    fn predict_rows(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<FlowPrediction, NnError> {
+    fn predict_rows(&self, spec: &ModelSpec, rows: &FutureRows, steps: usize) -> Result<FlowPrediction, NnError> {
         if self.layers.recurrent {
-            return self.predict_recurrently(spec, rows);
+            return self.predict_recurrently(spec, rows, steps);
         }
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
@@ -195,7 +207,7 @@ impl FlowModel {
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
         let content = fold_pixels(&scene.narrow(3, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)?)?;
         Ok(FlowPrediction {
-            frames: frames.reshape((count, horizon, size.pixels()))?,
+            frames: frames.reshape((count, horizon, size.pixels()))?.narrow(1, 0, steps)?,
             scene: content.reshape((count, horizon, size.pixels()))?,
             motion,
         })

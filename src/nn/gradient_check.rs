@@ -3,7 +3,7 @@
 use candle_core::{Device, Result, Tensor, Var};
 
 /// Values −1 to 1 without a pattern, the same for the same seed.
-pub(super) fn noise(shape: &[usize], seed: u64) -> Tensor {
+pub(crate) fn noise(shape: &[usize], seed: u64) -> Tensor {
     use rand::Rng;
     let mut rng = crate::types::Seed(seed).rng();
     let values: Vec<f32> = (0..shape.iter().product())

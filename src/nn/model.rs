@@ -6,6 +6,7 @@ use super::autoencoder::{DenseModel, Feedback};
 use super::conditioned::ConditioningTensors;
 use super::flow::{FlowModel, FlowPrediction, Layers};
 use super::long_futures;
+use super::spec::in_range;
 use super::{Architecture, ModelSpec, NnError, Parameters};
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
@@ -162,18 +163,20 @@ impl Model {
         }
     }
 
-    /// All that the flow network gives for frames `[B, context, P]`; `None` of another architecture.
-    /// Errors: `Shape`, `Missing`.
+    /// All that the flow network gives for frames `[B, context, P]`, with the frames of the first `steps` (1 to the horizon) only;
+    /// `None` of another architecture. Errors: `Shape`, `Missing`, `OutOfRange`.
     pub fn predict_flow(
         &self,
         frames: &Tensor,
         conditioning: &ConditioningTensors,
+        steps: usize,
     ) -> Result<Option<FlowPrediction>, NnError> {
         let batch = self.check_windows(frames)?;
+        in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
         match &self.network {
             Network::Dense(_) => Ok(None),
             Network::Flow(flow) => flow
-                .predict(&self.spec, frames, &each_once(batch), conditioning)
+                .predict_first(&self.spec, frames, &each_once(batch), conditioning, steps)
                 .map(Some),
         }
     }

@@ -1,12 +1,24 @@
-//! Changes of training windows that a robot could have seen as well: mirrored, brighter, darker, nearer.
+//! Changes of training windows that a robot could have seen as well: mirrored (all of it, or what moves), brighter, darker,
+//! nearer.
 
 use rand::Rng;
 
 use super::TrainError;
-use super::config::{DataConfig, Mirror};
-use crate::dataset::DatasetInfo;
+use super::config::{DataConfig, Mirror, MirrorWord};
+use crate::dataset::background::{Background, MAX_CHANGED_SHARE};
+use crate::dataset::{Dataset, DatasetInfo};
 use crate::frame::warp::sample;
 use crate::types::{Channel, Seed};
+
+/// What of half of the windows is mirrored.
+#[derive(Clone, Debug, PartialEq)]
+enum Mirroring {
+    Nothing,
+    /// Whole frames. The sign of these channels of actions and of states changes.
+    Frames([Vec<usize>; 2]),
+    /// What differs from this background, 0 to 255.
+    Movers(Vec<u8>),
+}
 
 /// The kinds of channels.
 pub(super) const ACTION: usize = 0;
@@ -15,8 +27,7 @@ pub(super) const STATE: usize = 1;
 /// How training windows are changed; drawn anew for each window of each step.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Augmentation {
-    /// Channels of actions and of states whose sign changes in a mirror; `None` if windows are not mirrored.
-    mirror: Option<[Vec<usize>; 2]>,
+    mirror: Mirroring,
     /// The largest relative change of brightness.
     brightness: f32,
     /// The largest share of each side that is cut off.
@@ -57,7 +68,9 @@ impl FramePart {
 /// The change of one window.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct WindowChange {
-    pub(super) is_mirrored: bool,
+    pub(super) is_frame_mirrored: bool,
+    /// Whether what moves is mirrored, in front of the background, which stays.
+    pub(super) are_movers_mirrored: bool,
     /// Factor of all intensities.
     pub(super) gain: f32,
     /// The part that is seen, after mirroring; `None` for all of it.
@@ -67,14 +80,15 @@ pub(super) struct WindowChange {
 impl WindowChange {
     /// No change.
     pub(super) const NONE: Self = Self {
-        is_mirrored: false,
+        is_frame_mirrored: false,
+        are_movers_mirrored: false,
         gain: 1.0,
         part: None,
     };
 
     /// Changes a frame's intensities, 0 to 1, row by row; `inverted` ones if the model inverts.
     pub(super) fn apply(self, values: &mut [f32], width: usize, is_inverted: bool) {
-        if self.is_mirrored {
+        if self.is_frame_mirrored {
             values.chunks_exact_mut(width).for_each(<[f32]>::reverse);
         }
         if let Some(part) = self.part {
@@ -92,9 +106,15 @@ impl WindowChange {
 }
 
 impl Augmentation {
-    /// As the settings say. Errors: `Config` for a channel that the data set does not have, and for parts of frames whose
-    /// camera model is known.
-    pub(super) fn new(config: &DataConfig, info: &DatasetInfo, seed: Seed) -> Result<Self, TrainError> {
+    /// As the settings say, for these training frames. Errors: `Config` for a channel that the data set does not have, for parts
+    /// of frames whose camera model is known, and for movers in front of a camera that moves; those of [`Dataset::pixels`].
+    pub(super) fn new(
+        config: &DataConfig,
+        dataset: &Dataset,
+        frames: &[usize],
+        seed: Seed,
+    ) -> Result<Self, TrainError> {
+        let info = dataset.info();
         if config.crop > 0.0 && info.camera.is_some() {
             return Err(TrainError::Config(format!(
                 "data.crop is {}; it must be 0 for a data set with a camera model, which a part of the frame does not fit",
@@ -103,8 +123,9 @@ impl Augmentation {
         }
         Ok(Self {
             mirror: match &config.mirror {
-                Mirror::Off(_) => None,
-                Mirror::Channels(names) => Some(signed_channels(names, info)?),
+                Mirror::Word(MirrorWord::Off) => Mirroring::Nothing,
+                Mirror::Word(MirrorWord::Movers) => Mirroring::Movers(standing_background(dataset, frames)?),
+                Mirror::Channels(names) => Mirroring::Frames(signed_channels(names, info)?),
             },
             brightness: config.brightness as f32,
             crop: config.crop as f32,
@@ -114,7 +135,7 @@ impl Augmentation {
 
     /// The change of the window at this position of this step's batch.
     pub(super) fn draw(&self, step: usize, position: usize) -> WindowChange {
-        if self.mirror.is_none() && self.brightness == 0.0 && self.crop == 0.0 {
+        if self.mirror == Mirroring::Nothing && self.brightness == 0.0 && self.crop == 0.0 {
             return WindowChange::NONE;
         }
         let mut rng = self
@@ -122,8 +143,10 @@ impl Augmentation {
             .derive("step", step as u64)
             .derive("window", position as u64)
             .rng();
+        let is_mirrored = rng.random::<bool>();
         WindowChange {
-            is_mirrored: rng.random::<bool>() && self.mirror.is_some(),
+            is_frame_mirrored: is_mirrored && matches!(self.mirror, Mirroring::Frames(_)),
+            are_movers_mirrored: is_mirrored && matches!(self.mirror, Mirroring::Movers(_)),
             gain: 1.0 + self.brightness * rng.random_range(-1.0f32..=1.0),
             part: (self.crop > 0.0).then(|| FramePart {
                 side: 1.0 - self.crop * rng.random::<f32>(),
@@ -135,11 +158,43 @@ impl Augmentation {
 
     /// Changes the sign of the channels of an action or a state, as a mirror does.
     pub(super) fn turn_signs(&self, kind: usize, values: &mut [f32]) {
-        let channels = self.mirror.iter().flat_map(|channels| &channels[kind]);
-        for &channel in channels {
+        let Mirroring::Frames(channels) = &self.mirror else {
+            return;
+        };
+        for &channel in &channels[kind] {
             values[channel] = -values[channel];
         }
     }
+
+    /// Mirrors what differs from the background in a frame, 0 to 255, row by row.
+    pub(super) fn mirror_movers(&self, frame: &mut [u8], width: usize) {
+        let Mirroring::Movers(background) = &self.mirror else {
+            return;
+        };
+        let mut differences = vec![0; width];
+        for (row, behind) in frame.chunks_exact_mut(width).zip(background.chunks_exact(width)) {
+            for ((difference, value), behind) in differences.iter_mut().zip(&*row).zip(behind) {
+                *difference = i16::from(*value) - i16::from(*behind);
+            }
+            for ((value, behind), difference) in row.iter_mut().zip(behind).zip(differences.iter().rev()) {
+                *value = (i16::from(*behind) + difference).clamp(0, 255) as u8;
+            }
+        }
+    }
+}
+
+/// The background of training frames. Errors: `Config` if too much differs from it; those of [`Dataset::pixels`].
+fn standing_background(dataset: &Dataset, frames: &[usize]) -> Result<Vec<u8>, TrainError> {
+    let Background { pixels, changed_share } = Background::of(dataset, frames)?;
+    if changed_share > MAX_CHANGED_SHARE {
+        return Err(TrainError::Config(format!(
+            "data.mirror is \"movers\", but {:.0} % of the training frames' pixels differ from their median, and at most {:.0} % \
+             may: probably the camera moves, or the light changes; use \"off\", or a list of channels to mirror whole frames",
+            100.0 * changed_share,
+            100.0 * MAX_CHANGED_SHARE
+        )));
+    }
+    Ok(pixels)
 }
 
 fn signed_channels(names: &[String], info: &DatasetInfo) -> Result<[Vec<usize>; 2], TrainError> {
@@ -177,11 +232,25 @@ mod tests {
     fn a_mirrored_frame_is_reversed_row_by_row() {
         let mut values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
         let change = WindowChange {
-            is_mirrored: true,
+            is_frame_mirrored: true,
             ..WindowChange::NONE
         };
         change.apply(&mut values, 3, false);
         assert_eq!(values, [0.3, 0.2, 0.1, 0.6, 0.5, 0.4]);
+    }
+
+    #[test]
+    fn movers_are_mirrored_in_front_of_the_background() {
+        let augmentation = Augmentation {
+            mirror: Mirroring::Movers(vec![10, 20, 30, 250, 5, 5, 5, 5]),
+            brightness: 0.0,
+            crop: 0.0,
+            seed: Seed(1),
+        };
+        // The first pixel is 30 brighter than the background and the third of the second row 4 darker.
+        let mut frame = [40, 20, 30, 250, 5, 5, 1, 5];
+        augmentation.mirror_movers(&mut frame, 4);
+        assert_eq!(frame, [10, 20, 30, 255, 5, 1, 5, 5]);
     }
 
     #[test]

@@ -102,7 +102,11 @@ impl<'a> FrameSource<'a> {
             .par_chunks_exact_mut(pixels)
             .zip(frames)
             .try_for_each(|(out, &(frame, change))| {
-                out.copy_from_slice(&preprocess.forward(&self.dataset.frame(frame)?));
+                let mut frame = self.dataset.frame(frame)?;
+                if change.are_movers_mirrored {
+                    self.augmentation.mirror_movers(frame.pixels_mut(), width);
+                }
+                out.copy_from_slice(&preprocess.forward(&frame));
                 change.apply(out, width, preprocess.invert);
                 Ok::<(), TrainError>(())
             })?;
@@ -166,7 +170,7 @@ impl<'a> FrameSource<'a> {
         } else {
             self.dataset.state(frame)
         });
-        if change.is_mirrored {
+        if change.is_frame_mirrored {
             self.augmentation.turn_signs(kind, &mut values[from..]);
         }
     }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
 use super::observer::{Observer, TrainingEvent, TrainingStage};
-use super::optimizer::Adam;
+use super::optimizer::Optimizer;
 use super::stage::{HistoryPoint, TrainState};
 use crate::files::{is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, try_lock, write_atomically};
 use crate::nn::{ModelSpec, Parameters};
@@ -301,7 +301,8 @@ impl Checkpoint {
         };
         let wrong_weights = |error: crate::nn::NnError| failed(error.to_string());
         let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(wrong_weights)?;
-        let optimizer = Adam::import(run.adam(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
+        let optimizer =
+            Optimizer::import(run.optimizer(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
         let state = TrainState {
             stage: meta.stage,
             step: meta.step,

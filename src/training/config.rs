@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
-use super::optimizer::AdamConfig;
+use super::optimizer::{OptimizerConfig, UpdateRule};
 use crate::dataset::{Dataset, sampler::WindowShape};
 use crate::frame::preprocess::Preprocess;
 use crate::nn::loss::Loss;
@@ -89,7 +89,7 @@ pub struct DataConfig {
     pub validation_windows: usize,
     /// The seed of the split into training, validation and test parts.
     pub split_seed: Seed,
-    /// Whether half of the training windows are mirrored left to right.
+    /// What is mirrored left to right in half of the training windows.
     #[serde(default)]
     pub mirror: Mirror,
     /// Each training window is made brighter or darker by up to this share, 0 to 0.9.
@@ -122,28 +122,31 @@ pub enum All {
     All,
 }
 
-/// Whether training windows are mirrored: `"off"`, or the channels of actions and states whose sign changes in a mirror, as
-/// in `["steering"]`; the list may be empty.
+/// What is mirrored left to right in half of the training windows: nothing (`"off"`), what moves in front of a standing
+/// camera (`"movers"`), or whole frames; then the channels of actions and states whose sign changes in a mirror, as in
+/// `["steering"]`. The list may be empty.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Mirror {
-    /// They are not.
-    Off(Off),
-    /// Half of them are, with the sign of these channels changed.
+    /// `"off"` or `"movers"`.
+    Word(MirrorWord),
+    /// Whole frames, with the sign of these channels changed.
     Channels(Vec<String>),
 }
 
-/// The word `off`.
+/// A word for what is mirrored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Off {
+pub enum MirrorWord {
     /// `"off"`
     Off,
+    /// `"movers"`
+    Movers,
 }
 
 impl Default for Mirror {
     fn default() -> Self {
-        Self::Off(Off::Off)
+        Self::Word(MirrorWord::Off)
     }
 }
 
@@ -157,7 +160,7 @@ pub struct PretrainConfig {
     pub steps: usize,
     /// Frames per update.
     pub batch_size: usize,
-    /// Adam's highest learning rate.
+    /// The highest learning rate.
     pub learning_rate: f64,
 }
 
@@ -179,7 +182,7 @@ pub struct FitConfig {
     pub steps: usize,
     /// Windows per update.
     pub batch_size: usize,
-    /// Adam's highest learning rate.
+    /// The highest learning rate.
     pub learning_rate: f64,
     /// Whether the pre-trained codec is trained further.
     pub codec: CodecTraining,
@@ -195,6 +198,13 @@ pub struct FitConfig {
     /// Weight of the similarity loss (flow network): 1 minus the structural similarity of the predicted frames.
     #[serde(default)]
     pub ssim_weight: f64,
+    /// In this share of the updates, the first ones, the frame and SSIM losses count only the first `short_horizon` predicted
+    /// frames of each window (flow network). In its recurrent form, these updates take less time.
+    #[serde(default)]
+    pub short_share: f64,
+    /// Frames that count in these first updates, 1 to the horizon.
+    #[serde(default = "FitConfig::default_short_horizon")]
+    pub short_horizon: usize,
     /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
     #[serde(default)]
     pub scene_weight: f64,
@@ -202,6 +212,21 @@ pub struct FitConfig {
     /// the measured poses, if the states have a pose.
     #[serde(default)]
     pub motion_weight: f64,
+}
+
+impl FitConfig {
+    fn default_short_horizon() -> usize {
+        1
+    }
+
+    /// How many frames of a window of `horizon` count in the update after `step` updates.
+    pub(super) fn frames_that_count(&self, step: usize, horizon: usize) -> usize {
+        if (step as f64) < self.short_share * self.steps as f64 {
+            self.short_horizon
+        } else {
+            horizon
+        }
+    }
 }
 
 /// The target frames of the decoder, in both stages.
@@ -238,6 +263,9 @@ pub enum TrainingFeedback {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
+    /// How weights are updated: `"adam"`, or `"muon"` (flow network).
+    #[serde(default)]
+    pub optimizer: UpdateRule,
     /// Updates over which the learning rate rises from 0.
     pub warmup_steps: usize,
     /// The final learning rate as a share of the highest one; the rate decreases along a cosine.
@@ -253,11 +281,12 @@ pub struct RunConfig {
 }
 
 impl RunConfig {
-    /// Adam's constants.
-    pub(super) fn adam(&self) -> AdamConfig {
-        AdamConfig {
+    /// The optimizer's constants.
+    pub(super) fn optimizer(&self) -> OptimizerConfig {
+        OptimizerConfig {
+            rule: self.optimizer,
             clip_norm: self.clip_norm,
-            ..AdamConfig::default()
+            ..OptimizerConfig::default()
         }
     }
 }
@@ -297,6 +326,7 @@ impl TrainConfig {
             ("fit.learning_rate", fit.learning_rate, 1.0),
             ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
             ("fit.ssim_weight", fit.ssim_weight, 100.0),
+            ("fit.short_share", fit.short_share, 0.9),
             ("fit.scene_weight", fit.scene_weight, 100.0),
             ("fit.motion_weight", fit.motion_weight, 100.0),
             ("data.brightness", self.data.brightness, 0.9),
@@ -329,6 +359,30 @@ impl TrainConfig {
                     run.batch_parts
                 )));
             }
+        }
+        if self.model.architecture == Architecture::Dense {
+            let refused = [
+                ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
+                ("fit.short_share", fit.short_share > 0.0, "0"),
+            ];
+            if let Some((field, _, needed)) = refused.iter().find(|(_, is_set, _)| *is_set) {
+                return Err(TrainError::Config(format!(
+                    "{field} is for the flow network only; it must be {needed} where model.architecture is dense"
+                )));
+            }
+        }
+        if self.data.mirror == Mirror::Word(MirrorWord::Movers) && self.model.conditioning != Conditioning::None {
+            return Err(TrainError::Config(format!(
+                "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
+                 model.conditioning is {}: set it to none, or data.mirror to off",
+                self.model.conditioning
+            )));
+        }
+        if fit.short_share > 0.0 && !(1..=self.model.horizon).contains(&fit.short_horizon) {
+            return Err(TrainError::Config(format!(
+                "fit.short_horizon is {}; it must be 1 to model.horizon, {}",
+                fit.short_horizon, self.model.horizon
+            )));
         }
         if self.data.windows == WindowBudget::Count(0) {
             return Err(TrainError::Config(

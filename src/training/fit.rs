@@ -44,15 +44,17 @@ impl<'a> SequenceObjective<'a> {
     }
 
     /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
-    fn flow_loss(&self, model: &Model, batch: &WindowBatch) -> Result<Tensor, TrainError> {
+    /// In the frame and SSIM losses, only the first `counting` frames count.
+    fn flow_loss(&self, model: &Model, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
         let fit = &self.config.fit;
-        let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition)? else {
+        let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition, counting)? else {
             return Err(TrainError::Config("only the flow network has this loss".to_owned()));
         };
-        let mut loss = fit.loss.between(&predicted.frames, &batch.targets)?;
+        let targets = batch.targets.narrow(1, 0, counting)?.contiguous()?;
+        let mut loss = fit.loss.between(&predicted.frames, &targets)?;
         if fit.ssim_weight > 0.0 {
             let width = self.plan.spec.frame_width_px as usize;
-            let similarity = ssim_loss(&predicted.frames, &batch.targets, width)?;
+            let similarity = ssim_loss(&predicted.frames, &targets, width)?;
             loss = (loss + (similarity * fit.ssim_weight)?)?;
         }
         if fit.scene_weight > 0.0 {
@@ -106,7 +108,8 @@ impl Objective for SequenceObjective<'_> {
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
         if self.plan.spec.architecture == Architecture::Flow {
-            return self.flow_loss(&model, &batch);
+            let counting = fit.frames_that_count(step, self.plan.spec.horizon);
+            return self.flow_loss(&model, &batch, counting);
         }
         let inputs = self.features(&model, &batch.inputs)?;
         let true_features = batch

@@ -1,9 +1,10 @@
-//! Adam (Kingma & Ba 2015). Its moments can be exported, so that a resumed training continues bit by bit. [`Gradients`] are
+//! Adam (Kingma & Ba 2015), or Muon for some weights and Adam for the others. The moments can be exported, so that a resumed training continues bit by bit. [`Gradients`] are
 //! separate values, so that parts of a batch can be computed in parallel and averaged.
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
 mod gradients;
+mod muon;
 
 pub use gradients::Gradients;
 
@@ -12,6 +13,7 @@ use std::collections::BTreeMap;
 
 use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Tensor};
 use pulp::Arch;
+use serde::{Deserialize, Serialize};
 
 use crate::nn::Parameters;
 use crate::nn::tensors::with_values;
@@ -21,7 +23,7 @@ const FIRST: &str = "adam.first.";
 const SECOND: &str = "adam.second.";
 const STEP: &str = "adam.step";
 
-/// Why an update failed. Parameters and moments are unchanged.
+/// Why an update failed. Parameters and moments are unchanged, except where the tensor library failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OptimizerError {
@@ -53,9 +55,22 @@ pub enum OptimizerError {
     Tensor(#[from] candle_core::Error),
 }
 
-/// Adam's constants.
+/// How weights are updated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UpdateRule {
+    /// Adam for all tensors.
+    #[default]
+    Adam,
+    /// Muon for the weights of the flow network's hidden layers, Adam for all other tensors.
+    Muon,
+}
+
+/// The optimizer's constants.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct AdamConfig {
+pub struct OptimizerConfig {
+    /// How weights are updated.
+    pub rule: UpdateRule,
     /// Decay of the first moment.
     pub beta1: f64,
     /// Decay of the second moment.
@@ -66,9 +81,10 @@ pub struct AdamConfig {
     pub clip_norm: f64,
 }
 
-impl Default for AdamConfig {
+impl Default for OptimizerConfig {
     fn default() -> Self {
         Self {
+            rule: UpdateRule::Adam,
             beta1: 0.9,
             beta2: 0.999,
             epsilon: 1e-8,
@@ -77,9 +93,9 @@ impl Default for AdamConfig {
     }
 }
 
-/// Running means of a tensor's gradient and of its square.
+/// Running means of a tensor's gradient and of its square; Muon keeps no mean of the square, and leaves zeros.
 #[derive(Clone, Debug)]
-struct AdamMoments {
+struct Moments {
     shape: Vec<usize>,
     first: Vec<f32>,
     second: Vec<f32>,
@@ -87,16 +103,16 @@ struct AdamMoments {
 
 /// The optimizer with its moments, by tensor name.
 #[derive(Clone, Debug)]
-pub struct Adam {
-    config: AdamConfig,
+pub struct Optimizer {
+    config: OptimizerConfig,
     step: u64,
-    moments: BTreeMap<String, AdamMoments>,
+    moments: BTreeMap<String, Moments>,
 }
 
-impl Adam {
+impl Optimizer {
     /// An optimizer before its first update.
     #[must_use]
-    pub fn new(config: AdamConfig) -> Self {
+    pub fn new(config: OptimizerConfig) -> Self {
         Self {
             config,
             step: 0,
@@ -121,7 +137,8 @@ impl Adam {
         let norm = gradients.norm()?;
         self.step += 1;
         let steps = i32::try_from(self.step).unwrap_or(i32::MAX);
-        let AdamConfig {
+        let OptimizerConfig {
+            rule: update_rule,
             beta1,
             beta2,
             epsilon,
@@ -144,11 +161,15 @@ impl Adam {
             let Some(gradient) = gradients.get(name) else {
                 continue;
             };
-            let moments = self.moments.entry(name.to_owned()).or_insert_with(|| AdamMoments {
+            let moments = self.moments.entry(name.to_owned()).or_insert_with(|| Moments {
                 shape: var.dims().to_vec(),
                 first: vec![0.0; var.elem_count()],
                 second: vec![0.0; var.elem_count()],
             });
+            if update_rule == UpdateRule::Muon && muon::applies_to(name) {
+                muon::update(var, gradient, rule.scale, &mut moments.first, learning_rate)?;
+                continue;
+            }
             with_values(gradient, |gradient| {
                 var.inplace_op1(&AdamUpdate {
                     rule,
@@ -174,10 +195,10 @@ impl Adam {
         Ok(tensors)
     }
 
-    /// Restores the optimizer from the tensors of [`Adam::export`], bit by bit. Tensors with other names are ignored.
+    /// Restores the optimizer from the tensors of [`Optimizer::export`], bit by bit. Tensors with other names are ignored.
     /// Errors: `State`.
     pub fn import(
-        config: AdamConfig,
+        config: OptimizerConfig,
         tensors: &BTreeMap<String, Tensor>,
         parameters: &Parameters,
     ) -> Result<Self, OptimizerError> {
@@ -207,7 +228,7 @@ impl Adam {
                 (Some(first), Some(second)) => {
                     let shape = var.dims().to_vec();
                     let (first, second) = (read(&keys[0], first)?, read(&keys[1], second)?);
-                    moments.insert(name.to_owned(), AdamMoments { shape, first, second });
+                    moments.insert(name.to_owned(), Moments { shape, first, second });
                 }
                 (first, _) => return Err(problem(&keys[usize::from(first.is_some())], "is missing".to_owned())),
             }
@@ -243,7 +264,7 @@ impl AdamStep {
 struct AdamUpdate<'a> {
     rule: AdamStep,
     gradient: &'a [f32],
-    moments: RefCell<&'a mut AdamMoments>,
+    moments: RefCell<&'a mut Moments>,
 }
 
 impl InplaceOp1 for AdamUpdate<'_> {
@@ -256,7 +277,7 @@ impl InplaceOp1 for AdamUpdate<'_> {
             candle_core::bail!("adam needs contiguous f32 parameters");
         };
         let mut moments = self.moments.borrow_mut();
-        let AdamMoments { first, second, .. } = &mut **moments;
+        let Moments { first, second, .. } = &mut **moments;
         Arch::new().dispatch(
             #[inline(always)]
             || self.rule.apply(&mut values[from..to], self.gradient, first, second),

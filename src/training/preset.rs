@@ -60,9 +60,11 @@ impl TrainConfig {
         if let Some(settings) = settings.as_object_mut() {
             settings.remove(START_KEY);
         }
-        // Its codec has been trained already.
-        if let Some(steps) = settings.pointer_mut("/pretrain/steps") {
-            *steps = 0.into();
+        // Its codec has been trained already, and it knows the first frames.
+        for known in ["/pretrain/steps", "/fit/short_share"] {
+            if let Some(value) = settings.pointer_mut(known) {
+                *value = 0.into();
+            }
         }
         let written = SettingsLayer::serialized(&origin, &settings);
         Self::over(written, origin, layers)
@@ -94,7 +96,10 @@ fn extract(
 fn expected(key: &str) -> Option<String> {
     let expected = match key {
         "data.windows" => "a whole number, 1 or more, or \"all\"",
-        "data.mirror" => "\"off\", or a list of the channels whose sign changes, as in [\"steering\"]",
+        "data.mirror" => {
+            "\"off\", \"movers\" (for a camera that stands), or a list of the channels whose sign changes, as in [\"steering\"]"
+        }
+        "run.optimizer" => "\"adam\" or \"muon\"",
         _ => return None,
     };
     Some(expected.to_owned())

@@ -13,7 +13,7 @@ use super::TrainError;
 use super::checkpoint::{Checkpoint, RunFiles};
 use super::config::RunConfig;
 use super::observer::{Observer, TrainingEvent, TrainingStage};
-use super::optimizer::{Adam, Gradients, OptimizerError};
+use super::optimizer::{Gradients, Optimizer, OptimizerError};
 use crate::nn::Parameters;
 
 /// A larger loss counts as diverged, because pixels are in 0…1.
@@ -25,7 +25,7 @@ pub(super) trait Objective: Sync {
     fn stage(&self) -> TrainingStage;
     /// Number of updates.
     fn steps(&self) -> usize;
-    /// Adam's highest learning rate.
+    /// The highest learning rate.
     fn learning_rate(&self) -> f64;
     /// The loss of one part of a step's batch, as a scalar with gradients.
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
@@ -64,7 +64,7 @@ pub(super) struct TrainState {
     /// Number of completed updates of the stage.
     pub(super) step: usize,
     pub(super) parameters: Parameters,
-    pub(super) optimizer: Adam,
+    pub(super) optimizer: Optimizer,
     /// The parameters with the lowest validation loss of the stage.
     pub(super) best: BTreeMap<String, Tensor>,
     pub(super) best_step: usize,
@@ -79,7 +79,7 @@ impl TrainState {
             stage: TrainingStage::Pretrain,
             step: 0,
             parameters,
-            optimizer: Adam::new(run.adam()),
+            optimizer: Optimizer::new(run.optimizer()),
             best,
             best_step: 0,
             best_loss: None,
@@ -92,7 +92,7 @@ impl TrainState {
         self.restore_best()?;
         self.stage = stage;
         self.step = 0;
-        self.optimizer = Adam::new(run.adam());
+        self.optimizer = Optimizer::new(run.optimizer());
         self.best_step = 0;
         self.best_loss = None;
         Ok(())

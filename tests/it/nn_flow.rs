@@ -92,7 +92,7 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
         }
         let model = Model::new(spec.clone(), &parameters).unwrap();
         let predicted = model
-            .predict_flow(&frames(&spec, 2), &condition(&spec, 2))
+            .predict_flow(&frames(&spec, 2), &condition(&spec, 2), spec.horizon)
             .unwrap()
             .unwrap();
         let shape = [2, spec.horizon, spec.pixels()];
@@ -110,6 +110,20 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
             let most = gradient.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
             assert!(most.is_finite() && most > 0.0, "{name}: {most}");
         }
+    }
+}
+
+#[test]
+fn the_first_frames_alone_are_those_of_the_whole_horizon() {
+    for spec in kinds() {
+        let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+        let first = |steps: usize| {
+            let predicted = model.predict_flow(&frames(&spec, 2), &condition(&spec, 2), steps);
+            predicted.unwrap().unwrap().frames
+        };
+        let (whole, one) = (first(spec.horizon), first(1));
+        assert_eq!(one.dims(), [2, 1, spec.pixels()]);
+        assert!(largest_difference(&one, &whole.narrow(1, 0, 1).unwrap()) < 1e-6);
     }
 }
 
@@ -140,7 +154,11 @@ fn an_untrained_network_turns_the_last_frame_with_the_camera() {
     let mut told = condition(&spec, 1);
     told.actions = Some(Tensor::new(&[[[0.0f32, 0.5], [0.0, 0.5]]], &Device::Cpu).unwrap());
     told.state = Some(Tensor::new(&[[0.1f32, 0.1, 1.0, 0.0, 0.5]], &Device::Cpu).unwrap());
-    let motion = model.predict_flow(&frames(&spec, 1), &told).unwrap().unwrap().motion;
+    let motion = model
+        .predict_flow(&frames(&spec, 1), &told, spec.horizon)
+        .unwrap()
+        .unwrap()
+        .motion;
     let yaw: Vec<f32> = motion
         .narrow(2, 0, 1)
         .unwrap()

@@ -2,7 +2,7 @@
 
 use candle_core::{Device, Tensor};
 use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
-use foreframe::training::optimizer::{Adam, AdamConfig, Gradients, OptimizerError};
+use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig, OptimizerError};
 use foreframe::types::Seed;
 
 const RATE: f64 = 1e-2;
@@ -25,10 +25,10 @@ fn values(shape: &[usize], phase: f32) -> Tensor {
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
-fn unclipped() -> AdamConfig {
-    AdamConfig {
+fn unclipped() -> OptimizerConfig {
+    OptimizerConfig {
         clip_norm: f64::INFINITY,
-        ..AdamConfig::default()
+        ..OptimizerConfig::default()
     }
 }
 
@@ -54,7 +54,7 @@ fn all_bits(parameters: &Parameters) -> Vec<u32> {
         .collect()
 }
 
-fn train(parameters: &Parameters, adam: &mut Adam, steps: std::ops::Range<usize>) {
+fn train(parameters: &Parameters, adam: &mut Optimizer, steps: std::ops::Range<usize>) {
     let spec = tiny();
     let model = Model::new(spec.clone(), parameters).unwrap();
     for step in steps {
@@ -72,7 +72,7 @@ fn train(parameters: &Parameters, adam: &mut Adam, steps: std::ops::Range<usize>
 #[test]
 fn adam_follows_its_closed_form_for_two_steps() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
-    let mut adam = Adam::new(unclipped());
+    let mut adam = Optimizer::new(unclipped());
     let slopes = [0.5f32, -2.0, 1e-3, 30.0, 0.0, 1.0, -1.0, 0.1, 0.2, 0.3, 0.4, 0.6];
     let second: Vec<f32> = slopes.iter().map(|slope| 0.3 - slope).collect();
     let start = bias(&parameters);
@@ -99,13 +99,13 @@ fn adam_follows_its_closed_form_for_two_steps() {
 #[test]
 fn a_resumed_run_is_bit_identical() {
     let whole = Parameters::initialize(&tiny(), Seed(1)).unwrap();
-    train(&whole, &mut Adam::new(AdamConfig::default()), 0..7);
+    train(&whole, &mut Optimizer::new(OptimizerConfig::default()), 0..7);
     let stopped = Parameters::initialize(&tiny(), Seed(1)).unwrap();
-    let mut adam = Adam::new(AdamConfig::default());
+    let mut adam = Optimizer::new(OptimizerConfig::default());
     train(&stopped, &mut adam, 0..3);
     let (weights, moments) = (stopped.snapshot().unwrap(), adam.export().unwrap());
     let resumed = Parameters::from_tensors(&tiny(), weights).unwrap();
-    let mut adam = Adam::import(AdamConfig::default(), &moments, &resumed).unwrap();
+    let mut adam = Optimizer::import(OptimizerConfig::default(), &moments, &resumed).unwrap();
     assert_eq!(adam.steps(), 3);
     train(&resumed, &mut adam, 3..7);
     assert_eq!(all_bits(&resumed), all_bits(&whole));
@@ -113,9 +113,9 @@ fn a_resumed_run_is_bit_identical() {
 
 #[test]
 fn a_large_gradient_is_scaled_to_the_clipping_norm() {
-    let exported = |config: AdamConfig, slopes: &[f32]| {
+    let exported = |config: OptimizerConfig, slopes: &[f32]| {
         let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
-        let mut adam = Adam::new(config);
+        let mut adam = Optimizer::new(config);
         let gradients = Gradients::of(&slope(&parameters, slopes), &parameters, &[]).unwrap();
         let norm = adam.update(&parameters, &gradients, RATE).unwrap();
         (
@@ -125,7 +125,7 @@ fn a_large_gradient_is_scaled_to_the_clipping_norm() {
                 .unwrap(),
         )
     };
-    let (norm, clipped) = exported(AdamConfig::default(), &[3.0; 12]);
+    let (norm, clipped) = exported(OptimizerConfig::default(), &[3.0; 12]);
     let (_, unit) = exported(unclipped(), &[1.0 / 12f32.sqrt(); 12]);
     assert!((norm - 108f64.sqrt()).abs() < 1e-4);
     for (clipped, unit) in clipped.iter().zip(unit) {
@@ -137,7 +137,7 @@ fn a_large_gradient_is_scaled_to_the_clipping_norm() {
 fn a_non_finite_gradient_or_loss_changes_nothing() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let before = all_bits(&parameters);
-    let mut adam = Adam::new(AdamConfig::default());
+    let mut adam = Optimizer::new(OptimizerConfig::default());
     let infinite = slope(&parameters, &[f32::INFINITY; 12]);
     assert!(matches!(
         Gradients::of(&infinite, &parameters, &[]),
@@ -159,7 +159,7 @@ fn frozen_tensors_do_not_change() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
     let before = bias(&parameters);
     let gradients = Gradients::of(&slope(&parameters, &[1.0; 12]), &parameters, &["frame_"]).unwrap();
-    Adam::new(AdamConfig::default())
+    Optimizer::new(OptimizerConfig::default())
         .update(&parameters, &gradients, RATE)
         .unwrap();
     assert_eq!(bias(&parameters), before);
@@ -191,12 +191,12 @@ fn half_batch_gradients_average_to_the_batch_gradient() {
 #[test]
 fn a_mismatched_optimizer_state_is_refused() {
     let parameters = Parameters::initialize(&tiny(), Seed(1)).unwrap();
-    let mut adam = Adam::new(AdamConfig::default());
+    let mut adam = Optimizer::new(OptimizerConfig::default());
     train(&parameters, &mut adam, 0..1);
     let refused = |change: &dyn Fn(&mut std::collections::BTreeMap<String, Tensor>)| {
         let mut tensors = adam.export().unwrap();
         change(&mut tensors);
-        Adam::import(AdamConfig::default(), &tensors, &parameters)
+        Optimizer::import(OptimizerConfig::default(), &tensors, &parameters)
             .unwrap_err()
             .to_string()
     };

@@ -55,7 +55,10 @@ fn trains_and_predicts(preset: &str, [width, height, context, horizon]: [usize; 
         "fit.batch_size=2".to_owned(),
     ];
     let small: &[&str] = match preset {
-        "static-flow" => &["model.flow={ channels = 4, stem_channels = 4, enlarged_channels = 2, fine_channels = 4 }"],
+        "static-flow" => &[
+            "model.flow={ channels = 4, stem_channels = 4, enlarged_channels = 2, fine_channels = 4 }",
+            "data.mirror=off",
+        ],
         _ => &["model.features=6", "model.hidden=6"],
     };
     let settings: Vec<String> = settings

@@ -31,16 +31,80 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         "run.checkpoint_every_steps=4",
         "run.warmup_steps=3",
     ];
-    let settings: Vec<String> = small.iter().map(|&setting| setting.to_owned()).collect();
-    let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
-    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
-    let (unbroken, broken) = (dir.path().join("unbroken"), dir.path().join("broken"));
-    train(&config, &dataset, &unbroken).unwrap();
-    for updates in [2, 5] {
-        train_until(&config, &dataset, &broken, updates).unwrap();
+    let camera_stands = [
+        "model.conditioning=none",
+        "model.flow.recurrent=true",
+        "data.mirror=movers",
+        "fit.short_share=0.5",
+        "fit.short_horizon=2",
+        "run.optimizer=muon",
+    ];
+    let dataset = squares(20);
+    for other in [&[][..], &camera_stands] {
+        let settings: Vec<String> = small.iter().chain(other).map(|&setting| setting.to_owned()).collect();
+        let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let (unbroken, broken) = (dir.path().join("unbroken"), dir.path().join("broken"));
+        train(&config, &dataset, &unbroken).unwrap();
+        for updates in [2, 5] {
+            train_until(&config, &dataset, &broken, updates).unwrap();
+        }
+        train(&config, &dataset, &broken).unwrap();
+        assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
+        // Each of the settings changes what is learned.
+        for without in ["data.mirror=off", "fit.short_share=0", "run.optimizer=adam"] {
+            if other.is_empty() {
+                continue;
+            }
+            let settings: Vec<String> = settings.iter().cloned().chain([without.to_owned()]).collect();
+            let config = TrainConfig::layered("moving-flow", None, &settings).unwrap();
+            let changed = dir.path().join(without);
+            train(&config, &dataset, &changed).unwrap();
+            assert!(weights(&changed) != weights(&unbroken), "{without} changes nothing");
+        }
     }
-    train(&config, &dataset, &broken).unwrap();
-    assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
+}
+
+#[test]
+fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
+    for (preset, setting, expected) in [
+        (
+            "paper",
+            "run.optimizer=muon",
+            "run.optimizer is for the flow network only; it must be adam where model.architecture is dense",
+        ),
+        (
+            "paper",
+            "fit.short_share=0.5",
+            "fit.short_share is for the flow network only; it must be 0 where model.architecture is dense",
+        ),
+        (
+            "static-flow",
+            "fit={ short_share = 0.5, short_horizon = 6 }",
+            "fit.short_horizon is 6; it must be 1 to model.horizon, 5",
+        ),
+        (
+            "moving-flow",
+            "data.mirror=movers",
+            "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
+             model.conditioning is state-action: set it to none, or data.mirror to off",
+        ),
+    ] {
+        let error = TrainConfig::layered(preset, None, &[setting.to_owned()]).unwrap_err();
+        assert_eq!(error.to_string(), expected);
+    }
+    let error = TrainConfig::layered("static-flow", None, &["data.mirror=movrs".to_owned()]).unwrap_err();
+    assert!(
+        error.to_string().contains("\"movers\" (for a camera that stands)"),
+        "{error}"
+    );
+    let (noise, dir) = (standing(None), tempfile::tempdir().unwrap());
+    let config = small_config(&["model.conditioning=none", "data.mirror=movers"]);
+    let error = train(&config, &noise, dir.path()).unwrap_err().to_string();
+    assert!(
+        error.contains("and at most 40 % may: probably the camera moves"),
+        "{error}"
+    );
 }
 
 fn small_config(extra: &[&str]) -> TrainConfig {

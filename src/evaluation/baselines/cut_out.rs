@@ -3,16 +3,11 @@
 
 use std::collections::VecDeque;
 
-use super::{evenly, mean};
+use super::mean;
+use crate::dataset::background::{Background, MAX_CHANGED_SHARE, differing};
 use crate::dataset::{Dataset, Window};
 use crate::evaluation::EvaluationError;
 
-/// Training frames that the background is the median of at most, evenly spread.
-const MAX_BACKGROUND_FRAMES: usize = 1000;
-/// A pixel that differs from the background by more than this belongs to something else.
-const DIFFERENCE: f32 = 12.0 / 255.0;
-/// Where the background of the training split differs in more than this share of the pixels, the camera looks elsewhere.
-const MAX_CHANGED_SHARE: f32 = 0.4;
 /// Smaller objects are noise; share of the frame's pixels.
 const MIN_OBJECT_SHARE: f32 = 0.002;
 /// An object whose size or place changes by more than this from one frame to the next is another one: factor of its
@@ -39,16 +34,10 @@ impl CutOut {
     /// Takes the median of every pixel over the first frames of these windows.
     /// Errors: those of [`Dataset::pixels`].
     pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Result<Self, EvaluationError> {
-        let frames = evenly(windows, MAX_BACKGROUND_FRAMES);
-        let mut counts = vec![[0u16; 256]; dataset.info().frame_pixels()];
-        for window in &frames {
-            for (counts, &value) in counts.iter_mut().zip(&*dataset.pixels(window.first_frame)?) {
-                counts[usize::from(value)] += 1;
-            }
-        }
-        let middle = frames.len() as u16 / 2;
+        let frames: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
+        let background = Background::of(dataset, &frames)?.pixels;
         Ok(Self {
-            background: counts.iter().map(|counts| median(counts, middle)).collect(),
+            background: background.into_iter().map(|value| f32::from(value) / 255.0).collect(),
             width: dataset.info().frame_width_px as usize,
         })
     }
@@ -215,25 +204,6 @@ fn neighbours(pixel: usize, width: usize, count: usize) -> impl Iterator<Item = 
     let rows = row.saturating_sub(1)..(row + 2).min(count / width);
     rows.flat_map(move |row| columns.clone().map(move |column| row * width + column))
         .filter(move |&next| next != pixel)
-}
-
-fn differing(frame: &[f32], background: &[f32]) -> impl Iterator<Item = bool> {
-    frame
-        .iter()
-        .zip(background)
-        .map(|(value, behind)| (value - behind).abs() > DIFFERENCE)
-}
-
-/// The value that has `middle` others below it.
-fn median(counts: &[u16; 256], middle: u16) -> f32 {
-    let mut below = 0;
-    for (value, count) in counts.iter().enumerate() {
-        below += count;
-        if below > middle {
-            return value as f32 / 255.0;
-        }
-    }
-    0.0
 }
 
 #[cfg(test)]

@@ -17,8 +17,13 @@ use super::{FlowModel, FlowPrediction};
 const BLOCK_PIXELS: usize = 4;
 
 impl FlowModel {
-    /// The futures of a model that takes no actions: its camera stands.
-    pub(super) fn predict_recurrently(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<FlowPrediction, NnError> {
+    /// The futures of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
+    pub(super) fn predict_recurrently(
+        &self,
+        spec: &ModelSpec,
+        rows: &FutureRows,
+        steps: usize,
+    ) -> Result<FlowPrediction, NnError> {
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
         let motion = Tensor::zeros((count, horizon, 3), DType::F32, &Device::Cpu)?;
@@ -39,8 +44,8 @@ impl FlowModel {
             .flat_map(|&row| &contexts.last_frames[row as usize * size.pixels()..(row as usize + 1) * size.pixels()])
             .copied()
             .collect();
-        let mut frames = Vec::with_capacity(horizon);
-        for step in 0..horizon {
+        let mut frames = Vec::with_capacity(steps);
+        for step in 0..steps {
             let moved = sampled_blocks(&last_frames, &each, &own, size);
             let moved = Tensor::from_vec(moved, (count, half.height, half.width, BLOCK_PIXELS + 1), &Device::Cpu)?;
             let seen = pixel_unshuffle(&moved.narrow(3, 0, BLOCK_PIXELS)?.contiguous()?)?;
