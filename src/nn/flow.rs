@@ -142,15 +142,14 @@ impl FlowModel {
         windows: &[u32],
         conditioning: &ConditioningTensors,
     ) -> Result<FlowPrediction, NnError> {
-        self.predict_first(spec, frames, windows, conditioning, spec.horizon)
+        self.predict_first(spec, (frames, windows), conditioning, spec.horizon)
     }
 
     /// As [`FlowModel::predict`], with the frames of the first `steps` only.
     pub(super) fn predict_first(
         &self,
         spec: &ModelSpec,
-        frames: &Tensor,
-        windows: &[u32],
+        (frames, windows): (&Tensor, &[u32]),
         conditioning: &ConditioningTensors,
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {

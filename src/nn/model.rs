@@ -176,7 +176,7 @@ impl Model {
         match &self.network {
             Network::Dense(_) => Ok(None),
             Network::Flow(flow) => flow
-                .predict_first(&self.spec, frames, &each_once(batch), conditioning, steps)
+                .predict_first(&self.spec, (frames, &each_once(batch)), conditioning, steps)
                 .map(Some),
         }
     }

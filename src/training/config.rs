@@ -360,6 +360,17 @@ impl TrainConfig {
                 )));
             }
         }
+        if self.data.windows == WindowBudget::Count(0) {
+            return Err(TrainError::Config(
+                "data.windows is 0; it must be at least 1, or \"all\"".to_owned(),
+            ));
+        }
+        self.validate_together()
+    }
+
+    /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
+    fn validate_together(&self) -> Result<(), TrainError> {
+        let (run, fit) = (&self.run, &self.fit);
         if self.model.architecture == Architecture::Dense {
             let refused = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
@@ -383,11 +394,6 @@ impl TrainConfig {
                 "fit.short_horizon is {}; it must be 1 to model.horizon, {}",
                 fit.short_horizon, self.model.horizon
             )));
-        }
-        if self.data.windows == WindowBudget::Count(0) {
-            return Err(TrainError::Config(
-                "data.windows is 0; it must be at least 1, or \"all\"".to_owned(),
-            ));
         }
         Ok(())
     }
