@@ -123,8 +123,8 @@ pub enum All {
 }
 
 /// What is mirrored left to right in half of the training windows: nothing (`"off"`), what moves in front of a standing
-/// camera (`"movers"`), or whole frames; then the channels of actions and states whose sign changes in a mirror, as in
-/// `["steering"]`. The list may be empty.
+/// camera (`"movers"`), or whole frames (a list of the channels of actions and states whose sign changes in a mirror, as in
+/// `["steering"]`; it may be empty).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Mirror {

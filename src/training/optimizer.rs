@@ -1,5 +1,6 @@
-//! Adam (Kingma & Ba 2015), or Muon for some weights and Adam for the others. The moments can be exported, so that a resumed training continues bit by bit. [`Gradients`] are
-//! separate values, so that parts of a batch can be computed in parallel and averaged.
+//! Adam (Kingma & Ba 2015), or Muon for some weights and Adam for the others. The moments can be exported, so that a resumed
+//! training continues bit by bit. [`Gradients`] are separate values, so that parts of a batch can be computed in parallel and
+//! averaged.
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
@@ -138,14 +139,14 @@ impl Optimizer {
         self.step += 1;
         let steps = i32::try_from(self.step).unwrap_or(i32::MAX);
         let OptimizerConfig {
-            rule: update_rule,
+            rule,
             beta1,
             beta2,
             epsilon,
             clip_norm,
         } = self.config;
         let second_correction = 1.0 - beta2.powi(steps);
-        let rule = AdamStep {
+        let adam = AdamStep {
             scale: if norm > clip_norm {
                 (clip_norm / norm) as f32
             } else {
@@ -166,13 +167,13 @@ impl Optimizer {
                 first: vec![0.0; var.elem_count()],
                 second: vec![0.0; var.elem_count()],
             });
-            if update_rule == UpdateRule::Muon && muon::applies_to(name) {
-                muon::update(var, gradient, rule.scale, &mut moments.first, learning_rate)?;
+            if rule == UpdateRule::Muon && muon::applies_to(name) {
+                muon::update(var, gradient, adam.scale, &mut moments.first, learning_rate)?;
                 continue;
             }
             with_values(gradient, |gradient| {
                 var.inplace_op1(&AdamUpdate {
-                    rule,
+                    rule: adam,
                     gradient,
                     moments: RefCell::new(moments),
                 })
