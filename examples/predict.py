@@ -77,7 +77,7 @@ def smoothed(image, sigma):
 
 
 def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
+    return 1 / (1 + np.exp(-np.clip(x, -87, 87)))
 
 
 def lstm_step(x, h, c, tensors, name):

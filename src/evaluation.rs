@@ -78,6 +78,9 @@ impl Purpose {
     }
 }
 
+/// Training windows among which the nearest-window baseline looks, unless other numbers are asked for.
+pub const NEAREST_WINDOWS: usize = 15_000;
+
 /// What to test on, and how closely.
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
@@ -89,6 +92,8 @@ pub struct EvaluateConfig<'a> {
     pub stride: usize,
     /// Windows of each set at most, evenly spread over its trials.
     pub max_windows: usize,
+    /// Training windows among which the baseline looks for the nearest one, at most, evenly spread.
+    pub nearest_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,
     /// Seed of the resamples and of the shuffled actions.
@@ -112,6 +117,7 @@ impl Default for EvaluateConfig<'_> {
             split_seed: None,
             stride: 1,
             max_windows: 2000,
+            nearest_windows: NEAREST_WINDOWS,
             bootstrap_samples: 1000,
             seed: Seed(0),
             batch: 64,
@@ -129,6 +135,7 @@ impl EvaluateConfig<'_> {
         for (setting, value, least) in [
             ("the stride of windows", self.stride, 1),
             ("the number of windows", self.max_windows, 1),
+            ("the number of training windows to search", self.nearest_windows, 1),
             ("the number of bootstrap samples", self.bootstrap_samples, 100),
             ("the batch size", self.batch, 1),
         ] {
@@ -252,7 +259,7 @@ pub fn run(
         });
     }
     let spec = loaded.model.spec();
-    let mut baselines = fitted_baselines(loaded, (dataset, &splits), config.purpose)?;
+    let mut baselines = fitted_baselines(loaded, (dataset, &splits), config)?;
     if spec.architecture == Architecture::Flow {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
@@ -284,15 +291,15 @@ pub fn run(
 fn fitted_baselines(
     loaded: &LoadedModel,
     (dataset, splits): (&Dataset, &Splits),
-    purpose: Purpose,
+    config: &EvaluateConfig,
 ) -> Result<Baselines, EvaluationError> {
     let shape = window_shape(loaded.model.spec());
-    let mut baselines = match purpose {
+    let mut baselines = match config.purpose {
         Purpose::WholeSet => {
             let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
-            Baselines::fit(dataset, &own, shape)?.without(Method::NearestWindow)
+            Baselines::fit(dataset, &own, shape, config.nearest_windows)?.without(Method::NearestWindow)
         }
-        _ => Baselines::fit(dataset, splits, shape)?,
+        _ => Baselines::fit(dataset, splits, shape, config.nearest_windows)?,
     };
     let of = |scenario: &Option<String>| scenario.as_deref() == Some(MOVING_MNIST);
     if of(&loaded.manifest.dataset.scenario) || of(&dataset.info().scenario) {

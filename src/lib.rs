@@ -39,6 +39,8 @@
 
 pub mod types;
 
+mod vectorized;
+
 pub mod files;
 
 #[cfg(feature = "train")]

@@ -9,7 +9,7 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use super::{CliError, command_line, print_line, progress::ProgressLine};
 use crate::dataset::Dataset;
-use crate::evaluation::{self, EvaluateConfig, EvaluationReport, Purpose};
+use crate::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, Purpose};
 use crate::jobs::spec::MAX_RESAMPLES;
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
@@ -49,6 +49,10 @@ pub(super) struct EvaluateArgs {
     /// Windows of each set at most, spread evenly over its trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
+    /// Training windows among which the baseline looks for the nearest one, at most. Give as many as the model was trained on to
+    /// compare a model of few windows with a baseline that knows as little
+    #[arg(long, value_name = "WINDOWS", default_value_t = NEAREST_WINDOWS as u32, value_parser = value_parser!(u32).range(1..=NEAREST_WINDOWS as i64))]
+    nearest_windows: u32,
     /// Bootstrap resamples of the trials, for the intervals
     #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]
     resamples: u32,
@@ -112,6 +116,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
             SplitChoice::All => Purpose::WholeSet,
         },
         max_windows: args.windows,
+        nearest_windows: args.nearest_windows as usize,
         bootstrap_samples: args.resamples as usize,
         seed: Seed(args.seed),
         twins: twins.iter().collect(),

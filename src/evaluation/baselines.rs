@@ -66,8 +66,14 @@ pub struct Baselines {
 impl Baselines {
     /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
     /// training window of that shape exists there is no nearest one. All but the mean training frame look only at a limited
-    /// number of windows or frames, evenly spread. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
-    pub fn fit(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Self, EvaluationError> {
+    /// number of windows or frames, evenly spread: the nearest window is one of `searched`. Errors: those of
+    /// [`Splits::windows`] and [`Dataset::pixels`].
+    pub fn fit(
+        dataset: &Dataset,
+        splits: &Splits,
+        shape: WindowShape,
+        searched: usize,
+    ) -> Result<Self, EvaluationError> {
         let ego_motion = match CameraTurn::of(dataset.info()) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
             None => {
@@ -75,7 +81,7 @@ impl Baselines {
             }
         };
         let windows = training_windows(dataset, splits, shape)?;
-        let nearest = TrainingWindows::new(dataset, &evenly(&windows, nearest::MAX_WINDOWS), shape)?;
+        let nearest = TrainingWindows::new(dataset, &evenly(&windows, searched), shape)?;
         let single = WindowShape { context: 1, horizon: 1 };
         let frames = training_windows(dataset, splits, single)?;
         let methods = Method::ALL.into_iter().filter(|method| match method {
@@ -265,14 +271,18 @@ mod tests {
 
     const SHAPE: WindowShape = WindowShape { context: 5, horizon: 3 };
 
-    fn fitted(dataset: &Dataset) -> (Baselines, Splits) {
+    fn fitted(dataset: &Dataset, searched: usize) -> (Baselines, Splits) {
         let splits = Splits::new(dataset, Seed(1));
-        (Baselines::fit(dataset, &splits, SHAPE).unwrap(), splits)
+        (Baselines::fit(dataset, &splits, SHAPE, searched).unwrap(), splits)
     }
 
-    /// Mean error of a method over the test windows.
     fn error_of(method: Method, dataset: &Dataset) -> f64 {
-        let (baselines, splits) = fitted(dataset);
+        error_among(usize::MAX, method, dataset)
+    }
+
+    /// Mean error of a method over the test windows, where the nearest window is one of `searched`.
+    fn error_among(searched: usize, method: Method, dataset: &Dataset) -> f64 {
+        let (baselines, splits) = fitted(dataset, searched);
         let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
         let errors = windows.iter().flat_map(|&window| {
             let frame = |step: usize| frame_of(dataset, window.first_frame + step).unwrap();
@@ -311,7 +321,7 @@ mod tests {
     #[test]
     fn every_baseline_is_right_on_a_still_scene() {
         let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
-        for method in fitted(&dataset)
+        for method in fitted(&dataset, usize::MAX)
             .0
             .methods()
             .iter()
@@ -344,7 +354,7 @@ mod tests {
         let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
         let shape = WindowShape { context: 1, horizon: 1 };
         let splits = Splits::new(&dataset, Seed(1));
-        let baselines = Baselines::fit(&dataset, &splits, shape).unwrap();
+        let baselines = Baselines::fit(&dataset, &splits, shape, usize::MAX).unwrap();
         let inputs = [frame_of(&dataset, 0).unwrap()];
         let window = Window {
             episode: 0,
@@ -403,6 +413,7 @@ mod tests {
         };
         let dataset = recordings(SIDE, frame, |_, _| 0.0);
         assert!(error_of(Method::NearestWindow, &dataset) < 1e-6);
+        assert!(error_among(1, Method::NearestWindow, &dataset) > 0.1);
         assert!(error_of(Method::CopyLast, &dataset) > 0.1);
     }
 }

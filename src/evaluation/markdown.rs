@@ -37,7 +37,7 @@ fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result
     }
     uncertainty::novelty_section(out, &report.novelty)?;
     figures(out, report)?;
-    how(out)?;
+    how(out, report.stamp.nearest_windows)?;
     model(out, &report.model)?;
     stamp(out, &report.stamp)
 }
@@ -326,7 +326,7 @@ fn figures(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
     Ok(())
 }
 
-fn how(out: &mut String) -> std::fmt::Result {
+fn how(out: &mut String, nearest_windows: usize) -> std::fmt::Result {
     writeln!(out, "\n## How this was measured\n")?;
     writeln!(
         out,
@@ -362,7 +362,10 @@ fn how(out: &mut String) -> std::fmt::Result {
         ),
         (
             Method::NearestWindow,
-            "the future of the training window (one of at most 15,000) whose inputs have the least MSE",
+            &format!(
+                "the future of the training window (one of at most {}) whose inputs have the least MSE",
+                grouped(nearest_windows as u64)
+            ),
         ),
         (
             Method::CodecOnly,

@@ -104,6 +104,9 @@ pub struct ReportStamp {
     pub command: String,
     /// Frames from the start of one window to that of the next.
     pub stride: usize,
+    /// Training windows among which the baseline looked for the nearest one, at most.
+    #[serde(default = "nearest_windows")]
+    pub nearest_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,
     /// Seed of the resamples and of the shuffled actions.
@@ -137,6 +140,7 @@ impl ReportStamp {
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,
+            nearest_windows: config.nearest_windows,
             bootstrap_samples: config.bootstrap_samples,
             seed: config.seed,
             wall_time_s: wall_time.as_secs_f64(),
@@ -144,6 +148,11 @@ impl ReportStamp {
             threads: rayon::current_num_threads(),
         }
     }
+}
+
+/// Of reports from before this number was a setting.
+fn nearest_windows() -> usize {
+    super::NEAREST_WINDOWS
 }
 
 /// From `/proc/cpuinfo`; the architecture where that does not exist.

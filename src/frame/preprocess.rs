@@ -3,10 +3,10 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use pulp::Arch;
 use serde::{Deserialize, Serialize};
 
 use super::{Frame, FrameError};
+use crate::vectorized::vectorized;
 
 /// How frames are converted to the model's value range.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -66,7 +66,7 @@ impl Preprocess {
             });
         }
         let mut pixels = vec![0; values.len()];
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (pixel, value) in pixels.iter_mut().zip(values) {
@@ -111,6 +111,14 @@ pub(super) fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
 
 /// Convolves rows, then columns, with the same kernel of odd length. Outside the image, the edge pixel is repeated.
 pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
+    vectorized(
+        #[inline(always)]
+        || rows_then_columns(values, width, kernel),
+    )
+}
+
+#[inline(always)]
+fn rows_then_columns(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
     let height = values.len() / width;
     let radius = kernel.len() / 2;
     let mut rows = vec![0.0; values.len()];
@@ -135,6 +143,14 @@ pub(super) fn convolve_separable(values: &[f32], width: usize, kernel: &[f32]) -
 
 /// The adjoint of [`convolve_separable`]: the gradient of what it was given, from the gradient of its result.
 pub(super) fn convolve_separable_adjoint(gradient: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
+    vectorized(
+        #[inline(always)]
+        || columns_then_rows(gradient, width, kernel),
+    )
+}
+
+#[inline(always)]
+fn columns_then_rows(gradient: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
     let height = gradient.len() / width;
     let radius = kernel.len() / 2;
     let mut rows = vec![0.0; gradient.len()];
@@ -159,6 +175,7 @@ pub(super) fn convolve_separable_adjoint(gradient: &[f32], width: usize, kernel:
     result
 }
 
+#[inline(always)]
 fn add_scaled(out: &mut [f32], values: &[f32], weight: f32) {
     for (out, value) in out.iter_mut().zip(values) {
         *out += weight * value;

@@ -4,11 +4,11 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::activation::exp;
 use super::sampling::{ImageSize, Neighbourhood};
 use super::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
 
 /// Numbers that the head gives for each pixel: two flows (column, row), three mask logits, one change of the content.
 pub(super) const HEAD_VALUES: usize = 8;
@@ -151,7 +151,7 @@ impl CustomOp3 for Composition {
         let scene = slice(scene, scene_layout)?;
         let places = slice(places, places_layout)?;
         let mut out = vec![0.0; self.frame_of.len() * self.size.pixels()];
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 self.visit(
@@ -185,7 +185,7 @@ impl CustomOp3 for Composition {
             with_values(scene, |scene| {
                 with_values(places, |places| {
                     with_values(gradient, |gradient| {
-                        Arch::new().dispatch(
+                        vectorized(
                             #[inline(always)]
                             || {
                                 self.visit(

@@ -7,9 +7,9 @@
 
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::tensors::{add_columns, slice, with_values};
+use crate::vectorized::vectorized;
 
 /// Side of the kernel.
 const SIDE: usize = 3;
@@ -209,7 +209,7 @@ impl ImageGeometry {
 
 /// Adds values to sums.
 fn add(sums: &mut [f32], values: &[f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for (sum, value) in sums.iter_mut().zip(values) {
@@ -364,7 +364,7 @@ fn turned_kernel(weight: &[f32], channels: usize) -> Vec<f32> {
 }
 
 fn add_all_columns(sums: &mut [f32], values: &[f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || add_columns(sums, values),
     );

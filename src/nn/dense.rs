@@ -4,11 +4,11 @@
 
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
-use pulp::Arch;
 
 use super::NnError;
 use super::activation::tanh;
 use super::tensors::{add_columns, matrix, slice, with_values};
+use crate::vectorized::vectorized;
 
 /// The activation function of a dense layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,7 +84,7 @@ impl CustomOp3 for FusedDense {
         let mut sums = x.matmul(weight, (1, rows, outputs, inputs), x_layout, weight_layout)?;
         let bias = slice(bias, bias_layout)?;
         if let CpuStorage::F32(sums) = &mut sums {
-            Arch::new().dispatch(
+            vectorized(
                 #[inline(always)]
                 || {
                     for row in sums.chunks_exact_mut(outputs) {
@@ -116,7 +116,7 @@ impl CustomOp3 for FusedDense {
         };
         let mut sums = vec![0.0; gradient.dim(1)?];
         with_values(&gradient, |gradient| {
-            Arch::new().dispatch(
+            vectorized(
                 #[inline(always)]
                 || add_columns(&mut sums, gradient),
             );
@@ -136,7 +136,7 @@ fn through_tanh(y: &Tensor, gradient: &Tensor) -> candle_core::Result<Tensor> {
     let columns = y.dim(1)?;
     let product = with_values(y, |y| {
         with_values(gradient, |gradient| {
-            Arch::new().dispatch(
+            vectorized(
                 #[inline(always)]
                 || {
                     y.iter()

@@ -6,12 +6,12 @@ use std::fmt;
 use std::str::FromStr;
 
 use candle_core::{CpuStorage, CustomOp2, DType, Layout, Shape, Tensor};
-use pulp::Arch;
 use serde::{Deserialize, Serialize};
 
 use super::NnError;
 use super::spec::named_enum;
 use super::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
 
 named_enum!(
     /// The loss that training minimizes. The paper found the mean squared error best.
@@ -98,7 +98,7 @@ impl CustomOp2 for Loss {
 /// Sum of `term` of each difference: blocks in f32, the sum of the blocks in f64.
 #[inline(always)]
 fn sum_of(prediction: &[f32], target: &[f32], term: impl Fn(f32) -> f32) -> f64 {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             let mut total = 0.0;
@@ -120,7 +120,7 @@ fn sum_of(prediction: &[f32], target: &[f32], term: impl Fn(f32) -> f32) -> f64 
 #[inline(always)]
 fn slopes(prediction: &[f32], target: &[f32], slope: impl Fn(f32) -> f32) -> Vec<f32> {
     let mut values = vec![0.0; prediction.len()];
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for ((value, prediction), target) in values.iter_mut().zip(prediction).zip(target) {

@@ -3,10 +3,10 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::activation::sigmoid;
 use super::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
 
 /// x · σ(x) of each value ("`SiLU`").
 pub(super) fn silu(x: &Tensor) -> Result<Tensor> {
@@ -51,7 +51,7 @@ impl CustomOp1 for Silu {
         let x = slice(x, layout)?;
         let mut values = vec![0.0; x.len()];
         // Not `collect`: it is not inlined, so its loop would do without vector instructions.
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (value, &x) in values.iter_mut().zip(x) {
@@ -66,7 +66,7 @@ impl CustomOp1 for Silu {
         let mut values = vec![0.0; x.elem_count()];
         with_values(x, |x| {
             with_values(gradient, |gradient| {
-                Arch::new().dispatch(
+                vectorized(
                     #[inline(always)]
                     || {
                         for ((value, &x), gradient) in values.iter_mut().zip(x).zip(gradient) {
@@ -99,7 +99,7 @@ impl CustomOp2 for ModulatedSilu {
         let (x, modulation) = (slice(x, x_layout)?, slice(modulation, modulation_layout)?);
         let mut out = x.to_vec();
         let item = x.len() / count;
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (values, modulation) in out.chunks_exact_mut(item).zip(modulation.chunks_exact(2 * channels)) {
@@ -135,7 +135,7 @@ impl CustomOp2 for ModulatedSilu {
                         .zip(x.chunks_exact(item))
                         .zip(modulation.chunks_exact(2 * channels))
                         .zip(for_modulation.chunks_exact_mut(2 * channels));
-                    Arch::new().dispatch(
+                    vectorized(
                         #[inline(always)]
                         || {
                             for (((gradient, x), modulation), sums) in items {

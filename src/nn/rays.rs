@@ -6,11 +6,11 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::sampling::ImageSize;
 use super::tensors::{slice, with_values};
 use crate::frame::warp::CameraModel;
+use crate::vectorized::vectorized;
 
 /// Depths below this count as this deep, so that what is behind the camera lands far outside the frame.
 const MIN_DEPTH: f32 = 1e-3;
@@ -115,7 +115,7 @@ impl Viewer {
     /// As [`Viewer::turned`], into `places`.
     fn write_turned(self, rays: &[[f32; 3]], yaw: f32, places: &mut [f32]) {
         let (sin, cos) = yaw.sin_cos();
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (place, &ray) in places.chunks_exact_mut(2).zip(rays) {

@@ -8,12 +8,12 @@ mod backward;
 use std::sync::{Mutex, PoisonError};
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::gates::{self, Peepholes};
 use super::lstm::Decoder;
 use super::lstm_cell::{LstmState, PeepholeCell};
 use super::tensors::{add_columns, matrix, slice, with_values};
+use crate::vectorized::vectorized;
 
 /// The output layer of an autoregressive decoder; its output is an input of the cell's next step.
 #[derive(Clone)]
@@ -186,7 +186,7 @@ impl Recurrence {
         let (c_before, c) = c[t * batch * hidden..].split_at_mut(batch * hidden);
         let h = &mut h[(t + 1) * batch * hidden..];
         let sums = &mut activations[t * batch * 4 * hidden..(t + 1) * batch * 4 * hidden];
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 let states = c_before

@@ -5,10 +5,10 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
-use pulp::Arch;
 
 use super::rays::{CameraPose, Viewer, rotated};
 use super::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
 
 /// Octaves of sines and cosines of each coordinate of the point met.
 const OCTAVES: usize = 5;
@@ -149,7 +149,7 @@ impl RoomViews {
         for ((places, &pose), &from) in views {
             let (origin, seen_from) = (self.origin(pose), self.origin(from));
             let [(sin, cos), (sin_before, cos_before)] = [pose, from].map(|pose| pose.heading.sin_cos());
-            Arch::new().dispatch(
+            vectorized(
                 #[inline(always)]
                 || {
                     for (place, &ray) in places.chunks_exact_mut(2).zip(&self.rays) {

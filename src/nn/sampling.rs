@@ -3,9 +3,9 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
-use pulp::Arch;
 
 use super::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
 
 /// The four pixels around a place, and the shares of the right column and of the lower row.
 #[derive(Clone, Copy)]
@@ -140,7 +140,7 @@ impl CustomOp1 for FeatureSampling {
         }
         let values = slice(features, layout)?;
         let mut out = vec![0.0; count * channels];
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 self.visit(
@@ -169,7 +169,7 @@ impl CustomOp1 for FeatureSampling {
         let size = ImageSize { height, width };
         let mut sums = vec![0.0; features.elem_count()];
         with_values(gradient, |gradient| {
-            Arch::new().dispatch(
+            vectorized(
                 #[inline(always)]
                 || {
                     self.visit(

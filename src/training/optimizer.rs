@@ -13,11 +13,11 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Tensor};
-use pulp::Arch;
 use serde::{Deserialize, Serialize};
 
 use crate::nn::Parameters;
 use crate::nn::tensors::with_values;
+use crate::vectorized::vectorized;
 
 /// Prefixes of the exported tensors' names: first and second moments, and the number of steps.
 const FIRST: &str = "adam.first.";
@@ -279,7 +279,7 @@ impl InplaceOp1 for AdamUpdate<'_> {
         };
         let mut moments = self.moments.borrow_mut();
         let Moments { first, second, .. } = &mut **moments;
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || self.rule.apply(&mut values[from..to], self.gradient, first, second),
         );

@@ -6,12 +6,13 @@ use std::path::{Path, PathBuf};
 /// The modules that each module may use.
 const MAY_USE: &[(&str, &[&str])] = &[
     ("types", &[]),
+    ("vectorized", &[]),
     ("files", &[]),
     ("settings", &[]),
     ("error_text", &[]),
     ("telemetry", &[]),
-    ("frame", &["types"]),
-    ("nn", &["types", "frame"]),
+    ("frame", &["types", "vectorized"]),
+    ("nn", &["types", "vectorized", "frame"]),
     ("sim", &["types", "frame"]),
     ("dataset", &["types", "files", "error_text", "frame", "sim"]),
     ("inspection", &["types", "frame", "dataset"]),
@@ -20,6 +21,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
         "training",
         &[
             "types",
+            "vectorized",
             "files",
             "settings",
             "error_text",
@@ -100,6 +102,7 @@ const MAY_USE: &[(&str, &[&str])] = &[
 /// The modules in which a dependency may be used.
 const USED_IN: &[(&str, &[&str])] = &[
     ("candle_core", &["nn", "registry", "training", "evaluation", "serving"]),
+    ("pulp", &["vectorized"]),
     ("axum", &["server"]),
     ("hyper", &["server"]),
     ("figment", &["settings"]),

@@ -100,6 +100,35 @@ fn scores_do_not_depend_on_the_batch_size() {
 }
 
 #[test]
+fn the_nearest_window_is_one_of_as_many_as_asked_for() {
+    let dataset = moving_squares(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let few = EvaluateConfig {
+        nearest_windows: 1,
+        ..config()
+    };
+    let [many, few] = [config(), few].map(|config| evaluate(&model, &dataset, &config).unwrap());
+    assert_eq!([many.stamp.nearest_windows, few.stamp.nearest_windows], [15_000, 1]);
+    assert!(few.to_markdown().contains("(one of at most 1)"));
+    let errors = |report: &EvaluationReport| -> Vec<(Method, f64)> {
+        let rows = &report.scores("test").unwrap().methods;
+        rows.iter().map(|row| (row.method, row.mse.mean)).collect()
+    };
+    for ((method, with_many), (_, with_few)) in errors(&many).into_iter().zip(errors(&few)) {
+        if method == Method::NearestWindow {
+            assert!(with_few > 2.0 * with_many, "{with_few} {with_many}");
+        } else {
+            assert_eq!(with_few, with_many, "{method:?}");
+        }
+    }
+    let none = EvaluateConfig {
+        nearest_windows: 0,
+        ..config()
+    };
+    assert!(refusal(&model, &dataset, &none).contains("training windows to search"));
+}
+
+#[test]
 fn validation_scores_are_of_the_validation_split_alone() {
     let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);

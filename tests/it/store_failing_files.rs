@@ -39,8 +39,9 @@ fn compiled(dir: &Path) -> Option<PathBuf> {
 
 /// Frames of a recording that takes some seconds to import.
 const FRAMES: u32 = 20_000;
-/// Steps of a training. It saves a checkpoint every other step, so it cannot end while the files fail.
-const STEPS: u32 = 100;
+/// Steps of a training: enough that it still runs when the files begin to fail. It saves a checkpoint every other step, so it
+/// cannot end while they fail.
+const STEPS: u32 = 600;
 
 #[test]
 fn a_server_recovers_from_a_failing_file_system() {

@@ -7,8 +7,6 @@ use crate::dataset::sampler::WindowShape;
 use crate::dataset::{Dataset, Window};
 use crate::evaluation::EvaluationError;
 
-/// Training windows that are searched at most, evenly spread.
-pub(super) const MAX_WINDOWS: usize = 15_000;
 /// Sides of the small image that frames are compared by first.
 const SMALL_SIDE: usize = 8;
 /// Windows that are compared pixel by pixel at most.

@@ -4,11 +4,11 @@
 #![allow(clippy::inline_always)]
 
 use candle_core::{Result, Tensor};
-use pulp::Arch;
 
 use super::super::gates::{self, StepActivations, add_product};
 use super::super::tensors::{add_columns, matrix, with_values};
 use super::{Recurrence, RecurrenceTrace};
+use crate::vectorized::vectorized;
 
 /// Gradients of the backward pass.
 pub(super) struct RecurrenceGradients {
@@ -76,7 +76,7 @@ impl Recurrence {
             peepholes: [p_i, p_f, p_o],
             ..
         } = gradients;
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for row in 0..batch {

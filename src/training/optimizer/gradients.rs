@@ -5,11 +5,11 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Tensor};
-use pulp::Arch;
 
 use super::OptimizerError;
 use crate::nn::Parameters;
 use crate::nn::tensors::with_values;
+use crate::vectorized::vectorized;
 
 /// Gradients of a loss by tensor name, with the loss.
 #[derive(Debug)]
@@ -89,7 +89,7 @@ impl Gradients {
 
 /// Sum of squares: short blocks in f32, the sum of the blocks in f64, so that the rounding error stays small.
 fn sum_of_squares(values: &[f32]) -> f64 {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             let mut total = 0.0;
