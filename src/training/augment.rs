@@ -1,5 +1,5 @@
-//! Changes of training windows that a robot could have seen as well: mirrored (all of it, or what moves), brighter, darker,
-//! nearer.
+//! Changes of training windows that a robot could have seen as well: mirrored (all of it, or what moves), played
+//! backwards, brighter, darker, nearer.
 
 use rand::Rng;
 
@@ -28,6 +28,8 @@ pub(super) const STATE: usize = 1;
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Augmentation {
     mirror: Mirroring,
+    /// Whether half of the windows are played backwards.
+    reverse: bool,
     /// The largest relative change of brightness.
     brightness: f32,
     /// The largest share of each side that is cut off.
@@ -71,6 +73,8 @@ pub(super) struct WindowChange {
     pub(super) is_frame_mirrored: bool,
     /// Whether what moves is mirrored, in front of the background, which stays.
     pub(super) are_movers_mirrored: bool,
+    /// Whether the window is played backwards.
+    pub(super) is_reversed: bool,
     /// Factor of all intensities.
     pub(super) gain: f32,
     /// The part that is seen, after mirroring; `None` for all of it.
@@ -82,6 +86,7 @@ impl WindowChange {
     pub(super) const NONE: Self = Self {
         is_frame_mirrored: false,
         are_movers_mirrored: false,
+        is_reversed: false,
         gain: 1.0,
         part: None,
     };
@@ -127,6 +132,7 @@ impl Augmentation {
                 Mirror::Word(MirrorWord::Movers) => Mirroring::Movers(standing_background(dataset, frames)?),
                 Mirror::Channels(names) => Mirroring::Frames(signed_channels(names, info)?),
             },
+            reverse: config.reverse,
             brightness: config.brightness as f32,
             crop: config.crop as f32,
             seed: seed.derive("augment", 0),
@@ -135,7 +141,7 @@ impl Augmentation {
 
     /// The change of the window at this position of this step's batch.
     pub(super) fn draw(&self, step: usize, position: usize) -> WindowChange {
-        if self.mirror == Mirroring::Nothing && self.brightness == 0.0 && self.crop == 0.0 {
+        if self.mirror == Mirroring::Nothing && !self.reverse && self.brightness == 0.0 && self.crop == 0.0 {
             return WindowChange::NONE;
         }
         let mut rng = self
@@ -153,6 +159,8 @@ impl Augmentation {
                 across: rng.random(),
                 down: rng.random(),
             }),
+            // Drawn last: whether it is set does not change what else is drawn.
+            is_reversed: self.reverse && rng.random::<bool>(),
         }
     }
 
@@ -243,6 +251,7 @@ mod tests {
     fn movers_are_mirrored_in_front_of_the_background() {
         let augmentation = Augmentation {
             mirror: Mirroring::Movers(vec![10, 20, 30, 250, 5, 5, 5, 5]),
+            reverse: false,
             brightness: 0.0,
             crop: 0.0,
             seed: Seed(1),

@@ -38,6 +38,12 @@ impl<'a> DrawnWindow<'a> {
             change: WindowChange::NONE,
         }
     }
+
+    /// The data set's frame at this place of the window of that shape, as it is played.
+    fn frame(&self, place: usize, shape: WindowShape) -> usize {
+        let last = shape.frames() - 1;
+        self.window.first_frame + if self.change.is_reversed { last - place } else { place }
+    }
 }
 
 /// One batch of windows.
@@ -122,11 +128,11 @@ impl<'a> FrameSource<'a> {
     ) -> Result<WindowBatch, TrainError> {
         let (context, horizon) = (shape.context, shape.horizon);
         let span = |from: usize, length: usize| -> Vec<(usize, WindowChange)> {
-            let frames = |drawn: &DrawnWindow| {
-                let (first, change) = (drawn.window.first_frame + from, drawn.change);
-                (first..first + length).map(move |frame| (frame, change))
-            };
-            windows.iter().flat_map(frames).collect()
+            let places = from..from + length;
+            windows
+                .iter()
+                .flat_map(|drawn| places.clone().map(|place| (drawn.frame(place, shape), drawn.change)))
+                .collect()
         };
         let inputs = |frames: &[(usize, WindowChange)]| self.preprocessed(self.preprocess, frames);
         let targets = |frames: &[(usize, WindowChange)]| self.preprocessed(self.target, frames);
@@ -153,9 +159,8 @@ impl<'a> FrameSource<'a> {
         }
         let mut values = Vec::with_capacity(windows.len() * shape.horizon * states);
         for drawn in windows {
-            let first = drawn.window.first_frame + shape.context;
-            for frame in first..first + shape.horizon {
-                self.push(&mut values, STATE, (frame, drawn.change));
+            for place in shape.context..shape.frames() {
+                self.push(&mut values, STATE, (drawn.frame(place, shape), drawn.change));
             }
         }
         let shape = (windows.len(), shape.horizon, states);
@@ -182,12 +187,17 @@ impl<'a> FrameSource<'a> {
         );
         let (mut future, mut present) = (Vec::new(), Vec::new());
         for drawn in windows {
-            // An action acts from its frame to the next one, so the action of the last input leads to the first target.
+            // An action acts from its frame to the next one, so the action of the last input leads to the first target. Models
+            // with windows that are played backwards take no actions.
             let last = drawn.window.first_frame + shape.context - 1;
             for frame in last..last + shape.horizon {
                 self.push(&mut future, ACTION, (frame, drawn.change));
             }
-            self.push(&mut present, STATE, (last, drawn.change));
+            self.push(
+                &mut present,
+                STATE,
+                (drawn.frame(shape.context - 1, shape), drawn.change),
+            );
         }
         let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
         Ok(ConditioningTensors {
@@ -254,6 +264,28 @@ impl Shuffle {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_reversed_window_begins_with_its_last_frame() {
+        let window = Window {
+            episode: 0,
+            first_frame: 7,
+        };
+        let shape = WindowShape { context: 2, horizon: 1 };
+        let played = |drawn: DrawnWindow<'_>| (0..3).map(|place| drawn.frame(place, shape)).collect::<Vec<_>>();
+        assert_eq!(played(DrawnWindow::unchanged(&window)), [7, 8, 9]);
+        let change = WindowChange {
+            is_reversed: true,
+            ..WindowChange::NONE
+        };
+        assert_eq!(
+            played(DrawnWindow {
+                window: &window,
+                change
+            }),
+            [9, 8, 7]
+        );
+    }
 
     #[test]
     fn an_epoch_draws_every_position_once() {

@@ -27,7 +27,7 @@ pub(crate) const HEIGHT: u32 = 12;
 pub(crate) const CONTEXT: usize = 3;
 pub(crate) const HORIZON: usize = 2;
 /// Time limit of every wait: longer than any step of a test takes.
-pub(crate) const TIMEOUT: Duration = Duration::from_mins(1);
+pub(crate) const TIMEOUT: Duration = Duration::from_mins(3);
 
 pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {

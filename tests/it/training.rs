@@ -35,6 +35,7 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         "model.conditioning=none",
         "model.flow.recurrent=true",
         "data.mirror=movers",
+        "data.reverse=true",
         "fit.short_share=0.5",
         "fit.short_horizon=2",
         "run.optimizer=muon",
@@ -52,7 +53,13 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         train(&config, &dataset, &broken).unwrap();
         assert_eq!(weights(&broken), weights(&unbroken), "the last checkpoints differ");
         // Each of the settings changes what is learned.
-        for without in ["data.mirror=off", "fit.short_share=0", "run.optimizer=adam"] {
+        let changes = [
+            "data.mirror=off",
+            "data.reverse=false",
+            "fit.short_share=0",
+            "run.optimizer=adam",
+        ];
+        for without in changes {
             if other.is_empty() {
                 continue;
             }
@@ -88,6 +95,12 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
             "data.mirror=movers",
             "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
              model.conditioning is state-action: set it to none, or data.mirror to off",
+        ),
+        (
+            "moving",
+            "data.reverse=true",
+            "data.reverse is true, but actions and states do not fit a window that is played backwards; \
+             model.conditioning is state-action: set it to none, or data.reverse to false",
         ),
     ] {
         let error = TrainConfig::layered(preset, None, &[setting.to_owned()]).unwrap_err();
