@@ -248,6 +248,40 @@ mod tests {
     }
 
     #[test]
+    fn half_of_the_windows_are_reversed_and_nothing_else_changes() {
+        let plain = Augmentation {
+            mirror: Mirroring::Nothing,
+            reverse: false,
+            brightness: 0.0,
+            crop: 0.0,
+            seed: Seed(1),
+        };
+        let changed = Augmentation {
+            mirror: Mirroring::Frames(Default::default()),
+            brightness: 0.2,
+            crop: 0.1,
+            ..plain.clone()
+        };
+        for augmentation in [plain, changed] {
+            let reversing = Augmentation {
+                reverse: true,
+                ..augmentation.clone()
+            };
+            let mut reversed = 0;
+            for step in 0..1000 {
+                let change = reversing.draw(step, 3);
+                reversed += usize::from(change.is_reversed);
+                let forwards = WindowChange {
+                    is_reversed: false,
+                    ..change
+                };
+                assert_eq!(forwards, augmentation.draw(step, 3));
+            }
+            assert!((400..600).contains(&reversed), "{reversed}");
+        }
+    }
+
+    #[test]
     fn movers_are_mirrored_in_front_of_the_background() {
         let augmentation = Augmentation {
             mirror: Mirroring::Movers(vec![10, 20, 30, 250, 5, 5, 5, 5]),

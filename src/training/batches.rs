@@ -264,27 +264,62 @@ impl Shuffle {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::{DatasetInfo, EpisodeData};
+    use crate::training::TrainConfig;
+    use crate::types::Channel;
+
+    /// Four frames of one pixel, whose intensity and state are a quarter of their number.
+    fn four_frames() -> Dataset {
+        let info = DatasetInfo {
+            frame_width_px: 1,
+            frame_height_px: 1,
+            frame_period_s: 0.1,
+            state_channels: vec![Channel::new("place", "m")],
+            ..DatasetInfo::default()
+        };
+        let episode = EpisodeData {
+            pixels: vec![0, 51, 102, 153],
+            states: vec![0.0, 0.2, 0.4, 0.6],
+            timestamps_s: vec![0.0, 0.1, 0.2, 0.3],
+            ..EpisodeData::default()
+        };
+        Dataset::from_episodes(info, vec![episode]).unwrap()
+    }
 
     #[test]
-    fn a_reversed_window_begins_with_its_last_frame() {
+    fn a_reversed_window_is_played_backwards() {
+        let (dataset, config) = (four_frames(), TrainConfig::preset("moving-mnist").unwrap());
+        let augmentation = Augmentation::new(&config.data, &dataset, &[], Seed(1)).unwrap();
+        let source = FrameSource::new(&dataset, config.model.preprocess, Target::Sharp, augmentation);
         let window = Window {
             episode: 0,
-            first_frame: 7,
+            first_frame: 0,
         };
-        let shape = WindowShape { context: 2, horizon: 1 };
-        let played = |drawn: DrawnWindow<'_>| (0..3).map(|place| drawn.frame(place, shape)).collect::<Vec<_>>();
-        assert_eq!(played(DrawnWindow::unchanged(&window)), [7, 8, 9]);
-        let change = WindowChange {
-            is_reversed: true,
-            ..WindowChange::NONE
-        };
-        assert_eq!(
-            played(DrawnWindow {
+        let shape = WindowShape { context: 3, horizon: 1 };
+        let played = |is_reversed| {
+            let change = WindowChange {
+                is_reversed,
+                ..WindowChange::NONE
+            };
+            let drawn = DrawnWindow {
                 window: &window,
-                change
-            }),
-            [9, 8, 7]
-        );
+                change,
+            };
+            let batch = source.windows(&[drawn], shape, true).unwrap();
+            let tensors = [
+                Some(batch.inputs),
+                Some(batch.targets),
+                batch.future,
+                batch.condition.state,
+                batch.future_states,
+            ];
+            tensors.map(|tensor| tensor.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap())
+        };
+        let all = |inputs: &[f32], present: f32, next: f32| {
+            [inputs, &[next], &[next], &[present], &[next]].map(<[f32]>::to_vec)
+        };
+        assert_eq!(played(false), all(&[0.0, 0.2, 0.4], 0.4, 0.6));
+        assert_eq!(played(true), all(&[0.6, 0.4, 0.2], 0.2, 0.0));
     }
 
     #[test]

@@ -7,10 +7,12 @@ use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMess
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 
 use crate::client::Client;
-use crate::service::{self, InProcessServer, TIMEOUT, model, poll_until, run, spec, with_data};
+use crate::service::{self, InProcessServer, model, poll_until, run, spec, with_data};
 
 const SIDE: u32 = 256;
 const SEND_TIMEOUT: Duration = Duration::from_millis(500);
+/// A client beside a slow one is answered faster, also on a busy machine.
+const SLOWEST: Duration = Duration::from_secs(15);
 
 /// A server with a model whose answers are so large (half a megabyte) that they soon fill a socket.
 async fn start(dir: &std::path::Path) -> InProcessServer {
@@ -118,7 +120,7 @@ async fn a_slow_client_does_not_delay_others() {
         slowest
     });
     for slowest in futures_util::future::join_all(others).await {
-        assert!(slowest < TIMEOUT / 4, "{slowest:?}");
+        assert!(slowest < SLOWEST, "{slowest:?}");
     }
     flood.abort();
     server.stop().await;

@@ -1,6 +1,6 @@
 //! The stream over a real WebSocket.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use foreframe::nn::Conditioning;
 use foreframe::server::ServerConfig;
@@ -261,6 +261,7 @@ async fn an_idle_stream_is_warned_and_closed() {
         ..ServerConfig::default()
     };
     let server = run(app(dir.path(), config)).await;
+    let opened = Instant::now();
     let mut socket = open(&server, "plain").await;
     let warning = receive(&mut socket).await;
     assert_eq!(
@@ -268,6 +269,8 @@ async fn an_idle_stream_is_warned_and_closed() {
         (&json!("warning"), &json!("idle"))
     );
     assert_eq!(receive(&mut socket).await, json!({"type": "closing", "reason": "idle"}));
+    let default = Duration::from_millis(ServerConfig::default().stream_idle_ms);
+    assert!(opened.elapsed() < default, "the setting is not used");
     drop(socket);
     server.stop().await;
 }
