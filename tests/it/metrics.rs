@@ -27,6 +27,7 @@ fn metric(server: &RunningServer, series: &str) -> Option<f64> {
     line.map(|value| value.parse().unwrap())
 }
 
+/// Waits for a value: some events are counted only after they are answered, so that no client waits for the metrics.
 #[track_caller]
 fn wait_for_metric(server: &RunningServer, series: &str, value: f64) {
     let deadline = Instant::now() + TIMEOUT;
@@ -110,9 +111,9 @@ async fn sessions(server: &RunningServer) {
     // A refused frame counts as well.
     let refused = clients[1].ask(&numbered_message(9)).await;
     assert!(matches!(refused, ServerMessage::Error { .. }), "{refused:?}");
-    assert_metric(server, "foreframe_sessions_active", 2.0);
-    assert_metric(server, "foreframe_streams_active", 2.0);
-    assert_metric(server, "foreframe_stream_frames_total{model=\"plain\"}", 4.0);
+    wait_for_metric(server, "foreframe_sessions_active", 2.0);
+    wait_for_metric(server, "foreframe_streams_active", 2.0);
+    wait_for_metric(server, "foreframe_stream_frames_total{model=\"plain\"}", 4.0);
     assert_metric(server, "foreframe_sessions_evicted_total", 0.0);
     drop(clients);
     wait_for_metric(server, "foreframe_sessions_evicted_total", 2.0);
@@ -138,7 +139,7 @@ async fn late_frames(server: &RunningServer) {
     }
     assert!(overtaken > 0);
     let name = "foreframe_stream_frames_overtaken_total{model=\"plain\"}";
-    assert_metric(server, name, f64::from(overtaken));
+    wait_for_metric(server, name, f64::from(overtaken));
 }
 
 async fn a_slow_reader(server: &RunningServer) {
@@ -166,12 +167,12 @@ async fn a_slow_reader(server: &RunningServer) {
         }
     }
     assert!(dropped_total > 0);
-    assert_metric(
+    wait_for_metric(
         server,
         "foreframe_stream_predictions_dropped_total",
         dropped_total as f64,
     );
-    assert_metric(
+    wait_for_metric(
         server,
         "foreframe_stream_frames_total{model=\"large\"}",
         1.0 + sent as f64,
@@ -193,7 +194,7 @@ fn a_full_queue(server: &RunningServer) {
             }
         });
     }
-    assert_metric(
+    wait_for_metric(
         server,
         "foreframe_predictions_refused_total{reason=\"full\"}",
         f64::from(refused),
@@ -202,15 +203,15 @@ fn a_full_queue(server: &RunningServer) {
         "foreframe_prediction_batch_size_sum",
         "foreframe_prediction_queue_wait_seconds_count",
     ] {
-        assert_metric(server, &format!("{name}{{model=\"slow\"}}"), f64::from(computed));
+        wait_for_metric(server, &format!("{name}{{model=\"slow\"}}"), f64::from(computed));
     }
     let seconds = metric(server, "foreframe_prediction_compute_seconds_sum{model=\"slow\"}");
     assert!(seconds.is_some_and(|seconds| seconds > 0.0), "{seconds:?}");
-    assert_metric(server, "foreframe_predictions_waiting", 0.0);
+    wait_for_metric(server, "foreframe_predictions_waiting", 0.0);
     let route = "method=\"POST\",route=\"/v1/models/{model}/predict\"";
     for (status, count) in [(200, computed), (503, refused)] {
         let series = format!("foreframe_http_requests_total{{{route},status=\"{status}\"}}");
-        assert_metric(server, &series, f64::from(count));
+        wait_for_metric(server, &series, f64::from(count));
     }
 }
 
@@ -230,18 +231,18 @@ fn jobs(server: &RunningServer) {
     let trained = server.wait_for_job("job-2", |job| job["state"] == "succeeded");
     for split in ["train", "validation"] {
         let series = format!("foreframe_training_loss{{split=\"{split}\"}}");
-        assert_metric(server, &series, trained["losses"][split].as_f64().unwrap());
+        wait_for_metric(server, &series, trained["losses"][split].as_f64().unwrap());
     }
     post(&collect("long", 100_000));
     server.wait_for_job("job-3", |job| job["state"] == "running");
-    assert_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 1.0);
+    wait_for_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 1.0);
     post_cancel(server, "job-3");
     for (kind, state, count) in [
         ("collect", "succeeded", 1.0),
         ("train", "succeeded", 1.0),
         ("collect", "cancelled", 1.0),
     ] {
-        assert_metric(
+        wait_for_metric(
             server,
             &format!("foreframe_jobs{{kind=\"{kind}\",state=\"{state}\"}}"),
             count,
@@ -252,9 +253,9 @@ fn jobs(server: &RunningServer) {
             count,
         );
     }
-    assert_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
+    wait_for_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
     wait_for_metric(server, "foreframe_models_loaded", 4.0);
-    assert_metric(server, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
+    wait_for_metric(server, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
 }
 
 fn post_cancel(server: &RunningServer, id: &str) {
