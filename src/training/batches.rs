@@ -268,7 +268,7 @@ mod tests {
     use crate::training::TrainConfig;
     use crate::types::Channel;
 
-    /// Four frames of one pixel, whose intensity and state are a quarter of their number.
+    /// Four frames of one pixel. Intensity and state of frame n are n / 5.
     fn four_frames() -> Dataset {
         let info = DatasetInfo {
             frame_width_px: 1,
