@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{LazyLock, OnceLock};
 
 use axum::extract::ws::Message;
-use foreframe::dataset::import::{ImportConfig, ImportOptions, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
 use foreframe::dataset::{CollectConfig, Dataset, collect};
 use foreframe::files::sha256_hex;
 use foreframe::frame::codec;
@@ -198,6 +198,7 @@ fn bags(bytes: &[u8]) {
             frame_height_px: 8,
             ..ImportOptions::default()
         },
+        disk_mib: DEFAULT_DISK_MIB,
     };
     let _ = import(&config, &|_| {}, &AtomicBool::new(false));
     let _ = std::fs::remove_dir_all(&config.out);

@@ -28,6 +28,8 @@ mod healthy_robot;
 mod import;
 mod import_hostile;
 mod import_killed;
+mod import_memory;
+mod import_programs;
 mod inspection;
 mod jobs;
 mod jobs_checkpoints;

@@ -95,11 +95,11 @@ pub(super) fn open(source: &Path, options: &ImportOptions) -> Result<Recording, 
         let faults = std::mem::take(&mut collector.topics[topic].faults);
         match faults.first().filter(|_| !options.skip_bad) {
             Some(fault) => return Err(ImportError::record(&fault.place, &fault.reason)),
-            None => skipped.extend(faults),
+            None => skipped.append(faults),
         }
     }
     let joined = join::join(&collector, &chosen)?;
-    skipped.extend(joined.skipped);
+    skipped.append(joined.skipped);
     let topic = &collector.topics[chosen.image];
     let positions = match &topic.content {
         Content::Images(entries) => joined

@@ -67,7 +67,7 @@ fn unreadable(path: &Path, error: &rusqlite::Error) -> ImportError {
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let connection = connect(path, collector.options.skip_bad)?;
     check_tables(&connection, path)?;
-    let topics = topics(&connection, collector).map_err(|error| unreadable(path, &error))?;
+    let topics = topics(&connection, path, collector)?;
     let mut statement = connection
         .prepare("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
         .map_err(|error| unreadable(path, &error))?;
@@ -102,12 +102,26 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
 }
 
 /// The topics by their number in the database.
-fn topics(connection: &Connection, collector: &mut Collector<'_>) -> rusqlite::Result<Vec<(i64, usize)>> {
-    let mut statement = connection.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
-    let found = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?)))?;
-    found
-        .map(|row| row.map(|(id, name, type_name, encoding)| (id, collector.topic(name, type_name, encoding))))
-        .collect()
+fn topics(
+    connection: &Connection,
+    path: &Path,
+    collector: &mut Collector<'_>,
+) -> Result<Vec<(i64, usize)>, ImportError> {
+    let failed = |error: rusqlite::Error| unreadable(path, &error);
+    let mut statement = connection
+        .prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
+        .map_err(failed)?;
+    let found = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?)));
+    let found = found.map_err(failed)?;
+    let mut topics = Vec::new();
+    for row in found {
+        let (id, name, type_name, encoding): (i64, String, String, String) = row.map_err(failed)?;
+        match collector.topic(name, type_name, encoding) {
+            Ok(topic) => topics.push((id, topic)),
+            Err(reason) => collector.fault(format!("{} topic {id}", path.display()), reason)?,
+        }
+    }
+    Ok(topics)
 }
 
 /// A database whose messages are read by their row.
