@@ -21,8 +21,9 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::Mutex;
 use tracing::warn;
 
+pub use self::audit::Author;
 use self::database::Database;
-pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob};
+pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, Lease, NewJob, job_id};
 pub use self::keys::{KeyRow, KeyScope};
 pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;

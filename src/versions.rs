@@ -15,7 +15,7 @@ use crate::error_text;
 use crate::files::write_atomically;
 use crate::registry::{self, LoadedModel, Manifest, RegistryError};
 use crate::serving::{Predictor, ServingError};
-use crate::store::{Lease, Store, StoreError, unix_s};
+use crate::store::{Author, Lease, Store, StoreError, unix_s};
 use crate::telemetry::names;
 
 /// Why a version could not be loaded, published, activated or deleted.
@@ -314,11 +314,17 @@ impl Versions {
 
     /// Makes a version active: here at once, on other servers of the store soon, and after a restart. Open streams keep
     /// their version. A refused version changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
-    pub async fn activate(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+    pub async fn activate(
+        &self,
+        predictor: &Predictor,
+        model: &str,
+        version: u32,
+        by: &Author,
+    ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         let before = predictor.model(model).map(|manifest| manifest.version);
         count_load(self.load_model(predictor, model, version).await)?;
-        if let Err(error) = self.store.set_active(model, version, unix_s()).await {
+        if let Err(error) = self.store.set_active(model, version, unix_s(), by).await {
             if let Ok(before) = before {
                 self.load_model(predictor, model, before).await?;
             }
@@ -329,7 +335,13 @@ impl Versions {
     }
 
     /// Deletes a published version. Errors: `Unknown`, `Active`, `Shipped`, `Store`.
-    pub async fn delete(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+    pub async fn delete(
+        &self,
+        predictor: &Predictor,
+        model: &str,
+        version: u32,
+        by: &Author,
+    ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         let (model_name, available) = (model.to_owned(), self.of(model).await?);
         let serves = predictor.model(model).is_ok_and(|manifest| manifest.version == version);
@@ -346,7 +358,7 @@ impl Versions {
                 version,
             });
         }
-        if serves || !self.store.delete_version(model, version, unix_s()).await? {
+        if serves || !self.store.delete_version(model, version, unix_s(), by).await? {
             return Err(VersionError::Active {
                 model: model_name,
                 version,

@@ -4,8 +4,7 @@ use super::settings::{CommonArgs, open_store};
 use super::workspace::block_on;
 use super::{CliError, print_line};
 use crate::server::keys::NewKey;
-use crate::store::audit::COMMAND_LINE;
-use crate::store::{KeyRow, KeyScope, Store};
+use crate::store::{Author, KeyRow, KeyScope, Store};
 
 const SECONDS_PER_DAY: f64 = 86_400.0;
 
@@ -98,8 +97,7 @@ async fn create(
         expires_s: expires_in_s.map(|seconds| now_s + seconds),
         requests_per_s,
     };
-    store.add_key(row).await?;
-    store.record_change(COMMAND_LINE, "key.create", &key.id).await;
+    store.add_key(row, &Author::command_line()).await?;
     print_line(key.text)
 }
 
@@ -147,8 +145,7 @@ async fn list(store: &Store) -> Result<(), CliError> {
 
 async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
     let now_s = store.now_s().await?;
-    if store.revoke_key(id, now_s).await? {
-        store.record_change(COMMAND_LINE, "key.revoke", id).await;
+    if store.revoke_key(id, now_s, &Author::command_line()).await? {
         let is_last = store.list_keys().await?.iter().all(|key| !key.is_valid(now_s));
         let consequence = if is_last {
             "; it was the last valid key: every request is refused until another is created"

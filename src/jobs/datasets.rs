@@ -3,12 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use futures_util::{StreamExt as _, TryStreamExt as _, stream};
+use tracing::warn;
 
 use super::JobError;
 use crate::dataset::import::{ImportConfig, ImportError, check_out};
 use crate::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
 use crate::registry::is_valid_name;
-use crate::store::Objects;
+use crate::store::{Author, Objects, Store};
 
 /// The file that is written last: it marks a complete data set.
 pub(super) const LAST_FILE: &str = "info.json";
@@ -125,12 +126,22 @@ async fn not_found(objects: &Objects, name: &str) -> Result<JobError, JobError> 
     })
 }
 
-/// Deletes a data set, finished or not. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
-pub async fn delete(objects: &Objects, name: &str) -> Result<(), JobError> {
-    if is_valid_name(name) && exists(objects, name).await? {
-        return Ok(objects.delete(&key(name)).await?);
+/// Deletes a data set, finished or not, and records it in the audit trail. Errors: `NotFound` with the existing names, `Store`,
+/// `Dataset`.
+pub async fn delete(store: &Store, name: &str, by: &Author) -> Result<(), JobError> {
+    let objects = store.objects();
+    if !(is_valid_name(name) && exists(objects, name).await?) {
+        return Err(not_found(objects, name).await?);
     }
-    Err(not_found(objects, name).await?)
+    // Files are not part of a transaction, so the entry comes first.
+    store.record_dataset_deletion(name, by).await?;
+    let deleted = objects.delete(&key(name)).await;
+    if deleted.is_err()
+        && let Err(error) = store.record_failed_deletion(name, by).await
+    {
+        warn!(dataset = name, %error, "could not record that a deletion failed");
+    }
+    Ok(deleted?)
 }
 
 /// Whether any part of the data set exists, locally or in the object store.

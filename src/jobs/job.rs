@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::progress::StoredProgress;
 use super::{JobError, JobProgress, JobSpec, JobState, Losses};
-use crate::store::{JobPage, JobRow};
+use crate::store::{JobPage, JobRow, job_id};
 
 /// One job as it is now.
 #[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
@@ -43,7 +43,7 @@ impl Job {
     /// Errors: `Record` if the row was written by an incompatible version of the program.
     pub(super) fn of(row: &JobRow) -> Result<Self, JobError> {
         let record = |reason: String| JobError::Record {
-            id: id_of(row.number),
+            id: job_id(row.number),
             reason,
         };
         let state: JobState = row.state.parse().map_err(record)?;
@@ -54,7 +54,7 @@ impl Job {
         }
         let outcome = row.outcome.as_deref().map(serde_json::from_str).transpose();
         Ok(Self {
-            id: id_of(row.number),
+            id: job_id(row.number),
             state,
             spec: serde_json::from_str(&row.spec).map_err(|error| record(error.to_string()))?,
             progress,
@@ -114,11 +114,6 @@ impl JobFilter {
             limit: self.limit as i64,
         })
     }
-}
-
-/// The id of the job of that number.
-pub(super) fn id_of(number: i64) -> String {
-    format!("job-{number}")
 }
 
 /// The number in a job's id.

@@ -8,11 +8,11 @@ use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use super::instance::Instance;
-use super::job::{id_of, number_of};
+use super::job::number_of;
 use super::progress::StoredProgress;
 use super::runner::{self, JobExecutor};
 use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition};
-use crate::store::{EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
+use crate::store::{Author, EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store, job_id};
 
 /// The maximum length of an idempotency key.
 const MAX_KEY_LENGTH: usize = 128;
@@ -175,7 +175,7 @@ impl Jobs {
 
     /// Cancels a job: a queued job ends at once, a running one as soon as its work has stopped.
     /// Errors: `Unknown`, `IllegalTransition` if it has ended, `Store`.
-    pub async fn cancel(&self, id: &str) -> Result<Job, JobError> {
+    pub async fn cancel(&self, id: &str, by: &Author) -> Result<Job, JobError> {
         let store = &self.shared.store;
         // Repeats if the state changes between the read and the write; that can happen only a few times.
         loop {
@@ -183,8 +183,8 @@ impl Jobs {
             let state = Job::of(&row)?.state;
             let asked = match state.after(JobTransition::Cancel) {
                 None => return Err(illegal(id, state, JobTransition::Cancel)),
-                Some(_) if state == JobState::Running => store.ask_to_cancel(row.number).await?,
-                Some(_) => store.cancel_queued(row.number, store.now_s().await?).await?,
+                Some(_) if state == JobState::Running => store.ask_to_cancel(row.number, by).await?,
+                Some(_) => store.cancel_queued(row.number, store.now_s().await?, by).await?,
             };
             if asked {
                 let job = self.get(id).await;
@@ -196,7 +196,7 @@ impl Jobs {
 
     /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
     /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
-    pub async fn resume(&self, id: &str) -> Result<Job, JobError> {
+    pub async fn resume(&self, id: &str, by: &Author) -> Result<Job, JobError> {
         if *self.shared.stop.borrow() {
             return Err(JobError::Stopping);
         }
@@ -206,7 +206,7 @@ impl Jobs {
             return Err(illegal(id, job.state, JobTransition::Resume));
         }
         let limit = self.shared.limits.queued as i64;
-        match self.shared.store.requeue(row.number, limit).await? {
+        match self.shared.store.requeue(row.number, limit, by).await? {
             Some(EnqueueResult::New(row)) => {
                 self.shared.wake.notify_one();
                 Job::of(&row)
@@ -253,7 +253,7 @@ impl JobsInner {
             Ok(forgotten) => forgotten,
             Err(error) => return warn!(%error, "could not delete old jobs"),
         };
-        for id in forgotten.into_iter().map(id_of) {
+        for id in forgotten.into_iter().map(job_id) {
             for dir in ["runs", "reports"] {
                 if let Err(error) = self.store.objects().delete(&format!("{dir}/{id}")).await {
                     warn!(job.id = %id, %error, "could not delete the files of an old job");

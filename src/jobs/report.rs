@@ -7,10 +7,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use metrics::gauge;
 use serde::{Deserialize, Serialize};
 
-use super::job::id_of;
 use super::progress::ReportBuffer;
 use super::{Losses, unix_s};
-use crate::store::{Lease, LossRow};
+use crate::store::{Lease, LossRow, job_id};
 use crate::telemetry::names;
 
 /// A part of a job's report.
@@ -96,7 +95,7 @@ impl JobReporter {
     /// The job's id.
     #[must_use]
     pub fn id(&self) -> String {
-        id_of(self.lease.number)
+        job_id(self.lease.number)
     }
 
     /// The lease of this attempt.

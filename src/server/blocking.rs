@@ -5,7 +5,6 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 
 use tokio::sync::{Semaphore, oneshot};
-use tracing::Instrument as _;
 
 use super::http::problem::ApiError;
 use crate::jobs::priority;
@@ -116,13 +115,6 @@ impl BlockingWork {
         }))?;
         result.await.map_err(|_| TaskError::Panicked)
     }
-}
-
-/// Finishes the work even if the client disconnects. Errors: `Join`.
-pub(super) async fn run_to_completion<T: Send + 'static>(
-    work: impl Future<Output = T> + Send + 'static,
-) -> Result<T, TaskError> {
-    Ok(tokio::spawn(work.in_current_span()).await?)
 }
 
 #[cfg(test)]

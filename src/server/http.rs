@@ -3,6 +3,7 @@
 pub(super) mod access;
 pub(super) mod admission;
 pub(super) mod body_budget;
+pub(super) mod changes;
 mod connection_table;
 pub(super) mod connections;
 pub(super) mod extract;

@@ -8,6 +8,7 @@ use utoipa_axum::router::OpenApiRouter;
 
 use super::config::ServerConfig;
 use super::http::body_budget;
+use super::http::changes;
 use super::http::keys;
 use super::http::middleware::{self, RequestTrace};
 use super::http::origin::{self, OriginPolicy};
@@ -26,6 +27,7 @@ pub fn router(app: App) -> Router {
     let limit = RequestLimit::new(config);
     let api = request_routes(config)
         .route_layer(from_fn_with_state(limit, request_limit::check))
+        .route_layer(from_fn_with_state(app.changes().clone(), changes::complete))
         .merge(stream_routes())
         .route_layer(from_fn_with_state(app.keys().clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();

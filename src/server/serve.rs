@@ -78,9 +78,15 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     if timeout_at(deadline.into(), connections.ended()).await.is_err() {
         warn!("some requests were not answered within the deadline");
     }
-    let streams = async { tokio::join!(app.streams().ended(), app.event_streams().ended()) };
-    if timeout_at(deadline.into(), streams).await.is_err() {
-        warn!("some streams did not end within the deadline");
+    let tasks = async {
+        tokio::join!(
+            app.streams().ended(),
+            app.event_streams().ended(),
+            app.changes().ended()
+        )
+    };
+    if timeout_at(deadline.into(), tasks).await.is_err() {
+        warn!("some streams or changes did not end within the deadline");
     }
     let ended = async {
         let jobs_ended = app.jobs().finish_stop(deadline).await;

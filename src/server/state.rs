@@ -82,6 +82,7 @@ struct AppState {
     parts: AppParts,
     streams: Streams,
     event_streams: Streams,
+    changes: Streams,
     admission: Admission,
     body_budget: BodyBudget,
     predictions: BlockingWork,
@@ -150,6 +151,7 @@ impl App {
             shared: Arc::new(AppState {
                 streams: Streams::new("streams", config.max_streams),
                 event_streams: Streams::new("event streams", config.max_event_streams),
+                changes: Streams::new("changes", config.max_requests),
                 admission: Admission::new(&config),
                 body_budget: BodyBudget::new(&config),
                 predictions: BlockingWork::new("predictions", config.request_threads),
@@ -230,6 +232,11 @@ impl App {
 
     pub(super) fn event_streams(&self) -> &Streams {
         &self.shared.event_streams
+    }
+
+    /// The requests that change state and are being completed.
+    pub(super) fn changes(&self) -> &Streams {
+        &self.shared.changes
     }
 
     pub(super) fn admission(&self) -> &Admission {

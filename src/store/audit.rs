@@ -1,12 +1,14 @@
 //! The audit trail: who changed what and when.
 
-use tracing::{info, warn};
+use tracing::info;
 
-use super::database::DatabaseRow;
+use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::{Store, StoreError, unix_s};
 
+/// Who changes something while authentication is off.
+const ANONYMOUS: &str = "anonymous";
 /// Who changes something on the command line.
-pub const COMMAND_LINE: &str = "command line";
+const COMMAND_LINE: &str = "command line";
 /// How many rows are kept; the oldest are deleted.
 const MAX_ROWS: i64 = 100_000;
 
@@ -17,7 +19,7 @@ pub struct AuditRow {
     pub number: i64,
     /// When, in seconds since 1970.
     pub time_s: f64,
-    /// The id of an API key, `anonymous` or [`COMMAND_LINE`].
+    /// The id of an API key, `anonymous` or `command line`.
     pub who: String,
     /// The name of that key.
     pub name: Option<String>,
@@ -27,32 +29,109 @@ pub struct AuditRow {
     pub target: String,
 }
 
-impl Store {
-    /// Records a change that was made, in the log and in the database. If the database fails, the log says so.
-    pub async fn record_change(&self, who: &str, action: &str, target: &str) {
+/// Who makes a change.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Author(String);
+
+impl Author {
+    /// The user of an API key; without its id, a client of a server without authentication.
+    #[must_use]
+    pub fn of_key(id: &str) -> Self {
+        Self(if id.is_empty() { ANONYMOUS } else { id }.to_owned())
+    }
+
+    /// The user of the command line.
+    #[must_use]
+    pub fn command_line() -> Self {
+        Self(COMMAND_LINE.to_owned())
+    }
+
+    /// The id of the API key; empty without one.
+    #[must_use]
+    pub fn key_id(&self) -> &str {
+        if [ANONYMOUS, COMMAND_LINE].contains(&self.0.as_str()) {
+            ""
+        } else {
+            &self.0
+        }
+    }
+
+    pub(super) fn change(&self, action: &'static str, target: impl Into<String>) -> Change {
+        Change {
+            who: self.0.clone(),
+            action,
+            target: target.into(),
+        }
+    }
+}
+
+/// A change of state, before it is made. It is recorded in the transaction that makes it.
+pub(super) struct Change {
+    who: String,
+    action: &'static str,
+    target: String,
+}
+
+impl Change {
+    /// Adds the change to the audit trail. Errors: `Query`.
+    pub(super) async fn record(&self, tx: &mut Tx) -> Result<(), StoreError> {
+        // Locked until the commit, so that the numbers are in the order of the commits.
+        tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'audit'", vec![])
+            .await?;
+        let sql = "INSERT INTO audit (number, time_s, who, action, target) \
+             SELECT value, $1, $2, $3, $4 FROM counters WHERE name = 'audit'";
+        let (who, target) = (self.who.as_str(), self.target.as_str());
+        let values = vec![unix_s().into(), who.into(), self.action.into(), target.into()];
+        tx.execute(sql, values).await?;
+        let sql = "DELETE FROM audit WHERE number <= (SELECT value FROM counters WHERE name = 'audit') - $1";
+        tx.execute(sql, vec![MAX_ROWS.into()]).await.map(drop)
+    }
+
+    /// Commits the transaction that made and recorded the change, and logs it. Errors: `Query`.
+    pub(super) async fn commit(self, tx: Tx) -> Result<(), StoreError> {
+        tx.commit().await?;
+        let Self { who, action, target } = self;
         info!(
             audit.who = who,
             audit.action = action,
             audit.target = target,
             "state changed"
         );
-        if let Err(error) = self.write_audit(who, action, target).await {
-            warn!(%error, action, target, "could not write to the audit trail");
+        Ok(())
+    }
+}
+
+impl Store {
+    /// Executes a statement and, if it changes a row, records the change with it. Returns whether it does. Errors: `Query`.
+    pub(super) async fn execute_recorded(
+        &self,
+        sql: &'static str,
+        values: Vec<DatabaseValue>,
+        change: Change,
+    ) -> Result<bool, StoreError> {
+        let mut tx = self.database.begin().await?;
+        if tx.execute(sql, values).await? == 0 {
+            return Ok(false);
         }
+        change.record(&mut tx).await?;
+        change.commit(tx).await?;
+        Ok(true)
     }
 
-    async fn write_audit(&self, who: &str, action: &str, target: &str) -> Result<(), StoreError> {
+    /// Records a deletion of a data set, before its files are deleted: so none is deleted without an entry. Errors: `Query`.
+    pub async fn record_dataset_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
+        self.record(by.change("dataset.delete", dataset)).await
+    }
+
+    /// Records that the files of a data set could not be deleted, after all. Errors: `Query`.
+    pub async fn record_failed_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
+        self.record(by.change("dataset.delete.failed", dataset)).await
+    }
+
+    async fn record(&self, change: Change) -> Result<(), StoreError> {
         let mut tx = self.database.begin().await?;
-        // Locked until the commit, so that the numbers are in the order of the commits.
-        tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'audit'", vec![])
-            .await?;
-        let sql = "INSERT INTO audit (number, time_s, who, action, target) \
-             SELECT value, $1, $2, $3, $4 FROM counters WHERE name = 'audit'";
-        let values = vec![unix_s().into(), who.into(), action.into(), target.into()];
-        tx.execute(sql, values).await?;
-        let sql = "DELETE FROM audit WHERE number <= (SELECT value FROM counters WHERE name = 'audit') - $1";
-        tx.execute(sql, vec![MAX_ROWS.into()]).await?;
-        tx.commit().await
+        change.record(&mut tx).await?;
+        change.commit(tx).await
     }
 
     /// The changes before a number, the newest first. Errors: `Query`.

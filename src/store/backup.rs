@@ -14,7 +14,9 @@ use sha2::{Digest as _, Sha256};
 
 use super::database::Database;
 use super::{DATABASE_FILE, Store, StoreConfig, StoreError, WRITE_PROBE, unix_s};
-use crate::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
+use crate::files::{
+    files_below, hex, is_hidden, is_partial, is_partial_of, none_if_missing, remove_partials, write_atomically,
+};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
 const INDEX_FILE: &str = "backup.json";
@@ -175,16 +177,7 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
         return Err(BackupError::OtherDatabase);
     }
     std::fs::create_dir_all(data_dir).map_err(BackupError::io("make", data_dir))?;
-    let marker = data_dir.join(RESTORING);
-    let taken = database.as_ref().filter(|path| path.exists() && !marker.exists());
-    if let Some(path) = taken
-        .cloned()
-        .or((!marker.exists() && !is_empty(data_dir)?).then(|| data_dir.clone()))
-    {
-        return Err(BackupError::NotEmpty { path });
-    }
-    let text = "foreframe restore removes this file when it has finished.\n";
-    write_atomically(&marker, text.as_bytes()).map_err(BackupError::io("write", &marker))?;
+    let marker = begin_restore(data_dir, database.as_deref(), &index)?;
     for (name, expected) in &index.files {
         let source = inside(from, name).ok_or_else(|| no_backup(from, "names a file outside of it"))?;
         let to = match (&database, name.as_str()) {
@@ -196,8 +189,45 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
             return Err(BackupError::Damaged { path: source });
         }
     }
+    remove_partials(data_dir);
     std::fs::remove_file(&marker).map_err(BackupError::io("delete", &marker))?;
     Ok(index)
+}
+
+/// Marks the directory as one that is being restored, and removes what an earlier restore that did not finish has written there.
+/// Returns the marker. Errors: `NotEmpty`, `Io`.
+fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) -> Result<PathBuf, BackupError> {
+    let marker = data_dir.join(RESTORING);
+    let is_taken = |path: &Path| BackupError::NotEmpty { path: path.to_owned() };
+    if !marker.exists() {
+        if let Some(path) = database.filter(|path| path.exists()) {
+            return Err(is_taken(path));
+        }
+        // Older versions wrote the marker under another name first, and left it there if they were killed.
+        let is_left = |path: &PathBuf| is_partial_of(&marker, path);
+        if !is_empty_but(data_dir, is_left)? {
+            return Err(is_taken(data_dir));
+        }
+        // The first step in the directory: whatever is killed after it, the directory is known as unfinished.
+        let created = File::create_new(&marker).and_then(|file| file.sync_all());
+        created.map_err(BackupError::io("write", &marker))?;
+    }
+    let text = none_if_missing(std::fs::read(&marker)).map_err(BackupError::io("read", &marker))?;
+    // A marker without a list was written just before the kill: no file was copied yet.
+    let mut begun: BTreeSet<String> = serde_json::from_slice(&text.unwrap_or_default()).unwrap_or_default();
+    let stale: Vec<String> = begun
+        .iter()
+        .filter(|name| !index.files.contains_key(*name))
+        .cloned()
+        .collect();
+    begun.extend(index.files.keys().cloned());
+    let text = serde_json::to_vec(&begun).map_err(io::Error::other);
+    let written = text.and_then(|text| write_atomically(&marker, &text));
+    written.map_err(BackupError::io("write", &marker))?;
+    for path in stale.iter().filter_map(|name| inside(data_dir, name)) {
+        none_if_missing(std::fs::remove_file(&path)).map_err(BackupError::io("delete", &path))?;
+    }
+    Ok(marker)
 }
 
 /// The files that were copied, with the time of their last change.
@@ -298,8 +328,13 @@ fn inside(dir: &Path, name: &str) -> Option<PathBuf> {
 }
 
 fn is_empty(dir: &Path) -> Result<bool, BackupError> {
-    let mut entries = std::fs::read_dir(dir).map_err(BackupError::io("read", dir))?;
-    Ok(entries.next().is_none())
+    is_empty_but(dir, |_| false)
+}
+
+/// Whether a directory holds nothing but what may be ignored.
+fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<bool, BackupError> {
+    let entries = std::fs::read_dir(dir).map_err(BackupError::io("read", dir))?;
+    Ok(entries.flatten().all(|entry| is_ignored(&entry.path())))
 }
 
 /// Copies a file, with its directory, and reports what was copied.

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::audit::Author;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::reports::{JobReport, write_report};
 use super::{ModelMetrics, Store, StoreError};
@@ -139,6 +140,12 @@ pub struct JobPage {
     pub limit: i64,
 }
 
+/// The id of the job of that number.
+#[must_use]
+pub fn job_id(number: i64) -> String {
+    format!("job-{number}")
+}
+
 /// Takes the lock for enqueueing.
 async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
     let sql = "UPDATE counters SET value = value WHERE name = 'job'";
@@ -209,13 +216,20 @@ impl Store {
             new.submitter.into(),
         ];
         let row = first_job(&tx.fetch(sql, values).await?)?;
-        tx.commit().await?;
-        row.map(EnqueueResult::New)
-            .ok_or(StoreError::Query(sqlx::Error::RowNotFound))
+        let row = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?;
+        let change = Author::of_key(&row.submitter).change("job.create", job_id(row.number));
+        change.record(&mut tx).await?;
+        change.commit(tx).await?;
+        Ok(EnqueueResult::New(row))
     }
 
     /// Enqueues a failed or cancelled job again; `None` if it is neither. Errors: `Query`.
-    pub async fn requeue(&self, number: i64, max_queued: i64) -> Result<Option<EnqueueResult>, StoreError> {
+    pub async fn requeue(
+        &self,
+        number: i64,
+        max_queued: i64,
+        by: &Author,
+    ) -> Result<Option<EnqueueResult>, StoreError> {
         let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
@@ -229,7 +243,9 @@ impl Store {
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
              stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
         let row = first_job(&tx.fetch(sql, vec![number.into()]).await?)?;
-        tx.commit().await?;
+        let change = by.change("job.resume", job_id(number));
+        change.record(&mut tx).await?;
+        change.commit(tx).await?;
         Ok(row.map(EnqueueResult::New))
     }
 
@@ -391,14 +407,17 @@ impl Store {
     }
 
     /// Cancels a queued job. Returns whether it was queued. Errors: `Query`.
-    pub async fn cancel_queued(&self, number: i64, now_s: f64) -> Result<bool, StoreError> {
+    pub async fn cancel_queued(&self, number: i64, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET state = 'cancelled', ended_s = $2 WHERE number = $1 AND state = 'queued'";
-        Ok(self.database.execute(sql, vec![number.into(), now_s.into()]).await? > 0)
+        let change = by.change("job.cancel", job_id(number));
+        self.execute_recorded(sql, vec![number.into(), now_s.into()], change)
+            .await
     }
 
     /// Asks a running job to stop. Returns whether it is running. Errors: `Query`.
-    pub async fn ask_to_cancel(&self, number: i64) -> Result<bool, StoreError> {
+    pub async fn ask_to_cancel(&self, number: i64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running'";
-        Ok(self.database.execute(sql, vec![number.into()]).await? > 0)
+        let change = by.change("job.cancel", job_id(number));
+        self.execute_recorded(sql, vec![number.into()], change).await
     }
 }

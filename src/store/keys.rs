@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use super::audit::Author;
 use super::database::DatabaseRow;
 use super::{Store, StoreError};
 
@@ -106,14 +107,15 @@ impl Store {
             expires_s: None,
             requests_per_s: None,
         };
-        self.add_key(key).await
+        self.add_key(key, &Author::command_line()).await
     }
 
     /// Adds a key. Errors: `Query`, also if the id exists.
-    pub async fn add_key(&self, key: KeyRow) -> Result<(), StoreError> {
+    pub async fn add_key(&self, key: KeyRow, by: &Author) -> Result<(), StoreError> {
         self.mark_keys_created()?;
         let sql = "INSERT INTO api_keys (id, name, hash, created_s, scope, expires_s, requests_per_s) \
              VALUES ($1, $2, $3, $4, $5, $6, $7)";
+        let change = by.change("key.create", key.id.as_str());
         let values = vec![
             key.id.into(),
             key.name.into(),
@@ -123,7 +125,7 @@ impl Store {
             key.expires_s.into(),
             key.requests_per_s.into(),
         ];
-        self.database.execute(sql, values).await.map(drop)
+        self.execute_recorded(sql, values, change).await.map(drop)
     }
 
     /// All keys, also revoked ones, the oldest first. Errors: `Query`.
@@ -145,9 +147,9 @@ impl Store {
     }
 
     /// Revokes a key. Returns false if there is no such key or it was already revoked. Errors: `Query`.
-    pub async fn revoke_key(&self, id: &str, now_s: f64) -> Result<bool, StoreError> {
+    pub async fn revoke_key(&self, id: &str, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE api_keys SET revoked_s = $2 WHERE id = $1 AND revoked_s IS NULL";
-        let changed = self.database.execute(sql, vec![id.into(), now_s.into()]).await?;
-        Ok(changed > 0)
+        self.execute_recorded(sql, vec![id.into(), now_s.into()], by.change("key.revoke", id))
+            .await
     }
 }

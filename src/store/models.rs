@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::audit::Author;
 use super::database::{DatabaseRow, Tx};
 use super::jobs::Lease;
 use super::{Store, StoreError};
@@ -75,10 +76,11 @@ impl Store {
     }
 
     /// Records that the files of a reserved version are there. Errors: `Query`.
-    pub async fn publish_version(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
+    pub async fn publish_version(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
         let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
         let values = vec![model.into(), version.into(), now_s.into()];
-        self.database.execute(sql, values).await.map(drop)
+        let change = by.change("version.publish", version_id(model, version));
+        self.execute_recorded(sql, values, change).await.map(drop)
     }
 
     /// Forgets which version of a model was chosen to serve. Errors: `Query`.
@@ -134,21 +136,28 @@ impl Store {
     }
 
     /// Makes a version active. Errors: `Query`.
-    pub async fn set_active(&self, model: &str, version: u32, now_s: f64) -> Result<(), StoreError> {
+    pub async fn set_active(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
              ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s";
         let values = vec![model.into(), version.into(), now_s.into()];
-        self.database.execute(sql, values).await.map(drop)
+        let change = by.change("version.activate", version_id(model, version));
+        self.execute_recorded(sql, values, change).await.map(drop)
     }
 
     /// Marks a version as deleted unless it is active. Returns whether it did. Errors: `Query`.
-    pub async fn delete_version(&self, model: &str, version: u32, now_s: f64) -> Result<bool, StoreError> {
+    pub async fn delete_version(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
              AND published_s IS NOT NULL AND deleted_s IS NULL \
              AND NOT EXISTS (SELECT 1 FROM active_versions WHERE model = $1 AND version = $2)";
         let values = vec![model.into(), version.into(), now_s.into()];
-        Ok(self.database.execute(sql, values).await? > 0)
+        let change = by.change("version.delete", version_id(model, version));
+        self.execute_recorded(sql, values, change).await
     }
+}
+
+/// A version in the audit trail.
+fn version_id(model: &str, version: u32) -> String {
+    format!("{model}@{version}")
 }
 
 pub(super) async fn write_published(

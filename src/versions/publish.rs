@@ -5,8 +5,7 @@ use std::path::Path;
 
 use super::{VersionError, Versions, key};
 use crate::registry::{self, RegistryError};
-use crate::store::audit::COMMAND_LINE;
-use crate::store::unix_s;
+use crate::store::{Author, unix_s};
 
 impl Versions {
     /// Publishes the model in a directory as the next version of a name, and returns the version. If it becomes the active
@@ -22,25 +21,19 @@ impl Versions {
             self.store.objects().delete(&key(model, version)).await?;
             return Err(error);
         }
-        self.store.publish_version(model, version, unix_s()).await?;
+        let by = Author::command_line();
+        self.store.publish_version(model, version, unix_s(), &by).await?;
         if activates {
-            self.store.set_active(model, version, unix_s()).await?;
+            self.store.set_active(model, version, unix_s(), &by).await?;
         }
-        self.record("version.publish", model, version).await;
         Ok(version)
     }
 
     /// Makes a version the active one, for servers of the store to load. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn choose(&self, model: &str, version: u32) -> Result<(), VersionError> {
         self.load(model, version).await?;
-        self.store.set_active(model, version, unix_s()).await?;
-        self.record("version.activate", model, version).await;
-        Ok(())
-    }
-
-    async fn record(&self, action: &str, model: &str, version: u32) {
-        let target = format!("{model}@{version}");
-        self.store.record_change(COMMAND_LINE, action, &target).await;
+        let by = Author::command_line();
+        Ok(self.store.set_active(model, version, unix_s(), &by).await?)
     }
 
     /// Deletes one published version that is not active, or all published versions of a model; then the shipped one is
@@ -77,19 +70,19 @@ impl Versions {
             let (model, version) = of_model(version);
             return Err(VersionError::Shipped { model, version });
         }
+        let by = Author::command_line();
         if version.is_none() {
             match shipped {
-                Some(shipped) => self.store.set_active(model, shipped, unix_s()).await?,
+                Some(shipped) => self.store.set_active(model, shipped, unix_s(), &by).await?,
                 None => self.store.clear_active(model).await?,
             }
         }
         for &version in &doomed {
-            if !self.store.delete_version(model, version, unix_s()).await? {
+            if !self.store.delete_version(model, version, unix_s(), &by).await? {
                 let (model, version) = of_model(version);
                 return Err(VersionError::Active { model, version });
             }
             self.store.objects().delete(&key(model, version)).await?;
-            self.record("version.delete", model, version).await;
         }
         Ok(doomed)
     }

@@ -129,6 +129,74 @@ fn a_damaged_backup_is_not_restored() {
 }
 
 #[test]
+fn a_restore_killed_early_is_finished_by_the_next_one() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
+    succeed(dir.path(), &["backup", "one"]);
+    succeed(dir.path(), &["publish", &paper(), "--name", "other"]);
+    succeed(dir.path(), &["backup", "two"]);
+    let restored = dir.path().join("restored");
+    let restore = |backup: &str| succeed(dir.path(), &["restore", backup, "--data-dir", "restored"]);
+    let partial = format!("restore-unfinished.{:016x}.partial", 7);
+    // What a kill leaves: an older version's marker that was half written, this version's empty one, and one with its list.
+    for (left, content, is_noticed) in [
+        (partial.as_str(), "foreframe rest", false),
+        ("restore-unfinished", "", true),
+        ("restore-unfinished", "[\"models/ol", true),
+    ] {
+        std::fs::create_dir(&restored).unwrap();
+        std::fs::write(restored.join(left), content).unwrap();
+        if is_noticed {
+            let refused = fail(
+                dir.path(),
+                &["serve", "--bind", "127.0.0.1:0", "--data-dir", "restored"],
+            );
+            assert!(
+                refused.contains("the restore into restored did not finish"),
+                "{refused}"
+            );
+        }
+        restore("one");
+        assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
+        std::fs::remove_dir_all(&restored).unwrap();
+    }
+}
+
+#[test]
+fn a_restore_killed_at_any_time_leaves_no_file_of_another_backup() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
+    succeed(dir.path(), &["backup", "one"]);
+    succeed(dir.path(), &["publish", &paper(), "--name", "other"]);
+    succeed(dir.path(), &["backup", "two"]);
+    let restored = dir.path().join("restored");
+    for delay_ms in [0, 1, 2, 4, 8, 16, 32] {
+        let mut killed = crate::process::foreframe(dir.path())
+            .args(["restore", "two", "--data-dir", "restored"])
+            .stdout(std::process::Stdio::null())
+            .spawn()
+            .unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(delay_ms));
+        // On Unix this is SIGKILL.
+        killed.kill().unwrap();
+        if killed.wait().unwrap().success() {
+            // It had ended.
+            std::fs::remove_dir_all(&restored).unwrap();
+        }
+        succeed(dir.path(), &["restore", "one", "--data-dir", "restored"]);
+        assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
+        std::fs::remove_dir_all(&restored).unwrap();
+    }
+}
+
+/// The files of a backup without the list of them.
+fn contents_of_backup(backup: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = contents(backup);
+    files.retain(|(path, _)| path != Path::new("backup.json"));
+    files
+}
+
+#[test]
 fn a_backup_needs_a_store_and_a_directory_of_its_own() {
     let dir = tempfile::tempdir().unwrap();
     assert!(fail(dir.path(), &["backup", "b"]).contains("there is nothing to back up in data"));

@@ -257,7 +257,10 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
     page.wait_until(&format!("performance.now() < 20000 && {IS_COMPLETE}"))
         .await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
-    app.store().revoke_key(&key.id, 2.0).await.unwrap();
+    app.store()
+        .revoke_key(&key.id, 2.0, &foreframe::store::Author::command_line())
+        .await
+        .unwrap();
     keys.refresh().await.unwrap();
     page.wait_until(&says("This key is unknown or was revoked")).await;
     page.unlock(&other.text).await;

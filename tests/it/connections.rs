@@ -9,6 +9,7 @@ use foreframe::server::ServerConfig;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
+use crate::process::RunningServer;
 use crate::service::{InProcessServer, TIMEOUT, app, get, run, send};
 
 const ASK: &[u8] = b"GET /livez HTTP/1.1\r\nhost: a\r\n\r\n";
@@ -311,4 +312,44 @@ async fn the_api_documentation_works_offline() {
         page.contains("./swagger-ui-bundle.js") && !page.contains("https://"),
         "{page}"
     );
+}
+
+#[test]
+fn a_request_names_one_host() {
+    let dir = tempfile::tempdir().unwrap();
+    let served = RunningServer::start(dir.path(), &[]);
+    let status = |head: &str| -> u16 {
+        let mut stream = std::net::TcpStream::connect(served.address).unwrap();
+        std::io::Write::write_all(&mut stream, head.as_bytes()).unwrap();
+        let mut answer = String::new();
+        std::io::Read::read_to_string(&mut stream, &mut answer).unwrap();
+        if answer.starts_with("HTTP/1.1 400") {
+            assert!(answer.contains("\"detail\""), "{answer}");
+        }
+        answer.split(' ').nth(1).unwrap().parse().unwrap()
+    };
+    let get = |target: &str, hosts: &str| status(&format!("GET {target} HTTP/1.1\r\nconnection: close\r\n{hosts}\r\n"));
+    for (target, hosts) in [
+        ("/v1/models", "host: localhost\r\n"),
+        ("/v1/models", "host: 127.0.0.1:8642\r\n"),
+        ("http://LOCALHOST/v1/models", "host: localhost\r\n"),
+    ] {
+        assert_eq!(get(target, hosts), 200, "{target} {hosts}");
+    }
+    for (target, hosts) in [
+        ("/v1/models", ""),
+        ("/v1/models", "host:\r\n"),
+        ("/v1/models", "host: \r\n"),
+        ("/v1/models", "host: :8642\r\n"),
+        ("/v1/models", "host: l\u{f6}calhost\r\n"),
+        ("/v1/models", "host: user@localhost\r\n"),
+        ("/v1/models", "host: local host\r\n"),
+        ("/v1/models", "host: localhost\r\nhost: localhost\r\n"),
+        ("http://robot-7/v1/models", "host: localhost\r\n"),
+        ("http://localhost:1/v1/models", "host: localhost\r\n"),
+    ] {
+        assert_eq!(get(target, hosts), 400, "{target} {hosts}");
+    }
+    // HTTP/1.0 has no Host header.
+    assert_eq!(status("GET /livez HTTP/1.0\r\n\r\n"), 200);
 }

@@ -1,7 +1,7 @@
 //! Versions whose deletion was interrupted.
 
 use foreframe::nn::Conditioning;
-use foreframe::store::unix_s;
+use foreframe::store::{Author, unix_s};
 use foreframe::versions::Versions;
 
 use crate::service::{model, spec, store};
@@ -23,7 +23,12 @@ async fn a_start_finishes_interrupted_deletions() {
     let files = |version: &str| dir.path().join("models/mine").join(version);
     // Killed after the row was written, and while the files were being deleted.
     for version in [1, 2] {
-        assert!(store.delete_version("mine", version, unix_s()).await.unwrap());
+        assert!(
+            store
+                .delete_version("mine", version, unix_s(), &Author::command_line())
+                .await
+                .unwrap()
+        );
     }
     std::fs::rename(files("2"), files(".deleting-0123")).unwrap();
     let loaded = versions.load_serving().await.unwrap();

@@ -242,9 +242,15 @@ async fn model_versions_are_activated_refused_and_deleted() {
         (&json!([1, 2, 3]), &json!(2))
     );
     // A version that another server activates is loaded. If it is invalid, the previous one is served, also after a restart.
-    store(dir.path()).set_active("plain", 1, 0.0).await.unwrap();
+    store(dir.path())
+        .set_active("plain", 1, 0.0, &foreframe::store::Author::command_line())
+        .await
+        .unwrap();
     wait_for_version(&next, "plain", 1).await;
-    store(dir.path()).set_active("plain", 3, 0.0).await.unwrap();
+    store(dir.path())
+        .set_active("plain", 3, 0.0, &foreframe::store::Author::command_line())
+        .await
+        .unwrap();
     let third = App::open(config).await.unwrap();
     assert_eq!(get(&third, "/v1/models/plain").await.json()["active_version"], 1);
     assert_eq!(run_job(&third, &train("plain", 2)).await["result"]["version"], 5);

@@ -4,7 +4,7 @@ use axum::body::Body;
 use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
 use foreframe::server::{App, ServerConfig};
-use foreframe::store::{KeyRow, KeyScope, Store, StoreConfig, unix_s};
+use foreframe::store::{Author, KeyRow, KeyScope, Store, StoreConfig, unix_s};
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
@@ -45,7 +45,7 @@ async fn authentication_starts_with_the_first_key() {
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
-    assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
     keys.refresh().await.unwrap();
     // Revoking the last key does not switch authentication off.
     assert_eq!(get(&app, "/v1/models").await.status, 401);
@@ -71,7 +71,7 @@ async fn the_api_requires_a_valid_key() {
     for path in ["/", "/livez", "/metrics", "/openapi.json", "/docs/"] {
         assert_eq!(get(&app, path).await.status, 200, "{path}");
     }
-    assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
     keys.refresh().await.unwrap();
     assert_eq!(models_with(&app, &format!("Bearer {}", key.text)).await.status, 401);
 }
@@ -89,7 +89,7 @@ async fn a_stream_ends_when_its_key_is_revoked() {
         tokio_tungstenite::connect_async(request).await.unwrap().0
     };
     let (mut revoked, mut kept) = (connect(&key).await, connect(&other).await);
-    assert!(store.revoke_key(&key.id, 2.0).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
     keys.refresh().await.unwrap();
     let mut messages = Vec::new();
     while let Some(Ok(message)) = tokio::time::timeout(TIMEOUT, revoked.next()).await.unwrap() {
@@ -174,7 +174,7 @@ async fn limited_key(store: &Store, keys: &Keys, limits: impl FnOnce(&mut KeyRow
         requests_per_s: None,
     };
     limits(&mut row);
-    store.add_key(row).await.unwrap();
+    store.add_key(row, &Author::command_line()).await.unwrap();
     keys.refresh().await.unwrap();
     key
 }
@@ -295,26 +295,61 @@ async fn changes_are_audited_with_their_key() {
     assert_eq!(
         entry(&page),
         [
-            json!(2),
+            json!(4),
             json!(other.id),
             json!("robot"),
             json!("job.cancel"),
             json!("job-1")
         ]
     );
-    assert_eq!(page["next"], 2);
-    let page = send_with(&app, &one, ("GET", "/v1/audit?before=2"), &Value::Null)
+    assert_eq!(page["next"], 4);
+    let page = send_with(&app, &one, ("GET", "/v1/audit?before=4&limit=1"), &Value::Null)
         .await
         .json();
     assert_eq!(
         entry(&page),
         [
-            json!(1),
+            json!(3),
             json!(one.id),
             json!("robot"),
             json!("job.create"),
             json!("job-1")
         ]
     );
-    assert!(page["entries"][0]["unix_s"].as_f64().unwrap() > 1e9 && page["next"].is_null());
+    assert!(page["entries"][0]["unix_s"].as_f64().unwrap() > 1e9);
+}
+
+#[tokio::test]
+async fn a_key_sees_its_own_sessions_only() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let mut owners = Vec::new();
+    for scope in [KeyScope::Predict, KeyScope::Predict, KeyScope::Admin] {
+        let key = NewKey::generate().unwrap();
+        let row = KeyRow {
+            id: key.id.clone(),
+            name: "robot".to_owned(),
+            hash: key.hash.clone(),
+            created_s: 1.0,
+            revoked_s: None,
+            scope,
+            expires_s: None,
+            requests_per_s: None,
+        };
+        store.add_key(row, &Author::command_line()).await.unwrap();
+        owners.push(key);
+    }
+    keys.refresh().await.unwrap();
+    let (one, other, admin) = (&owners[0], &owners[1], &owners[2]);
+    let open = json!({"model": "plain"});
+    let created = send_with(&app, one, ("POST", "/v1/sessions"), &open).await.json();
+    let path = format!("/v1/sessions/{}", created["id"].as_str().unwrap());
+    for (key, seen) in [(one, 1), (other, 0), (admin, 1)] {
+        let list = send_with(&app, key, ("GET", "/v1/sessions"), &Value::Null).await.json();
+        assert_eq!(list["sessions"].as_array().unwrap().len(), seen, "{list}");
+        let status = send_with(&app, key, ("GET", &path), &Value::Null).await.status;
+        assert_eq!(status, if seen == 1 { 200 } else { 404 });
+        // What changes a session needs its token.
+        let state = format!("{path}/state");
+        assert_eq!(send_with(&app, key, ("GET", &state), &Value::Null).await.status, 403);
+    }
 }

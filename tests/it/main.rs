@@ -4,6 +4,7 @@
 
 mod architecture;
 mod asyncapi;
+mod audit;
 mod backup;
 mod bag_files;
 mod bags;

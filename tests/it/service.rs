@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
-use axum::http::{HeaderMap, Method, Request, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, Request, StatusCode, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::{Frame, codec};
@@ -143,7 +143,10 @@ impl Answer {
     }
 }
 
-pub(crate) async fn send(app: &App, request: Request<Body>) -> Answer {
+pub(crate) async fn send(app: &App, mut request: Request<Body>) -> Answer {
+    // A client's library adds it.
+    let host = HeaderValue::from_static("localhost");
+    request.headers_mut().entry(header::HOST).or_insert(host);
     let response = server::router(app.clone()).oneshot(request).await.unwrap();
     let (status, headers) = (response.status(), response.headers().clone());
     let body = axum::body::to_bytes(response.into_body(), 1 << 24)

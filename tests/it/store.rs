@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 
 use foreframe::store::{
-    EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob, Store, StoreConfig,
+    Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob, Store,
+    StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
@@ -110,7 +111,7 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         for line in ["one", "two", "three", "four"] {
             assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
-        assert!(store.ask_to_cancel(1).await.unwrap());
+        assert!(store.ask_to_cancel(1, &Author::command_line()).await.unwrap());
         assert_eq!(
             store.renew_at(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
@@ -186,10 +187,16 @@ async fn the_queue_limit_keys_and_names_are_enforced() {
         assert_eq!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::Taken);
         assert!(matches!(enqueue(job(None, None)).await, EnqueueResult::New(_)));
         assert_eq!(enqueue(job(None, None)).await, EnqueueResult::Full);
-        assert!(store.cancel_queued(1, 1.0).await.unwrap() && !store.cancel_queued(1, 1.0).await.unwrap());
+        assert!(
+            store.cancel_queued(1, 1.0, &Author::command_line()).await.unwrap()
+                && !store.cancel_queued(1, 1.0, &Author::command_line()).await.unwrap()
+        );
         assert!(matches!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::New(row) if row.number == 3));
-        assert_eq!(store.requeue(1, 2).await.unwrap(), Some(EnqueueResult::Taken));
-        assert_eq!(store.requeue(2, 2).await.unwrap(), None);
+        assert_eq!(
+            store.requeue(1, 2, &Author::command_line()).await.unwrap(),
+            Some(EnqueueResult::Taken)
+        );
+        assert_eq!(store.requeue(2, 2, &Author::command_line()).await.unwrap(), None);
         assert_eq!(store.job_of_key("k").await.unwrap().unwrap().number, 1);
     }
 }
@@ -245,7 +252,10 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
             enqueued(&store).await;
         }
         for number in 1..=3 {
-            store.cancel_queued(number, number as f64).await.unwrap();
+            store
+                .cancel_queued(number, number as f64, &Author::command_line())
+                .await
+                .unwrap();
         }
         let numbers = async |page: JobPage| -> Vec<i64> {
             store.jobs(page).await.unwrap().iter().map(|row| row.number).collect()
@@ -318,9 +328,23 @@ async fn versions_are_numbered_after_the_shipped_one() {
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
         // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
-        assert!(!store.delete_version("m", 5, 1.0).await.unwrap());
-        store.set_active("m", 4, 1.0).await.unwrap();
-        assert!(store.delete_version("m", 6, 1.0).await.unwrap() && !store.delete_version("m", 6, 1.0).await.unwrap());
+        assert!(
+            !store
+                .delete_version("m", 5, 1.0, &Author::command_line())
+                .await
+                .unwrap()
+        );
+        store.set_active("m", 4, 1.0, &Author::command_line()).await.unwrap();
+        assert!(
+            store
+                .delete_version("m", 6, 1.0, &Author::command_line())
+                .await
+                .unwrap()
+                && !store
+                    .delete_version("m", 6, 1.0, &Author::command_line())
+                    .await
+                    .unwrap()
+        );
         assert_eq!(reserve(&store, "m").await.1, 7);
     }
 }
@@ -339,7 +363,10 @@ async fn keys_are_found_by_id_and_revoked_once() {
             .map(|key| key.name)
             .collect();
         assert_eq!(names, ["room", "robot"]);
-        assert!(store.revoke_key("b", 5.0).await.unwrap() && !store.revoke_key("b", 6.0).await.unwrap());
+        assert!(
+            store.revoke_key("b", 5.0, &Author::command_line()).await.unwrap()
+                && !store.revoke_key("b", 6.0, &Author::command_line()).await.unwrap()
+        );
         assert_eq!(store.find_key("b").await.unwrap().unwrap().revoked_s, Some(5.0));
         assert_eq!(store.find_key("c").await.unwrap(), None);
     }
@@ -474,14 +501,14 @@ async fn a_key_has_its_share_of_the_job_queue() {
             ("b", KeyScope::Admin),
             ("robot", KeyScope::Predict),
         ] {
-            store.add_key(key(id, scope)).await.unwrap();
+            store.add_key(key(id, scope), &Author::command_line()).await.unwrap();
         }
         for _ in 0..4 {
             assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
         }
         assert_eq!(enqueued_by(&store, "a").await, EnqueueResult::ShareFull(4));
         assert!(matches!(enqueued_by(&store, "b").await, EnqueueResult::New(_)));
-        store.revoke_key("b", 1.0).await.unwrap();
+        store.revoke_key("b", 1.0, &Author::command_line()).await.unwrap();
         assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
         let stored = store.find_key("robot").await.unwrap().unwrap();
         assert_eq!(stored, key("robot", KeyScope::Predict));
@@ -492,14 +519,15 @@ async fn a_key_has_its_share_of_the_job_queue() {
 async fn the_audit_trail_is_kept_in_order() {
     for (_dir, store) in stores("audit").await {
         store.create_key("k", "robot", "hash", 1.0).await.unwrap();
-        store.record_change("k", "job.create", "job-1").await;
-        store.record_change("anonymous", "job.cancel", "job-1").await;
+        let (robot, nobody) = (Author::of_key("k"), Author::of_key(""));
+        store.record_dataset_deletion("one", &robot).await.unwrap();
+        store.record_dataset_deletion("two", &nobody).await.unwrap();
         let rows = store.audit(None, 10).await.unwrap();
         let seen: Vec<_> = rows
             .iter()
-            .map(|row| (row.number, row.name.as_deref(), row.action.as_str()))
+            .map(|row| (row.number, row.name.as_deref(), row.target.as_str()))
             .collect();
-        assert_eq!(seen, [(2, None, "job.cancel"), (1, Some("robot"), "job.create")]);
-        assert_eq!(store.audit(Some(2), 10).await.unwrap(), rows[1..]);
+        assert_eq!(seen, [(3, None, "two"), (2, Some("robot"), "one"), (1, None, "k")]);
+        assert_eq!(store.audit(Some(3), 10).await.unwrap(), rows[1..]);
     }
 }

@@ -16,18 +16,16 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::watch;
 use tracing::warn;
 
-use super::access::{Change, required_scope};
+use super::access::required_scope;
 use super::problem::ApiError;
 use super::rate::RateLimit;
-use crate::store::{KeyRow, KeyScope, Store, StoreError};
+use crate::store::{Author, KeyRow, KeyScope, Store, StoreError};
 use crate::telemetry::names;
 
 /// The beginning of every key, so that leaked keys are easy to find.
 const PREFIX: &str = "ffk";
 /// A browser cannot set headers of a WebSocket. It can offer the key as a sub-protocol with this prefix.
 const SUBPROTOCOL_PREFIX: &str = "foreframe.key.";
-/// Who calls while authentication is off.
-const ANONYMOUS: &str = "anonymous";
 const ID_BYTES: usize = 6;
 const SECRET_BYTES: usize = 32;
 
@@ -83,13 +81,21 @@ impl KeyHash {
 }
 
 /// Who sent a request: the key that it presented, or nobody if authentication was off.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(in crate::server) struct Caller(Option<KeyHash>);
+#[derive(Clone, Copy, Debug, Default)]
+pub(in crate::server) struct Caller {
+    key: Option<KeyHash>,
+    is_admin: bool,
+}
 
 impl Caller {
     /// Whether this caller may use what another made. What was made without a key is everybody's.
     pub(in crate::server) fn may_use(self, maker: Self) -> bool {
-        maker.0.is_none() || maker == self
+        maker.key.is_none() || maker.key == self.key
+    }
+
+    /// Whether this caller may see what another made: its own, and with the scope `admin` everything.
+    pub(in crate::server) fn may_see(self, maker: Self) -> bool {
+        self.is_admin || self.may_use(maker)
     }
 }
 
@@ -246,7 +252,7 @@ impl Keys {
 
     /// Completes when the caller's key is no longer valid; never for a caller without a key.
     pub(in crate::server) async fn revoked(&self, caller: Caller) {
-        let Caller(Some(key)) = caller else {
+        let Some(key) = caller.key else {
             return std::future::pending().await;
         };
         let mut refreshed = self.shared.refreshed.subscribe();
@@ -270,11 +276,11 @@ impl Keys {
         self.shared.is_required || self.known().exist
     }
 
-    /// Who calls, with a key of the needed scope. Takes the same time for every unknown key: the whole text is hashed, then
+    /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown key: the whole text is hashed, then
     /// looked up.
-    fn check(&self, presented: Option<&str>, needed: KeyScope) -> Result<Caller, ApiError> {
+    fn check(&self, presented: Option<&str>, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
         if !self.are_required() {
-            return Ok(Caller(None));
+            return Ok((Caller::default(), Author::of_key("")));
         }
         let key = presented.ok_or(ApiError::Unauthorized(
             "this server requires an API key: send the header Authorization: Bearer KEY; create a key with foreframe keys \
@@ -289,27 +295,11 @@ impl Keys {
             "the API key is not valid: it is unknown, was revoked or has expired",
         ))?;
         known.check(needed, clock.now_s())?;
-        Ok(Caller(Some(hash)))
-    }
-
-    /// The id of the caller's key; empty while authentication is off.
-    pub(in crate::server) fn id_of(&self, caller: Caller) -> String {
-        let Caller(Some(hash)) = caller else {
-            return String::new();
+        let caller = Caller {
+            key: Some(hash),
+            is_admin: known.row.scope == KeyScope::Admin,
         };
-        let known = self.known();
-        known
-            .valid
-            .get(&hash)
-            .map_or_else(String::new, |key| key.row.id.clone())
-    }
-
-    /// Writes a change that a request made to the audit trail.
-    async fn record(&self, caller: Caller, action: &str, target: &str) {
-        let Some(store) = &self.shared.store else { return };
-        let key = self.id_of(caller);
-        let who = if key.is_empty() { ANONYMOUS } else { &key };
-        store.record_change(who, action, target).await;
+        Ok((caller, Author::of_key(&known.row.id)))
     }
 
     fn known(&self) -> RwLockReadGuard<'_, KnownKeys> {
@@ -317,26 +307,22 @@ impl Keys {
     }
 }
 
-/// Refuses a request without a key that allows it, if authentication is on. Others get their [`Caller`] as an
-/// extension, and what they change is audited.
+/// Refuses a request without a key that allows it, if authentication is on. Others get their [`Caller`] and [`Author`] as
+/// extensions.
 pub(in crate::server) async fn check(State(keys): State<Keys>, mut request: Request, next: Next) -> Response {
     let route = request.extensions().get::<MatchedPath>().cloned();
     let route = route.as_ref().map_or("", MatchedPath::as_str);
     let needed = required_scope(request.method(), route);
-    let caller = match keys.check(presented(request.headers()), needed) {
+    let (caller, author) = match keys.check(presented(request.headers()), needed) {
         Ok(caller) => caller,
         Err(refused) => {
             counter!(names::AUTH_REFUSED).increment(1);
             return refused.into_response();
         }
     };
-    let change = Change::of(request.method(), route, request.uri().path());
     request.extensions_mut().insert(caller);
-    let response = next.run(request).await;
-    if let Some(change) = change.filter(|_| response.status().is_success()) {
-        keys.record(caller, change.action, &change.target(&response)).await;
-    }
-    response
+    request.extensions_mut().insert(author);
+    next.run(request).await
 }
 
 /// The key that a request presents.

@@ -8,7 +8,8 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::http::uri::Authority;
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -39,6 +40,9 @@ impl OriginPolicy {
 /// Refuses requests to a foreign host and requests of a foreign page, unless they are configured. Answers preflight
 /// requests.
 pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request: Request, next: Next) -> Response {
+    if let Err(wrong) = check_host(&request) {
+        return wrong.into_response();
+    }
     let allowed = &policy.allowed;
     if !policy.keys.are_required()
         && let Some(host) = foreign_host(request.headers(), allowed)
@@ -76,6 +80,33 @@ pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request
         headers.insert(header::ACCESS_CONTROL_ALLOW_HEADERS, HEADERS);
     }
     response
+}
+
+/// Errors: `Malformed` unless the request names one host, as HTTP/1.1 demands, the same in its target and in its header.
+fn check_host(request: &Request) -> Result<(), ApiError> {
+    let wrong = |what: &str| {
+        Err(ApiError::Malformed(format!(
+            "{what}; a request names its host once, as in Host: 127.0.0.1:8642"
+        )))
+    };
+    let mut hosts = request.headers().get_all(header::HOST).iter();
+    let host = match (hosts.next(), hosts.next()) {
+        (Some(host), None) => host,
+        (Some(_), Some(_)) => return wrong("there is more than one Host header"),
+        // Before HTTP/1.1, there was no such header.
+        (None, _) if request.version() < Version::HTTP_11 => return Ok(()),
+        (None, _) => return wrong("there is no Host header"),
+    };
+    let Some(authority) = Authority::try_from(host.as_bytes())
+        .ok()
+        .filter(|host| !host.host().is_empty() && !host.as_str().contains('@'))
+    else {
+        return wrong("the Host header is no host with an optional port");
+    };
+    match request.uri().authority() {
+        Some(target) if *target != authority => wrong("the request's target and its Host header name different hosts"),
+        _ => Ok(()),
+    }
 }
 
 /// The requested host, if it is a domain name that anybody could point at this machine.

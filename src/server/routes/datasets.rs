@@ -1,5 +1,6 @@
 //! The data sets, and pictures of their episodes.
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
@@ -19,6 +20,7 @@ use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
+use crate::store::Author;
 use crate::types::Channel;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -134,7 +136,11 @@ async fn get(State(app): State<App>, Path(name): Path<String>) -> Result<axum::J
         (status = 409, description = "A job that has not ended uses it", body = Problem),
     )
 )]
-async fn delete(State(app): State<App>, Path(name): Path<String>) -> Result<StatusCode, ApiError> {
+async fn delete(
+    State(app): State<App>,
+    Extension(author): Extension<Author>,
+    Path(name): Path<String>,
+) -> Result<StatusCode, ApiError> {
     let open = app.jobs().open().await?;
     if let Some(job) = open.into_iter().find(|job| job.spec.dataset() == name) {
         let kind = "data set";
@@ -145,7 +151,7 @@ async fn delete(State(app): State<App>, Path(name): Path<String>) -> Result<Stat
         }
         .into());
     }
-    datasets::delete(app.store().objects(), &name).await.map_err(absent)?;
+    datasets::delete(app.store(), &name, &author).await.map_err(absent)?;
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -13,10 +13,9 @@ use crate::error_text::with_causes;
 use crate::jobs::pipeline::report_key;
 use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use crate::server::http::extract::{Json, Path, Query};
-use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::{LogRow, LossRow};
+use crate::store::{Author, LogRow, LossRow};
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
@@ -157,7 +156,7 @@ impl From<LossRow> for CurvePoint {
 )]
 async fn create(
     State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    Extension(author): Extension<Author>,
     headers: HeaderMap,
     Json(spec): Json<JobSpec>,
 ) -> Result<Response, ApiError> {
@@ -167,8 +166,7 @@ async fn create(
     let key = key.transpose().map_err(|_| {
         ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned())
     })?;
-    let submitter = app.keys().id_of(caller);
-    Ok(accepted(app.jobs().submit_as(&submitter, spec, key).await?))
+    Ok(accepted(app.jobs().submit_as(author.key_id(), spec, key).await?))
 }
 
 /// Lists jobs, the newest first.
@@ -214,8 +212,12 @@ async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Jso
         (status = 409, description = "It has ended", body = Problem),
     )
 )]
-async fn cancel(State(app): State<App>, Path(id): Path<String>) -> Result<Response, ApiError> {
-    Ok(accepted(app.jobs().cancel(&id).await?))
+async fn cancel(
+    State(app): State<App>,
+    Extension(author): Extension<Author>,
+    Path(id): Path<String>,
+) -> Result<Response, ApiError> {
+    Ok(accepted(app.jobs().cancel(&id, &author).await?))
 }
 
 /// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
@@ -229,8 +231,12 @@ async fn cancel(State(app): State<App>, Path(id): Path<String>) -> Result<Respon
         (status = 503, description = "Too many jobs wait", body = Problem),
     )
 )]
-async fn resume(State(app): State<App>, Path(id): Path<String>) -> Result<Response, ApiError> {
-    Ok(accepted(app.jobs().resume(&id).await?))
+async fn resume(
+    State(app): State<App>,
+    Extension(author): Extension<Author>,
+    Path(id): Path<String>,
+) -> Result<Response, ApiError> {
+    Ok(accepted(app.jobs().resume(&id, &author).await?))
 }
 
 /// The log of a job.

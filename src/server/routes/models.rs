@@ -1,5 +1,6 @@
 //! The models and their versions.
 
+use axum::Extension;
 use axum::extract::State;
 use axum::http::StatusCode;
 use serde::Serialize;
@@ -9,11 +10,11 @@ use utoipa_axum::routes;
 use crate::error_text::with_causes;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
-use crate::server::blocking::run_to_completion;
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
+use crate::store::Author;
 use crate::versions::VersionError;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -158,11 +159,11 @@ async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::
 )]
 async fn activate(
     State(app): State<App>,
+    Extension(author): Extension<Author>,
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
-    let (switched, name) = (app.clone(), model.clone());
-    run_to_completion(async move { switched.versions().activate(switched.predictor(), &name, version).await })
-        .await??;
+    let versions = app.versions();
+    versions.activate(app.predictor(), &model, version, &author).await?;
     get(State(app), Path(model)).await
 }
 
@@ -179,8 +180,13 @@ async fn activate(
         (status = 409, description = "It is active, or was not published by a job", body = Problem),
     )
 )]
-async fn delete(State(app): State<App>, Path((model, version)): Path<(String, u32)>) -> Result<StatusCode, ApiError> {
-    run_to_completion(async move { app.versions().delete(app.predictor(), &model, version).await }).await??;
+async fn delete(
+    State(app): State<App>,
+    Extension(author): Extension<Author>,
+    Path((model, version)): Path<(String, u32)>,
+) -> Result<StatusCode, ApiError> {
+    let versions = app.versions();
+    versions.delete(app.predictor(), &model, version, &author).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

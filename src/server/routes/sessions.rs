@@ -5,6 +5,7 @@ mod bodies;
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
@@ -14,6 +15,7 @@ use utoipa_axum::routes;
 
 use self::bodies::{CreateSession, CreatedSession, ExportedState, SessionDescription, SessionList};
 use crate::server::http::extract::{Json, Path, Query};
+use crate::server::http::keys::Caller;
 use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
@@ -39,10 +41,14 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         (status = 503, description = "Too many sessions", body = Problem),
     )
 )]
-async fn create(State(app): State<App>, Json(request): Json<CreateSession>) -> Result<impl IntoResponse, ApiError> {
+async fn create(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    Json(request): Json<CreateSession>,
+) -> Result<impl IntoResponse, ApiError> {
     let (model, state, settings) = request.resolve(&app)?;
     let now = Instant::now();
-    let created = Session::new(model, state, settings, now);
+    let created = Session::new(model, state, settings, (caller, now));
     let (session, token) = created.map_err(|error| ApiError::Internal(error.to_string()))?;
     let session = app.sessions().insert(session, now)?;
     let created = CreatedSession {
@@ -54,14 +60,18 @@ async fn create(State(app): State<App>, Json(request): Json<CreateSession>) -> R
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], axum::Json(created)))
 }
 
-/// Lists the open sessions.
+/// Lists the open sessions that this key opened; with the scope `admin`, those of all keys.
 #[utoipa::path(
     get, path = "/v1/sessions", tag = "sessions", params(Page),
     responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range", body = Problem))
 )]
-async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
+async fn list(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    Query(page): Query<Page>,
+) -> Result<axum::Json<SessionList>, ApiError> {
     let now = Instant::now();
-    let found = app.sessions().page(&page.after, page.limit()? + 1, now);
+    let found = app.sessions().page(&page.after, page.limit()? + 1, caller, now);
     let (found, next) = page.of(found, |session| session.id())?;
     let grace = app.sessions().grace();
     let describe = |session: &Arc<Session>| SessionDescription::of(session, grace, now);
@@ -71,7 +81,7 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
     }))
 }
 
-/// Describes a session.
+/// Describes a session that this key opened; with the scope `admin`, any session.
 #[utoipa::path(
     get, path = "/v1/sessions/{id}", tag = "sessions",
     params(("id" = String, Path, description = "The session's id")),
@@ -81,9 +91,13 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
         (status = 410, description = "It has expired", body = Problem),
     )
 )]
-async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<SessionDescription>, ApiError> {
+async fn get(
+    State(app): State<App>,
+    Extension(caller): Extension<Caller>,
+    Path(id): Path<String>,
+) -> Result<axum::Json<SessionDescription>, ApiError> {
     let now = Instant::now();
-    let session = app.sessions().get(&id, now)?;
+    let session = app.sessions().find(&id, caller, now)?;
     Ok(axum::Json(SessionDescription::of(
         &session,
         app.sessions().grace(),

@@ -91,7 +91,7 @@ async fn model_stream(
         model,
         SessionState::default(),
         SessionSettings::default(),
-        Instant::now(),
+        (caller, Instant::now()),
     );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
     let services = services(&app, caller, messages);

@@ -10,6 +10,7 @@ use super::protocol::{ConfigureMessage, ServerMessage, SessionSettings};
 use super::step::{FrameStep, PendingStep, SessionCore, StepError};
 use crate::registry::LoadedModel;
 use crate::server::blocking::BlockingWork;
+use crate::server::http::keys::Caller;
 use crate::server::images::ImageFormat;
 use crate::server::token::{Token, TokenHash};
 use crate::serving::{Predictor, SessionState};
@@ -26,6 +27,7 @@ pub(in crate::server) enum Owner {
 pub(in crate::server) struct Session {
     pub(super) id: String,
     pub(super) token_hash: TokenHash,
+    pub(super) maker: Caller,
     /// The session's number in the predictor.
     key: u64,
     model: Arc<LoadedModel>,
@@ -48,13 +50,14 @@ impl Session {
         model: Arc<LoadedModel>,
         state: SessionState,
         settings: SessionSettings,
-        now: Instant,
+        (maker, now): (Caller, Instant),
     ) -> Result<(Self, String), getrandom::Error> {
         let (id, token) = (Token::random()?, Token::random()?);
         let session = Self {
             key: id.key(),
             id: id.id(),
             token_hash: token.hash(),
+            maker,
             model,
             inner: Mutex::new(SessionInner {
                 core: SessionCore::new(state, settings),

@@ -8,6 +8,7 @@ use metrics::counter;
 use tracing::info;
 
 use super::session::Session;
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::ApiError;
 use crate::server::token::TokenHash;
 use crate::telemetry::names;
@@ -77,8 +78,23 @@ impl SessionTable {
         Ok(session)
     }
 
+    /// The session, if the caller may see it. Errors: `Unknown`, `Expired`.
+    pub(in crate::server) fn find(
+        &self,
+        id: &str,
+        caller: Caller,
+        now: Instant,
+    ) -> Result<Arc<Session>, SessionTableError> {
+        let session = self.get(id, now)?;
+        if caller.may_see(session.maker) {
+            Ok(session)
+        } else {
+            Err(SessionTableError::Unknown(id.to_owned()))
+        }
+    }
+
     /// The session. Errors: `Unknown`, `Expired`.
-    pub(in crate::server) fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, SessionTableError> {
+    fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, SessionTableError> {
         let mut inner = self.inner();
         self.evict(&mut inner, now);
         let session = inner.sessions.get(id).cloned();
@@ -113,14 +129,15 @@ impl SessionTable {
         session.delete();
     }
 
-    /// The sessions after an id, in the order of their ids.
-    pub(in crate::server) fn page(&self, after: &str, limit: usize, now: Instant) -> Vec<Arc<Session>> {
+    /// The sessions after an id that the caller may see, in the order of their ids.
+    pub(in crate::server) fn page(&self, after: &str, limit: usize, caller: Caller, now: Instant) -> Vec<Arc<Session>> {
         let mut inner = self.inner();
         self.evict(&mut inner, now);
         let later = inner
             .sessions
             .range::<str, _>((std::ops::Bound::Excluded(after), std::ops::Bound::Unbounded));
-        later.take(limit).map(|(_, session)| Arc::clone(session)).collect()
+        let seen = later.map(|(_, session)| session).filter(|of| caller.may_see(of.maker));
+        seen.take(limit).cloned().collect()
     }
 
     /// How many are open.
