@@ -40,7 +40,8 @@ struct AuditEntry {
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<String>,
     /// `job.create`, `job.cancel`, `job.resume`, `version.publish`, `version.activate`, `version.delete`, `dataset.delete`,
-    /// `key.create` or `key.revoke`.
+    /// `key.create` or `key.revoke`. The entry of `dataset.delete` is written before the files are deleted; if that fails,
+    /// `dataset.delete.failed` follows.
     action: String,
     /// The job, the version (`NAME@VERSION`), the data set or the key.
     target: String,
