@@ -269,7 +269,7 @@ pub fn import(
     if let Some(finished) = directory.finished()? {
         return Ok(finished);
     }
-    let recording = open(config)?;
+    let recording = open(config, cancelled)?;
     check_channels(&recording)?;
     options.check_units(&recording)?;
     let plan = timing::plan(recording, options)?;
@@ -329,7 +329,7 @@ fn read_text(path: &Path) -> Result<String, ImportError> {
 }
 
 /// Reads the records of a source, after finding out of which kind it is.
-fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
+fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     let (source, options) = (&config.source, &config.options);
     if !source.is_dir() {
         open_file(source)?;
@@ -341,7 +341,7 @@ fn open(config: &ImportConfig) -> Result<Recording, ImportError> {
         return lerobot::open(source, &config.out, options);
     }
     if bag::is_bag(source) {
-        return bag::open(source, options);
+        return bag::open(source, options, cancelled);
     }
     if source.is_dir() {
         return images::open(source, options);

@@ -11,7 +11,7 @@ use super::recording::{DECODED, Images, PixelType, RawImages, Record, Recording}
 use super::{ImportError, ImportOptions};
 
 /// The containers that are read. Without such a list, ffmpeg takes a playlist for a video, and reads the files that it names.
-const CONTAINERS: [&str; 2] = ["-format_whitelist", "mov,matroska,avi"];
+const CONTAINERS: [&str; 4] = ["-format_whitelist", "mov,matroska,avi", "-protocol_whitelist", "file"];
 
 /// Decodes a video into a file of gray frames and lists them with their times. Errors: `Program`, `Io`, `Record`.
 pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
@@ -108,6 +109,7 @@ pub(super) struct Topic {
 pub(super) struct Collector<'a> {
     pub(super) source: &'a Path,
     pub(super) options: &'a ImportOptions,
+    cancelled: &'a AtomicBool,
     pub(super) topics: Vec<Topic>,
     by_name: HashMap<(String, String), usize>,
     pub(super) files: Vec<PathBuf>,
@@ -116,15 +118,24 @@ pub(super) struct Collector<'a> {
 }
 
 impl<'a> Collector<'a> {
-    pub(super) fn new(source: &'a Path, options: &'a ImportOptions) -> Self {
+    pub(super) fn new(source: &'a Path, options: &'a ImportOptions, cancelled: &'a AtomicBool) -> Self {
         Self {
             source,
             options,
+            cancelled,
             topics: Vec::new(),
             by_name: HashMap::new(),
             files: Vec::new(),
             skipped: Vec::new(),
         }
+    }
+
+    /// Errors: `Cancelled` if the import was cancelled.
+    pub(super) fn check_cancelled(&self) -> Result<(), ImportError> {
+        if self.cancelled.load(Ordering::Relaxed) {
+            return Err(ImportError::Cancelled { done: 0, total: 0 });
+        }
+        Ok(())
     }
 
     /// The messages that follow are in this file.
