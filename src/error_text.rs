@@ -140,14 +140,8 @@ mod tests {
             );
             assert!(long.contains("ä … ä") && long.ends_with("ä` at line 1"), "{long}");
         }
-        let many: String = (0..2000).map(|number| format!("{number},")).collect();
-        struct Pieces;
-        impl Display for Pieces {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                (0..2000).try_for_each(|number| write!(f, "{number},"))
-            }
-        }
-        assert_eq!(shortened(&Pieces), shortened(&many));
+        let in_pieces = fmt::from_fn(|f| (0..2000).try_for_each(|number| write!(f, "{number},")));
+        assert_eq!(shortened(&in_pieces), shortened(&in_pieces.to_string()));
     }
 
     #[test]

@@ -266,7 +266,7 @@ def database(*statements, messages=f"CREATE TABLE messages({MESSAGES})", topics=
         connection.execute(statement)
     if "TABLE" in topics:
         connection.execute("INSERT INTO topics(id, name, type, serialization_format) VALUES (1, '/image', 'sensor_msgs/msg/Image', 'cdr')")
-    if messages and "VIEW" not in messages:
+    if "topic_id" in messages and "VIEW" not in messages:
         stored = [row[1] for row in connection.execute("PRAGMA table_info(messages)") if row[1] != "data" or not row[4]]
         for index in range(1, count + 1):
             row = {"id": index, "topic_id": 1, "timestamp": index * 10**8, "data": cdr_image(index * 10**8)}
@@ -331,7 +331,7 @@ def bags():
         "refused-default.db3": database(messages=f"CREATE TABLE messages({without('data')}, data BLOB DEFAULT x'{IMAGE.hex()}')"),
         "refused-without-rowid.db3": database(messages=f"CREATE TABLE messages({MESSAGES}) WITHOUT ROWID"),
         "refused-column-rowid.db3": database(messages=f"CREATE TABLE messages({MESSAGES}, ROWID TEXT)"),
-        "refused-no-messages.db3": database(messages="SELECT 1"),
+        "refused-no-messages.db3": database(messages="CREATE TABLE message(id)"),
         "refused-rows-without-end.db3": endless(sound, 3, 6),
         "refused-topics-without-end.db3": endless(sound, 2, 6),
         "refused-schema-without-end.db3": endless(sound, 1, 6),

@@ -28,6 +28,7 @@ mod healthy_robot;
 mod import;
 mod import_hostile;
 mod import_killed;
+mod import_names;
 mod inspection;
 mod jobs;
 mod jobs_checkpoints;
