@@ -20,6 +20,7 @@ mod layout;
 pub mod moving_mnist;
 mod parquet_file;
 mod preview;
+mod program;
 pub mod sampler;
 mod shard;
 mod shard_reader;

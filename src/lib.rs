@@ -33,7 +33,7 @@
 //! ```
 //!
 //! The modules in reading order; each uses only those above it:
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 // Some crate-private helpers serve only the modules of a feature. The default features use all of them, and are checked.
 #![cfg_attr(not(feature = "server"), allow(dead_code, unused_imports))]
 

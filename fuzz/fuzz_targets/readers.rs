@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{LazyLock, OnceLock};
 
 use axum::extract::ws::Message;
-use foreframe::dataset::import::{ImportConfig, ImportOptions, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
 use foreframe::dataset::{CollectConfig, Dataset, collect};
 use foreframe::files::sha256_hex;
 use foreframe::frame::codec;
@@ -202,6 +202,7 @@ fn imported(name: &str, bytes: &[u8]) {
                 skip_bad,
                 ..ImportOptions::default()
             },
+            disk_mib: DEFAULT_DISK_MIB,
         };
         let _ = import(&config, &|_| {}, &AtomicBool::new(false));
         let _ = std::fs::remove_dir_all(&config.out);

@@ -123,6 +123,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             hold_s: args.hold,
             skip_bad: args.skip_bad,
         },
+        disk_mib: workspace.import_disk_mib(),
     };
     let was_complete = is_finished(&out);
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));
@@ -149,13 +150,13 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         info.content_hash
     ))?;
     if !imported.skipped.is_empty() {
-        print_line(format!("left out {} damaged items:", imported.skipped.len()))?;
+        print_line(format!("left out {} damaged items:", imported.skipped_count()))?;
         for item in imported.skipped.iter().take(LISTED_ITEMS) {
             print_line(format!("  {}: {}", item.place, item.reason))?;
         }
         if imported.skipped.len() > LISTED_ITEMS {
             print_line(format!(
-                "  … all of them are in {}",
+                "  … more of them are in {}",
                 out.join("meta/skipped.json").display()
             ))?;
         }
@@ -202,12 +203,13 @@ impl From<ImportError> for CliError {
     fn from(error: ImportError) -> Self {
         let text = with_causes(&error);
         match error {
-            ImportError::Cancelled { .. } => Self::Interrupted(text),
+            ImportError::Cancelled { .. } | ImportError::Stopped => Self::Interrupted(text),
             ImportError::UnknownSource(_)
             | ImportError::Option(_)
             | ImportError::OptionValue { .. }
             | ImportError::Record { .. }
             | ImportError::Image { .. }
+            | ImportError::Disk { .. }
             | ImportError::Empty(_)
             | ImportError::OutExists { .. } => Self::Usage(text),
             ImportError::Dataset(error) => error.into(),

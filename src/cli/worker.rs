@@ -47,7 +47,8 @@ async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let versions = Versions::new(store.clone(), &server.models_dir);
     let pipeline = Pipeline::new(store.clone(), versions, server.job_threads)
         .with_memory(server.job_memory())
-        .with_import_dir(server.import_dir.clone());
+        .with_import_dir(server.import_dir.clone())
+        .with_import_disk(server.import_disk_mib);
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
     let (stopping, is_stopping) = watch::channel(false);

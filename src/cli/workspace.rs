@@ -32,6 +32,11 @@ impl Workspace {
         self.server().data_dir.join("datasets")
     }
 
+    /// Disk space for frames that an import decompresses, in MiB.
+    pub(super) fn import_disk_mib(&self) -> u64 {
+        self.server().import_disk_mib
+    }
+
     /// Reads a data set by its directory or its name.
     pub(super) fn open_dataset(&self, dataset: &Path) -> Result<(PathBuf, Dataset), CliError> {
         let dir = self.find_dataset(dataset)?;

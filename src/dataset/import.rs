@@ -11,6 +11,7 @@ mod lerobot;
 mod npz;
 mod numpy;
 mod recording;
+mod skipped;
 mod timing;
 mod video;
 mod writer;
@@ -24,14 +25,18 @@ use std::sync::atomic::AtomicBool;
 use serde::{Deserialize, Serialize};
 
 use self::recording::Recording;
+pub use self::skipped::SkippedItem;
+use self::skipped::{SkippedList, listed, shortened};
 use super::{DatasetError, DatasetInfo};
 use crate::frame::fit::Fit;
 use crate::frame::{FrameError, MAX_SIDE_PX};
 
 /// The largest [`ImportOptions::every`].
 const MAX_EVERY: usize = 1_000_000;
-/// The largest file that is read in one piece: an image, or a text that describes the recording.
+/// The largest file that is read in one piece, in bytes.
 const MAX_FILE_BYTES: u64 = 256 << 20;
+/// The largest text that describes a recording, in bytes.
+const MAX_TEXT_BYTES: u64 = 32 << 20;
 
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +47,12 @@ pub struct ImportConfig {
     pub out: PathBuf,
     /// How its records are read.
     pub options: ImportOptions,
+    /// Disk space for frames that are decompressed before they are imported, in MiB.
+    pub disk_mib: u64,
 }
+
+/// The default of [`ImportConfig::disk_mib`].
+pub const DEFAULT_DISK_MIB: u64 = 16 << 10;
 
 /// How a recording is read. All of it has defaults.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -96,22 +106,21 @@ impl Default for ImportOptions {
     }
 }
 
-/// Something in the recording that was left out.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SkippedItem {
-    /// File and line, frame or position.
-    pub place: String,
-    /// What was wrong.
-    pub reason: String,
-}
-
 /// What an import made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
     /// The data set.
     pub info: DatasetInfo,
-    /// What was left out.
+    /// What was left out. The last entry can stand for all that are not listed.
     pub skipped: Vec<SkippedItem>,
+}
+
+impl Imported {
+    /// How many items were left out.
+    #[must_use]
+    pub fn skipped_count(&self) -> u64 {
+        self.skipped.iter().map(|item| item.count).sum()
+    }
 }
 
 /// How many frames are written, of how many.
@@ -198,6 +207,20 @@ pub enum ImportError {
         /// Frames in all.
         total: u64,
     },
+    /// It was cancelled before the first frame.
+    #[error("stopped while the recording was read; the same command reads it again")]
+    Stopped,
+    /// The frames need more room beside the data set than they may have.
+    #[error(
+        "its frames need {needed_mib} MiB of disk space until they are imported, and may have {limit_mib} MiB (setting \
+         import_disk_mib); raise the setting, or save them without compression"
+    )]
+    Disk {
+        /// What they need.
+        needed_mib: u64,
+        /// What they may have.
+        limit_mib: u64,
+    },
     /// The data set could not be written.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
@@ -219,14 +242,11 @@ impl ImportError {
     /// The item to list when what is damaged is left out; `None` if it is no damage of a single item.
     fn skippable(&self) -> Option<SkippedItem> {
         match self {
-            Self::Record { place, reason } => Some(SkippedItem {
-                place: place.clone(),
-                reason: reason.clone(),
-            }),
-            Self::Image { place, path, source } => Some(SkippedItem {
-                place: place.clone(),
-                reason: format!("{} is damaged: {source}", path.display()),
-            }),
+            Self::Record { place, reason } => Some(SkippedItem::new(place, reason)),
+            Self::Image { place, path, source } => {
+                let reason = format!("{} is damaged: {source}", path.display());
+                Some(SkippedItem::new(place, &reason))
+            }
             _ => None,
         }
     }
@@ -310,11 +330,15 @@ fn open_file(path: &Path) -> Result<File, ImportError> {
 }
 
 fn read_file(path: &Path) -> Result<Vec<u8>, ImportError> {
+    read_at_most(path, MAX_FILE_BYTES)
+}
+
+fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, ImportError> {
     let mut bytes = Vec::new();
-    let mut file = open_file(path)?.take(MAX_FILE_BYTES + 1);
+    let mut file = open_file(path)?.take(most + 1);
     file.read_to_end(&mut bytes).map_err(ImportError::io("read", path))?;
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        let reason = format!("it has more than {} MiB", MAX_FILE_BYTES >> 20);
+    if bytes.len() as u64 > most {
+        let reason = format!("it has more than {} MiB", most >> 20);
         let error = std::io::Error::new(std::io::ErrorKind::InvalidData, reason);
         return Err(ImportError::io("read", path)(error));
     }
@@ -323,7 +347,7 @@ fn read_file(path: &Path) -> Result<Vec<u8>, ImportError> {
 
 fn read_text(path: &Path) -> Result<String, ImportError> {
     let invalid = |_| std::io::Error::new(std::io::ErrorKind::InvalidData, "it is not UTF-8 text");
-    String::from_utf8(read_file(path)?)
+    String::from_utf8(read_at_most(path, MAX_TEXT_BYTES)?)
         .map_err(invalid)
         .map_err(ImportError::io("read", path))
 }
@@ -338,7 +362,7 @@ fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, Impo
         return donkeycar::open(source, options);
     }
     if lerobot::is_lerobot(source) {
-        return lerobot::open(source, &config.out, options);
+        return lerobot::open(source, options, cancelled);
     }
     if bag::is_bag(source) {
         return bag::open(source, options, cancelled);
@@ -348,8 +372,8 @@ fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, Impo
     }
     match extension(source).as_str() {
         "npy" => numpy::open(source, options),
-        "npz" => npz::open(source, &config.out, options),
-        "mp4" | "mkv" | "avi" | "mov" | "webm" => video::open(source, &config.out, options),
+        "npz" => npz::open(config, cancelled),
+        "mp4" | "mkv" | "avi" | "mov" | "webm" => video::open(source, options, cancelled),
         _ => Err(ImportError::UnknownSource(source.clone())),
     }
 }
@@ -393,11 +417,11 @@ impl ImportOptions {
         let Some((name, _)) = named.find(|(name, _)| channels().all(|channel| channel.name != *name)) else {
             return Ok(());
         };
-        let known: Vec<&str> = channels().map(|channel| channel.name.as_str()).collect();
+        let known = listed(channels().map(|channel| channel.name.as_str()));
         Err(ImportError::Option(format!(
             "--unit names the channel \"{}\", which is not imported; there are: {}",
             name.escape_default(),
-            known.join(", ")
+            known
         )))
     }
 

@@ -39,6 +39,8 @@ pub struct JobProcess {
     pub models_dir: PathBuf,
     /// The directory that imports may read.
     pub import_dir: Option<PathBuf>,
+    /// Disk space for frames that an import decompresses, in MiB.
+    pub import_disk_mib: u64,
     /// How many threads a job uses.
     pub threads: usize,
     /// The memory of a job.
@@ -51,6 +53,7 @@ struct JobOrder {
     store: StoreConfig,
     models_dir: PathBuf,
     import_dir: Option<PathBuf>,
+    import_disk_mib: u64,
     threads: usize,
     memory: JobMemory,
     lease: Lease,
@@ -164,6 +167,7 @@ impl ChildExecutor {
             store: self.process.store.clone(),
             models_dir: self.process.models_dir.clone(),
             import_dir: self.process.import_dir.clone(),
+            import_disk_mib: self.process.import_disk_mib,
             threads: self.process.threads,
             memory: self.process.memory,
             lease,
@@ -259,6 +263,7 @@ fn work(
         Pipeline::new(store, versions, order.threads)
             .with_memory(order.memory)
             .with_import_dir(order.import_dir.clone())
+            .with_import_disk(order.import_disk_mib)
     });
     Ok(pool.install(|| pipeline.execute(&order.spec, report, cancelled)))
 }

@@ -20,6 +20,7 @@ use super::report::JobReporter;
 use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
+use crate::dataset::import::DEFAULT_DISK_MIB;
 use crate::dataset::{self, Dataset, DatasetError};
 use crate::error_text;
 use crate::evaluation::{self, EvaluateConfig, EvaluationError};
@@ -40,6 +41,7 @@ pub struct Pipeline {
     threads: usize,
     memory: JobMemory,
     import_dir: Option<PathBuf>,
+    import_disk_mib: u64,
     runtime: Handle,
 }
 
@@ -53,6 +55,7 @@ impl Pipeline {
             threads,
             memory: JobMemory::default(),
             import_dir: None,
+            import_disk_mib: DEFAULT_DISK_MIB,
             runtime: Handle::current(),
         }
     }
@@ -67,6 +70,15 @@ impl Pipeline {
     #[must_use]
     pub fn with_import_dir(self, import_dir: Option<PathBuf>) -> Self {
         Self { import_dir, ..self }
+    }
+
+    /// Refuses imports that decompress more frames than this, in MiB.
+    #[must_use]
+    pub fn with_import_disk(self, import_disk_mib: u64) -> Self {
+        Self {
+            import_disk_mib,
+            ..self
+        }
     }
 }
 

@@ -55,6 +55,8 @@ pub(super) struct ReportBuffer {
     measured_from: Option<(f64, u64)>,
     /// Units that are saved.
     checkpoint: u64,
+    /// How often something new was reported.
+    changes: u64,
 }
 
 impl ReportBuffer {
@@ -76,6 +78,10 @@ impl ReportBuffer {
         let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
         let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
         let rate = (gained > 0.0 && elapsed_s >= MIN_MEASURED_S).then(|| gained / elapsed_s);
+        let last = &self.stored.progress;
+        if (last.done, last.total, last.message.as_str()) != (done, total, message) {
+            self.changes += 1;
+        }
         self.stored.progress = JobProgress {
             done,
             total,
@@ -101,7 +107,13 @@ impl ReportBuffer {
 
     /// Sets how many units are saved.
     pub(super) fn checkpoint(&mut self, units: u64) {
+        self.changes += u64::from(units > self.checkpoint);
         self.checkpoint = self.checkpoint.max(units);
+    }
+
+    /// A number that grows whenever the job reports something new.
+    pub(super) fn changes(&self) -> u64 {
+        self.changes
     }
 
     /// How many units are saved, as far as this attempt knows.
@@ -111,11 +123,13 @@ impl ReportBuffer {
 
     /// Adds a line to the log.
     pub(super) fn line(&mut self, line: String, now_s: f64) {
+        self.changes += 1;
         push(&mut self.lines, (now_s, line));
     }
 
     /// Adds a point to the loss curves.
     pub(super) fn point(&mut self, point: LossRow) {
+        self.changes += 1;
         push(&mut self.points, point);
     }
 
@@ -173,6 +187,20 @@ mod tests {
         assert_eq!(buffer.stored().progress.rate_per_s, None);
         buffer.progress((520, 1000), "fit", 20.0);
         assert_eq!(buffer.stored().progress.rate_per_s, Some(2.0));
+    }
+
+    #[test]
+    fn a_repeated_report_is_no_progress() {
+        let mut buffer = ReportBuffer::default();
+        buffer.progress((1, 9), "fit", 1.0);
+        buffer.checkpoint(1);
+        let reported = buffer.changes();
+        buffer.progress((1, 9), "fit", 2.0);
+        buffer.checkpoint(1);
+        assert_eq!(buffer.changes(), reported);
+        buffer.progress((2, 9), "fit", 3.0);
+        buffer.line("a line".to_owned(), 4.0);
+        assert_eq!(buffer.changes(), reported + 2);
     }
 
     #[test]

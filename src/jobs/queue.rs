@@ -32,6 +32,8 @@ pub struct JobLimits {
     pub max_attempts: u32,
     /// How long one attempt can run.
     pub time_limit: Option<Duration>,
+    /// How long a running job may report no progress.
+    pub stall_limit: Option<Duration>,
     /// After this time without a sign of life from the runner, another runner can claim its job.
     pub lease: Duration,
 }

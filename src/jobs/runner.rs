@@ -120,6 +120,10 @@ struct JobRun<'a> {
     claimed_checkpoint: i64,
     /// When the time limit is reached.
     deadline: Option<Instant>,
+    /// The latest number of changes of the report, and when it was first seen.
+    latest_change: (u64, Instant),
+    /// Whether the work was stopped because it reported no progress.
+    has_stalled: bool,
 }
 
 /// Stops the work when its supervision ends, for whatever reason.
@@ -138,6 +142,8 @@ impl<'a> JobRun<'a> {
             stalled_attempts: row.stalled_attempts,
             claimed_checkpoint: row.checkpoint,
             deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
+            latest_change: (0, Instant::now()),
+            has_stalled: false,
             cancelled: Arc::new(AtomicBool::new(false)),
             cancel_requested: row.cancelling,
             lease_lost: false,
@@ -173,6 +179,12 @@ impl<'a> JobRun<'a> {
                     "the attempt reached the time limit of {limit_s} s (setting job_time_limit_s); a resumed job continues \
                      from its last checkpoint"
                 )))
+            }
+            Err(JobFailure::Cancelled) if !self.cancel_requested && self.has_stalled && !is_stopping => {
+                let limit_s = self.shared.limits.stall_limit.unwrap_or_default().as_secs();
+                self.check_attempts(Err(JobFailure::Crashed(format!(
+                    "the job reported no progress for {limit_s} s (setting job_stall_limit_s)"
+                ))))
             }
             result => self.check_attempts(result),
         };
@@ -218,6 +230,7 @@ impl<'a> JobRun<'a> {
                 _ = ticks.tick() => {
                     self.renew().await;
                     self.check_deadline();
+                    self.check_stall();
                 }
             }
         }
@@ -286,6 +299,19 @@ impl<'a> JobRun<'a> {
     /// Stops the work when the time limit is reached.
     fn check_deadline(&self) {
         if self.is_over_time() {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    /// Stops the work when it has reported no progress for too long.
+    fn check_stall(&mut self) {
+        let changes = self.report.buffer().map_or(0, |buffer| buffer.changes());
+        if changes != self.latest_change.0 {
+            self.latest_change = (changes, Instant::now());
+        }
+        let limit = self.shared.limits.stall_limit;
+        if limit.is_some_and(|limit| self.latest_change.1.elapsed() >= limit) {
+            self.has_stalled = true;
             self.cancelled.store(true, Ordering::Release);
         }
     }

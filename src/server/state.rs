@@ -126,7 +126,8 @@ impl App {
         let predictor = Predictor::start(models, config.predictor())?;
         let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_threads)
             .with_memory(config.job_memory())
-            .with_import_dir(config.import_dir.clone());
+            .with_import_dir(config.import_dir.clone())
+            .with_import_disk(config.import_disk_mib);
         let executor = child::executor(pipeline, config.job_process());
         let jobs = Jobs::start(store.clone(), config.jobs(), executor, !config.no_jobs)?;
         let app = Self::with_parts(

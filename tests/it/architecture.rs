@@ -116,7 +116,7 @@ const USED_IN: &[(&str, &[&str])] = &[
     ("object_store", &["store"]),
     ("rapier3d", &["sim"]),
     ("parquet", &["dataset"]),
-    ("rustix", &["jobs"]),
+    ("rustix", &["dataset", "jobs"]),
 ];
 
 fn sources() -> Vec<(String, String)> {

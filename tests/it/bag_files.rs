@@ -181,6 +181,22 @@ fn chunk(records: &[u8], chunks: Chunks) -> Vec<u8> {
     record(6, &parts)
 }
 
+/// An MCAP file with the descriptions of many topics before everything else.
+pub(crate) fn endless_topics(mcap: &[u8], count: u32) -> Vec<u8> {
+    let (magic, rest) = mcap.split_at(8);
+    let mut file = magic.to_vec();
+    for number in 0..count {
+        let names = [text(&format!("/topic/{number}")), text("cdr")].concat();
+        // They share an identifier that the bag's own topics do not use.
+        file.extend(record(
+            4,
+            &[&60_000u16.to_le_bytes(), &0u16.to_le_bytes(), &names, &[0; 4]],
+        ));
+    }
+    file.extend(rest);
+    file
+}
+
 /// An MCAP file with chunks of `per_chunk` messages.
 pub(crate) fn mcap(messages: &[BagMessage], chunks: Chunks, per_chunk: usize) -> Vec<u8> {
     let mut file = b"\x89MCAP0\r\n".to_vec();

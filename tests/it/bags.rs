@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use foreframe::dataset::Dataset;
-use foreframe::dataset::import::{ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 use foreframe::error_text::with_causes;
 use foreframe::frame::{Frame, codec};
 
@@ -31,6 +31,7 @@ fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, Im
         source: source.to_owned(),
         out: out.to_owned(),
         options,
+        disk_mib: DEFAULT_DISK_MIB,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }
@@ -226,6 +227,7 @@ fn a_stopped_import_of_a_bag_continues_to_the_same_bytes() {
             source: source.clone(),
             out: dir.path().join(format!("stopped-{stop_after}")),
             options: options(),
+            disk_mib: DEFAULT_DISK_MIB,
         };
         let cancelled = AtomicBool::new(false);
         let stop = |now: foreframe::dataset::import::ImportProgress| {

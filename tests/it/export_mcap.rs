@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use foreframe::dataset::export::{ACTION_TOPIC, STATE_TOPIC, to_mcap};
-use foreframe::dataset::import::{ImportConfig, ImportOptions, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
 use foreframe::dataset::{Dataset, DatasetInfo, Episode, EpisodeData};
 use foreframe::frame::warp::CameraModel;
 use foreframe::types::Channel;
@@ -51,6 +51,7 @@ fn exported_and_imported(dataset: &Dataset, dir: &Path) -> Dataset {
             states: vec![STATE_TOPIC.to_owned()],
             ..ImportOptions::default()
         },
+        disk_mib: DEFAULT_DISK_MIB,
     };
     let imported = import(&config, &|_| {}, &AtomicBool::new(false)).unwrap();
     assert_eq!(imported.skipped, []);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use foreframe::dataset::Dataset;
-use foreframe::dataset::import::{ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 use foreframe::frame::{Frame, codec};
 use serde_json::json;
 
@@ -16,6 +16,7 @@ pub(crate) fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<I
         source: source.to_owned(),
         out: out.to_owned(),
         options,
+        disk_mib: DEFAULT_DISK_MIB,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }
@@ -254,6 +255,7 @@ fn a_stopped_import_continues_to_the_same_bytes() {
             source: source.clone(),
             out: dir.path().join(format!("stopped-{stop_after}")),
             options: options.clone(),
+            disk_mib: DEFAULT_DISK_MIB,
         };
         let (cancelled, most) = (AtomicBool::new(false), AtomicU64::new(0));
         let stopped = import(

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::import::{ImportConfig, ImportOptions, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
 use foreframe::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, collect};
 use foreframe::inspection::{FramePlace, FrozenSpan, Inspection, MotionSignal, inspect, page};
 use foreframe::sim::{Scenario, WorldConfig};
@@ -151,6 +151,7 @@ fn steering_of_a_real_car_moves_the_image_later() {
         source,
         out: out.clone(),
         options: ImportOptions::default(),
+        disk_mib: DEFAULT_DISK_MIB,
     };
     import(&config, &|_| {}, &AtomicBool::new(false)).unwrap();
     let inspection = inspect(&Dataset::open(&out).unwrap()).unwrap();

@@ -91,6 +91,27 @@ fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
 }
 
 #[test]
+fn a_job_without_progress_is_stopped() {
+    let dir = tempfile::tempdir().unwrap();
+    let limits = ["--set", "job_stall_limit_s=1", "--set", "job_max_attempts=1"];
+    let served = RunningServer::start(dir.path(), &limits);
+    served.ask("POST", JOBS, &collect("seen", 1_000_000));
+    let child = child_of(&served, 1);
+    let stopped = std::process::Command::new("kill")
+        .args(["-STOP", &child.to_string()])
+        .status();
+    assert!(stopped.unwrap().success());
+    let job = served.ended_job("job-1");
+    assert_eq!(job["state"], "failed", "{job}");
+    let error = job["error"].as_str().unwrap();
+    assert!(
+        error.contains("reported no progress for 1 s (setting job_stall_limit_s)"),
+        "{error}"
+    );
+    assert!(!is_alive(child));
+}
+
+#[test]
 fn a_job_ends_with_the_server_that_is_killed() {
     let dir = tempfile::tempdir().unwrap();
     let served = RunningServer::start(dir.path(), &[]);

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use foreframe::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
-use foreframe::dataset::import::{ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 use foreframe::dataset::{CollectConfig, Dataset, DatasetError, collect};
 use foreframe::sim::{Scenario, WorldConfig};
 use foreframe::types::Seed;
@@ -24,6 +24,7 @@ fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, Im
             frame_height_px: SIDE,
             ..options
         },
+        disk_mib: DEFAULT_DISK_MIB,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use foreframe::dataset::import::{ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 use foreframe::error_text::with_causes;
 use proptest::prelude::*;
 use proptest::sample::Index;
@@ -46,6 +46,7 @@ fn in_time(name: &str, dir: &Path, skip_bad: bool) -> Result<Imported, ImportErr
             skip_bad,
             ..ImportOptions::default()
         },
+        disk_mib: DEFAULT_DISK_MIB,
     };
     let (sender, receiver) = mpsc::channel();
     std::thread::spawn(move || sender.send(import(&config, &|_| {}, &AtomicBool::new(false))));

@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
+use super::super::program::{ProgramError, spawn};
 use super::super::{Dataset, DatasetError};
 
 /// Writes frames, counted over the whole data set, as an MP4 file; one frame takes the data set's frame period.
@@ -40,12 +41,12 @@ fn start(dataset: &Dataset, path: &Path) -> Result<Child, DatasetError> {
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .stderr(Stdio::piped());
-    command.spawn().map_err(|error| {
-        DatasetError::Program(match error.kind() {
-            std::io::ErrorKind::NotFound => {
+    spawn(&mut command).map_err(|error| {
+        DatasetError::Program(match error {
+            ProgramError::Missing => {
                 "ffmpeg is not installed; it writes videos (Debian: apt-get install ffmpeg)".to_owned()
             }
-            _ => format!("ffmpeg could not be started: {error}"),
+            _ => format!("ffmpeg: {error}"),
         })
     })
 }

@@ -82,7 +82,7 @@ impl BagFile {
     }
 }
 
-/// Reads everything of a bag but its pixels. Errors: `Option`, `Io`, `Record`, `Cancelled`.
+/// Reads everything of a bag but its pixels. Errors: `Option`, `Io`, `Record`, `Stopped`.
 pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     let mut collector = Collector::new(source, options, cancelled);
     let paths = rosbag2::files(source)?;
@@ -99,11 +99,11 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
         let faults = std::mem::take(&mut collector.topics[topic].faults);
         match faults.first().filter(|_| !options.skip_bad) {
             Some(fault) => return Err(ImportError::record(&fault.place, &fault.reason)),
-            None => skipped.extend(faults),
+            None => skipped.append(faults),
         }
     }
     let joined = join::join(&collector, &chosen)?;
-    skipped.extend(joined.skipped);
+    skipped.append(joined.skipped);
     let topic = &collector.topics[chosen.image];
     let positions = match &topic.content {
         Content::Images(entries) => joined

@@ -1,19 +1,24 @@
 //! Donkeycar tubs, version 2: `manifest.json`, `catalog_*.catalog` and `images/`.
 
 use std::collections::BTreeSet;
-use std::io::{BufRead as _, BufReader};
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 
 use super::images::inside;
 use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, open_file, read_text};
+use super::{ImportError, ImportOptions, SkippedList, listed, open_file, read_text, shortened};
 use crate::types::Channel;
 
 const MANIFEST: &str = "manifest.json";
 /// Lines of the manifest: input names, input types, metadata, times, catalogs.
 const MANIFEST_LINES: usize = 5;
+
+/// The longest line of a catalog, in bytes.
+const MAX_LINE_BYTES: u64 = 1 << 20;
+/// How much of a wrong value a message quotes, in bytes.
+const QUOTED_BYTES: usize = 60;
 
 /// Whether a directory is a tub.
 pub(super) fn is_tub(source: &Path) -> bool {
@@ -72,14 +77,10 @@ impl TubManifest {
     }
 
     fn missing(&self, what: &str, option: &str) -> ImportError {
-        let known: Vec<String> = self
-            .inputs
-            .iter()
-            .map(|(name, kind)| format!("{name} ({kind})"))
-            .collect();
+        let known = self.inputs.iter().map(|(name, kind)| format!("{name} ({kind})"));
         ImportError::Option(format!(
             "the tub has no {what} ({option}); its inputs are: {}",
-            known.join(", ")
+            listed(known)
         ))
     }
 
@@ -133,16 +134,18 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
         camera: None,
         records: Vec::new(),
         images: Images::Files(Vec::new()),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
     };
     let mut paths = Vec::new();
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
         let file = open_file(&path)?;
-        for (row, line) in BufReader::new(file).lines().enumerate() {
-            let place = format!("{} line {}", path.display(), row + 1);
+        let (mut lines, mut row) = (BufReader::new(file), 0);
+        while let Some(line) = next_line(&mut lines).map_err(ImportError::io("read", &path))? {
+            row += 1;
+            let place = format!("{} line {row}", path.display());
             let parsed = line
-                .map_err(|error| ImportError::record(&place, error.to_string()))
+                .map_err(|reason| ImportError::record(&place, reason))
                 .and_then(|line| reader.record(&line, &place));
             match parsed {
                 Ok((index, _, _)) if manifest.deleted.contains(&index) => {}
@@ -164,6 +167,19 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
     Ok(recording)
 }
 
+/// The next line, or why it cannot be read; `None` at the end.
+fn next_line(lines: &mut impl BufRead) -> std::io::Result<Option<Result<String, String>>> {
+    let mut line = Vec::new();
+    if std::io::Read::take(&mut *lines, MAX_LINE_BYTES + 1).read_until(b'\n', &mut line)? == 0 {
+        return Ok(None);
+    }
+    if line.pop_if(|last| *last == b'\n').is_none() && line.len() as u64 > MAX_LINE_BYTES {
+        lines.skip_until(b'\n')?;
+        return Ok(Some(Err(format!("the line has more than {MAX_LINE_BYTES} bytes"))));
+    }
+    Ok(Some(String::from_utf8(line).map_err(|error| error.to_string())))
+}
+
 struct Reader<'a> {
     tub: &'a Path,
     image: String,
@@ -178,6 +194,7 @@ impl Reader<'_> {
             .map_err(|error| ImportError::record(place, format!("not a JSON object: {error}")))?;
         let wrong = |field: &str, right: &str| {
             let found = fields.get(field).map_or_else(|| "missing".to_owned(), Value::to_string);
+            let found = shortened(&found, QUOTED_BYTES);
             ImportError::record(place, format!("{field:?} is {found}; it must be {right}"))
         };
         let index = fields.get("_index").and_then(Value::as_u64);

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, extension, open_file};
+use super::{ImportError, ImportOptions, SkippedList, extension, listed, open_file};
 use crate::files::natural_order;
 use crate::types::Channel;
 
@@ -25,7 +25,7 @@ const TIME_COLUMNS: [(&str, f64); 8] = [
 /// What can separate the columns of a CSV file.
 const SEPARATORS: [u8; 3] = *b",;\t";
 /// The largest CSV file.
-const MAX_CSV_BYTES: u64 = 1 << 30;
+const MAX_CSV_BYTES: u64 = 256 << 20;
 
 /// Reads the records of a folder. Errors: `Option`, `Io`, `Record`.
 pub(super) fn open(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
@@ -98,7 +98,7 @@ fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, Impo
         camera: None,
         records: paths.iter().enumerate().map(record).collect(),
         images: Images::Files(paths),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
     })
 }
 
@@ -120,7 +120,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         camera: None,
         records: Vec::new(),
         images: Images::Files(Vec::new()),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
     };
     let mut paths = Vec::new();
     let mut lines = reader.records();
@@ -241,19 +241,13 @@ fn channels(header: &[String], columns: &[usize], options: &ImportOptions) -> Ve
 
 impl Columns {
     fn find(header: &[String], csv: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
-        let listed = || {
-            header
-                .iter()
-                .map(|name| name.escape_debug().to_string())
-                .collect::<Vec<_>>()
-                .join(", ")
-        };
+        let columns = || listed(header.iter().map(|name| name.escape_debug().to_string()));
         let position = |name: &str| position(header, name);
         let missing = |name: &str, option: &str| {
             ImportError::Option(format!(
                 "{} has no column \"{name}\" ({option}); its columns are: {}",
                 csv.display(),
-                listed()
+                columns()
             ))
         };
         let wanted = |names: &[String], option: &str| -> Result<Vec<usize>, ImportError> {
@@ -287,7 +281,7 @@ impl Columns {
             return Err(ImportError::Option(format!(
                 "{} has no column of times (its columns are: {}); name it with --time, or give --rate",
                 csv.display(),
-                listed()
+                columns()
             )));
         }
         let (mut actions, mut states) = (

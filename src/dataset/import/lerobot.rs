@@ -6,13 +6,14 @@ mod rows;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 use self::description::{Description, EpisodeEntry, VideoPart};
-pub(super) use self::images::LerobotImages;
-use self::images::{ImageTable, VideoFiles};
+pub(super) use self::images::ImageTable;
 use self::rows::{Row, read_rows};
 use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, SkippedItem, video};
+use super::video::{VideoFrames, packet_times};
+use super::{ImportError, ImportOptions, SkippedList};
 use crate::types::Channel;
 
 /// The description, which every data set of `LeRobot` has.
@@ -23,8 +24,8 @@ pub(super) fn is_lerobot(source: &Path) -> bool {
     source.join(INFO).is_file()
 }
 
-/// Reads the records of a data set. Errors: `Option`, `Io`, `Record`, `Program`.
-pub(super) fn open(source: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+/// Reads the records of a data set. Errors: `Option`, `Io`, `Record`, `Program`, `Stopped`.
+pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     let description = Description::read(source)?;
     let image = description.image(options)?;
     let actions = description.components(&options.actions, "action", "--action")?;
@@ -37,9 +38,10 @@ pub(super) fn open(source: &Path, out: &Path, options: &ImportOptions) -> Result
         is_video: image.is_video,
         action_count: actions.len(),
         records: Vec::new(),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
         places: Vec::new(),
         videos: VideoTimes::default(),
+        cancelled,
     };
     let mut tables: Vec<PathBuf> = Vec::new();
     for of_table in episodes.chunk_by(|a, b| a.table == b.table) {
@@ -51,9 +53,9 @@ pub(super) fn open(source: &Path, out: &Path, options: &ImportOptions) -> Result
     }
     let channel = |component: &description::Component| Channel::new(&component.name, &options.unit(&component.name));
     let images = if image.is_video {
-        LerobotImages::Videos(VideoFiles::new(out, reader.videos.paths(), reader.places))
+        Images::Videos(VideoFrames::new(reader.videos.paths(), reader.places))
     } else {
-        LerobotImages::Tables(ImageTable::new(source, &image.name, tables, reader.places))
+        Images::Table(ImageTable::new(source, &image.name, tables, reader.places))
     };
     Ok(Recording {
         name: source
@@ -65,7 +67,7 @@ pub(super) fn open(source: &Path, out: &Path, options: &ImportOptions) -> Result
         state_channels: states.iter().map(channel).collect(),
         camera: None,
         records: reader.records,
-        images: Images::Lerobot(images),
+        images,
         skipped: reader.skipped,
     })
 }
@@ -79,14 +81,14 @@ struct VideoTimes {
 
 impl VideoTimes {
     /// The video's number.
-    fn probe(&mut self, path: &Path) -> Result<usize, ImportError> {
+    fn probe(&mut self, path: &Path, cancelled: &AtomicBool) -> Result<usize, ImportError> {
         if let Some(&number) = self.by_path.get(path) {
             return Ok(number);
         }
         if !path.is_file() {
             return Err(ImportError::record(path.display().to_string(), "the video is missing"));
         }
-        let times_s = video::packet_times(path)?;
+        let times_s = packet_times(path, cancelled)?;
         self.files.push((path.to_owned(), times_s));
         self.by_path.insert(path.to_owned(), self.files.len() - 1);
         Ok(self.files.len() - 1)
@@ -130,10 +132,11 @@ struct RecordCollector<'a> {
     is_video: bool,
     action_count: usize,
     records: Vec<Record>,
-    skipped: Vec<SkippedItem>,
+    skipped: SkippedList,
     /// Where each image is: table or video, and row or frame.
     places: Vec<(usize, usize)>,
     videos: VideoTimes,
+    cancelled: &'a AtomicBool,
 }
 
 impl RecordCollector<'_> {
@@ -175,7 +178,9 @@ impl RecordCollector<'_> {
         episode: &EpisodeEntry,
     ) -> Result<(), ImportError> {
         let video = match &episode.video {
-            Some(part) if self.is_video => Some((self.videos.probe(&self.source.join(&part.path))?, part)),
+            Some(part) if self.is_video => {
+                Some((self.videos.probe(&self.source.join(&part.path), self.cancelled)?, part))
+            }
             _ => None,
         };
         for &(index, row) in rows {

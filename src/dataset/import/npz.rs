@@ -2,16 +2,18 @@
 //! their names.
 
 use std::fs::File;
-use std::io::Read as _;
+use std::io::{Read, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use zip::result::ZipError;
 use zip::{CompressionMethod, ZipArchive};
 
 use super::numpy::{ArrayHeader, FrameLayout};
-use super::recording::{DECODED, Images, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions, open_file};
+use super::recording::{Images, RawImages, Record, Recording};
+use super::{ImportConfig, ImportError, ImportOptions, SkippedList, listed, open_file};
+use crate::files::partial_path;
 use crate::types::Channel;
 
 /// Names of the arrays if none are given.
@@ -34,8 +36,13 @@ const MAX_COMPRESSION: u64 = 1033;
 /// Actions, states and times are in memory as a whole.
 const MAX_VALUES_BYTES: u64 = 1 << 30;
 
-/// Reads all arrays but the frames. Compressed frames are decompressed beside the data set. Errors: `Option`, `Io`, `Record`.
-pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+/// Bytes that are decompressed between two looks at the cancel flag.
+const PIECE_BYTES: u64 = 1 << 20;
+
+/// Reads all arrays but the frames. Compressed frames are decompressed beside the data set. Errors: `Option`, `Io`, `Record`,
+/// `Disk`, `Stopped`.
+pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
+    let (path, options) = (config.source.as_path(), &config.options);
     let mut npz = Npz::open(path)?;
     let frames = npz.frames(options)?;
     let header = npz.header(&frames)?;
@@ -66,7 +73,7 @@ pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<R
             order.push(at as u64);
         }
     }
-    let (pixels, start) = npz.pixels(&frames, &header, out)?;
+    let (pixels, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
     let frame_bytes = layout.frame_bytes();
     Ok(Recording {
         name: path
@@ -77,14 +84,14 @@ pub(super) fn open(path: &Path, out: &Path, options: &ImportOptions) -> Result<R
         camera: None,
         records,
         images: Images::Raw(RawImages {
-            file: Mutex::new(File::open(&pixels).map_err(ImportError::io("read", &pixels))?),
+            file: Mutex::new(file),
             path: pixels,
             width_px: layout.width as u32,
             height_px: layout.height as u32,
             offsets: order.iter().map(|at| start + at * frame_bytes).collect(),
             pixel: layout.pixel,
         }),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
     })
 }
 
@@ -167,7 +174,7 @@ impl Npz {
         ImportError::Option(format!(
             "{} has no {what} ({option}); its arrays are: {}",
             self.path.display(),
-            self.names.join(", ")
+            listed(&self.names)
         ))
     }
 
@@ -291,8 +298,14 @@ impl Npz {
         }
     }
 
-    /// The file with the frames' values, and where they begin in it. Errors: `Record`, `Io`.
-    fn pixels(&mut self, name: &str, header: &ArrayHeader, out: &Path) -> Result<(PathBuf, u64), ImportError> {
+    /// The file with the frames' values, its name, and where they begin in it. Errors: `Record`, `Io`, `Disk`, `Stopped`.
+    fn pixels(
+        &mut self,
+        name: &str,
+        header: &ArrayHeader,
+        config: &ImportConfig,
+        cancelled: &AtomicBool,
+    ) -> Result<(PathBuf, File, u64), ImportError> {
         let place = self.place(name);
         let entry = self.archive.by_name(&format!("{name}.npy"));
         let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
@@ -300,12 +313,43 @@ impl Npz {
         if entry.compression() == CompressionMethod::Stored
             && let Some(start) = entry.data_start()
         {
-            return Ok((self.path.clone(), start + header.data_offset));
+            let file = File::open(&self.path).map_err(ImportError::io("read", &self.path))?;
+            return Ok((self.path.clone(), file, start + header.data_offset));
         }
-        let decoded = out.join(DECODED);
-        let mut file = File::create(&decoded).map_err(ImportError::io("write", &decoded))?;
-        std::io::copy(&mut entry.take(needed), &mut file)
-            .map_err(|error| ImportError::record(place, format!("it cannot be decompressed: {error}")))?;
-        Ok((decoded, header.data_offset))
+        let needed_mib = needed.div_ceil(1 << 20);
+        if needed_mib > config.disk_mib {
+            return Err(ImportError::Disk {
+                needed_mib,
+                limit_mib: config.disk_mib,
+            });
+        }
+        let (decoded, mut file) = temporary_file(&config.out)?;
+        let mut rest = entry.take(needed);
+        let mut piece = Vec::new();
+        loop {
+            if cancelled.load(Ordering::Relaxed) {
+                return Err(ImportError::Stopped);
+            }
+            piece.clear();
+            let read = rest.by_ref().take(PIECE_BYTES).read_to_end(&mut piece);
+            let read = read.map_err(|error| ImportError::record(&place, format!("it cannot be decompressed: {error}")));
+            if read? == 0 {
+                return Ok((decoded, file, header.data_offset));
+            }
+            file.write_all(&piece).map_err(ImportError::io("write", &decoded))?;
+        }
     }
+}
+
+/// A new file in a directory, which only this process uses and the system removes with it. Where an open file cannot be removed, it
+/// stays as a partial file, which the end of the import or its next run removes. Errors: `Io`.
+fn temporary_file(directory: &Path) -> Result<(PathBuf, File), ImportError> {
+    let failed = ImportError::io("write", directory);
+    let path = partial_path(&directory.join("frames"));
+    let created = path.and_then(|path| {
+        let file = File::options().read(true).write(true).create_new(true).open(&path)?;
+        let _ = std::fs::remove_file(&path);
+        Ok((path, file))
+    });
+    created.map_err(failed)
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use super::recording::{Images, PixelType, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions, open_file};
+use super::{ImportError, ImportOptions, SkippedList, open_file};
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// A header is a short Python dictionary.
@@ -101,7 +101,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
             offsets,
             pixel: layout.pixel,
         }),
-        skipped: Vec::new(),
+        skipped: SkippedList::default(),
     })
 }
 

@@ -4,10 +4,14 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::PoisonError;
+use std::sync::atomic::AtomicBool;
+
+use rayon::prelude::*;
 
 use super::bag::BagImages;
-use super::lerobot::LerobotImages;
-use super::{ImportError, SkippedItem, read_file};
+use super::lerobot::ImageTable;
+use super::video::VideoFrames;
+use super::{ImportError, SkippedList, read_file};
 use crate::files::may_pass;
 use crate::frame::warp::CameraModel;
 use crate::frame::{Frame, codec};
@@ -36,7 +40,7 @@ pub(super) struct Recording {
     pub(super) camera: Option<CameraModel>,
     pub(super) records: Vec<Record>,
     pub(super) images: Images,
-    pub(super) skipped: Vec<SkippedItem>,
+    pub(super) skipped: SkippedList,
 }
 
 /// Where the images are.
@@ -45,11 +49,23 @@ pub(super) enum Images {
     Files(Vec<PathBuf>),
     /// Gray frames of one size in one file, from an offset on.
     Raw(RawImages),
-    /// Columns or videos of a data set of `LeRobot`.
-    Lerobot(LerobotImages),
+    /// A column of the tables of a `LeRobot` data set.
+    Table(ImageTable),
+    /// Frames of videos.
+    Videos(VideoFrames),
     /// Messages of a bag.
     Bag(BagImages),
 }
+
+/// An image that is needed next.
+pub(super) struct WantedImage<'a> {
+    pub(super) image: usize,
+    /// File and line, frame or position, for messages.
+    pub(super) place: &'a str,
+}
+
+/// Resizes an image; the second argument is its place.
+pub(super) type FitImage<'a> = &'a (dyn Fn(&Frame, &str) -> Result<Frame, ImportError> + Sync);
 
 /// Gray frames of one size in a file. A frame can lie in one piece or, for a `NumPy` array of another layout, at any stride.
 pub(super) struct RawImages {
@@ -61,9 +77,6 @@ pub(super) struct RawImages {
     pub(super) offsets: Vec<u64>,
     pub(super) pixel: PixelType,
 }
-
-/// The decoded frames of some sources, beside the data set; removed when it is complete.
-pub(super) const DECODED: &str = "decoded.gray.tmp";
 
 /// How a pixel is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,23 +102,34 @@ impl PixelType {
 }
 
 impl Images {
-    /// Decodes an image as gray. Errors: `Image`, `Io`, `Record`.
-    pub(super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+    /// Decodes images as gray and passes each to `fit`, in parallel. They are wanted in the order of the recording. Errors, for each
+    /// image: `Image`, `Io`, `Record`, `Program`, `Stopped`, and those of `fit`.
+    pub(super) fn read_all(
+        &self,
+        wanted: &[WantedImage<'_>],
+        fit: FitImage<'_>,
+        cancelled: &AtomicBool,
+    ) -> Vec<Result<Frame, ImportError>> {
+        let in_parallel = |read: &(dyn Fn(&WantedImage<'_>) -> Result<Frame, ImportError> + Sync)| {
+            let fitted = |wanted: &WantedImage<'_>| fit(&read(wanted)?, wanted.place);
+            wanted.par_iter().map(fitted).collect()
+        };
         match self {
-            Self::Files(paths) => {
-                let path = &paths[image];
-                let bytes = read_image(path, place)?;
-                codec::decode(&bytes).map_err(|source| ImportError::Image {
-                    place: place.to_owned(),
-                    path: path.clone(),
-                    source,
-                })
-            }
-            Self::Raw(raw) => raw.read(image, place),
-            Self::Lerobot(images) => images.read(image, place),
-            Self::Bag(bag) => bag.read(image, place),
+            Self::Files(paths) => in_parallel(&|wanted| decode_file(&paths[wanted.image], wanted.place)),
+            Self::Raw(raw) => in_parallel(&|wanted| raw.read(wanted.image, wanted.place)),
+            Self::Table(table) => in_parallel(&|wanted| table.read(wanted.image, wanted.place)),
+            Self::Bag(bag) => in_parallel(&|wanted| bag.read(wanted.image, wanted.place)),
+            Self::Videos(videos) => videos.read_all(wanted, fit, cancelled),
         }
     }
+}
+
+fn decode_file(path: &Path, place: &str) -> Result<Frame, ImportError> {
+    codec::decode(&read_image(path, place)?).map_err(|source| ImportError::Image {
+        place: place.to_owned(),
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// The bytes of an image file. Errors: `Record` if it is missing or cannot be read, `Io` where trying again may help.

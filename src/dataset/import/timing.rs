@@ -121,13 +121,11 @@ fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Re
             continue;
         };
         if options.skip_bad && record.timestamp_s < last.timestamp_s && fits_after(kept.iter().rev().nth(1), &record) {
-            recording.skipped.push(SkippedItem {
-                place: last.place.clone(),
-                reason: format!(
-                    "its time {} s is not before the one after, {} s",
-                    last.timestamp_s, record.timestamp_s
-                ),
-            });
+            let reason = format!(
+                "its time {} s is not before the one after, {} s",
+                last.timestamp_s, record.timestamp_s
+            );
+            recording.skipped.push(SkippedItem::new(&last.place, &reason));
             kept.pop();
             kept.push(record);
             continue;
@@ -243,6 +241,7 @@ fn mean_action(records: &[Record]) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::SkippedList;
     use super::super::recording::Images;
     use super::*;
     use crate::types::Channel;
@@ -263,7 +262,7 @@ mod tests {
             camera: None,
             records: times_s.iter().enumerate().map(record).collect(),
             images: Images::Files(Vec::new()),
-            skipped: Vec::new(),
+            skipped: SkippedList::default(),
         }
     }
 
@@ -317,7 +316,7 @@ mod tests {
             ..ImportOptions::default()
         };
         let plan = plan(recording(&times), &options).unwrap();
-        assert_eq!((plan.recording.skipped.len(), plan.episodes[0].len()), (1, 4));
+        assert_eq!((plan.recording.skipped.items().len(), plan.episodes[0].len()), (1, 4));
     }
 
     #[test]

@@ -1,39 +1,33 @@
-//! Video files, decoded by the programs `ffmpeg` and `ffprobe`.
+//! Video files, decoded by the programs `ffmpeg` and `ffprobe`. Frames are decoded when they are needed, one after the other;
+//! none is written to a file.
 
-use std::fs::File;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::sync::Mutex;
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+use std::sync::{Mutex, PoisonError};
 
-use serde_json::Value;
+use rayon::prelude::*;
 
-use super::recording::{DECODED, Images, PixelType, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions};
+use super::recording::{FitImage, Images, Record, Recording, WantedImage};
+use super::{ImportError, ImportOptions, SkippedList};
+use crate::dataset::program::{ProgramError, ProgramOutput};
+use crate::frame::{Frame, MAX_SIDE_PX};
 
-/// The containers that are read. Without such a list, ffmpeg takes a playlist for a video, and reads the files that it names.
-const CONTAINERS: [&str; 4] = ["-format_whitelist", "mov,matroska,avi", "-protocol_whitelist", "file"];
+/// The containers and protocols that are read. Without such lists, ffmpeg takes a playlist for a video, and reads the files that it
+/// names.
+const ALLOWED: [&str; 4] = ["-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi"];
+/// Frames that are decoded before they are resized together.
+const DECODED_FRAMES: usize = 8;
 
-/// Decodes a video into a file of gray frames and lists them with their times. Errors: `Program`, `Io`, `Record`.
-pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+/// Lists the frames of a video with their times. Errors: `Option`, `Program`, `Record`, `Stopped`.
+pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     if options.csv.is_some() || !options.actions.is_empty() || !options.states.is_empty() {
         return Err(ImportError::Option(
             "actions and states cannot be joined to a video yet; extract its frames to a folder and give a CSV with --csv"
                 .to_owned(),
         ));
     }
-    let (width_px, height_px) = frame_size(video)?;
-    let times_s = frame_times(video)?;
-    let decoded = out.join(DECODED);
-    decode(video, &decoded)?;
-    let file = File::open(&decoded).map_err(ImportError::io("read", &decoded))?;
-    let frame_bytes = u64::from(width_px) * u64::from(height_px);
-    let frames = file.metadata().map_err(ImportError::io("read", &decoded))?.len() / frame_bytes.max(1);
-    if frames != times_s.len() as u64 {
-        return Err(ImportError::record(
-            format!("{} frame {frames}", video.display()),
-            format!("the video ends here; it announces {} frames", times_s.len()),
-        ));
-    }
+    let times_s = frame_times(video, cancelled)?;
     let record = |(index, &timestamp_s): (usize, &f64)| Record {
         timestamp_s,
         session: String::new(),
@@ -50,107 +44,73 @@ pub(super) fn open(video: &Path, out: &Path, options: &ImportOptions) -> Result<
         state_channels: Vec::new(),
         camera: None,
         records: times_s.iter().enumerate().map(record).collect(),
-        images: Images::Raw(RawImages {
-            path: decoded,
-            file: Mutex::new(file),
-            width_px,
-            height_px,
-            offsets: (0..frames).map(|frame| frame * frame_bytes).collect(),
-            pixel: PixelType::U8,
-        }),
-        skipped: Vec::new(),
+        images: Images::Videos(VideoFrames::new(
+            vec![(video.to_owned(), times_s.len())],
+            (0..times_s.len()).map(|frame| (0, frame)).collect(),
+        )),
+        skipped: SkippedList::default(),
     })
 }
 
-/// The file for the decoded frames of one of many videos.
-pub(super) fn decoded_path(out: &Path, number: usize) -> PathBuf {
-    out.join(format!("{number}-{DECODED}"))
-}
-
-/// Removes the decoded frames of a finished import.
-pub(super) fn clean_up(out: &Path) {
-    for entry in std::fs::read_dir(out).into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().ends_with(DECODED) {
-            // Nothing is lost if the file stays.
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
-}
-
-/// Width and height of the first video stream.
-pub(super) fn frame_size(video: &Path) -> Result<(u32, u32), ImportError> {
-    let found = probe(video, "stream=width,height")?;
-    let stream = &found["streams"][0];
-    let side = |name: &str| stream[name].as_u64().and_then(|side| u32::try_from(side).ok());
-    side("width")
-        .zip(side("height"))
-        .ok_or_else(|| ImportError::record(video.display().to_string(), "it holds no video stream"))
-}
-
 /// The presentation time of every frame, in seconds.
-fn frame_times(video: &Path) -> Result<Vec<f64>, ImportError> {
-    let found = probe(video, "frame=pts_time,best_effort_timestamp_time")?;
-    let frames = found["frames"].as_array().map(Vec::as_slice).unwrap_or_default();
-    let time = |(index, frame): (usize, &Value)| {
-        let text = frame["pts_time"]
-            .as_str()
-            .or(frame["best_effort_timestamp_time"].as_str());
-        text.and_then(|text| text.parse().ok())
-            .ok_or_else(|| ImportError::record(format!("{} frame {index}", video.display()), "the frame has no time"))
-    };
-    frames.iter().enumerate().map(time).collect()
+fn frame_times(video: &Path, cancelled: &AtomicBool) -> Result<Vec<f64>, ImportError> {
+    let mut times_s = Vec::new();
+    probe(
+        video,
+        "frame=pts_time,best_effort_timestamp_time",
+        cancelled,
+        |fields| {
+            let time = number(fields, "pts_time").or_else(|| number(fields, "best_effort_timestamp_time"));
+            let place = || format!("{} frame {}", video.display(), times_s.len());
+            times_s.push(time.ok_or_else(|| ImportError::record(place(), "the frame has no time"))?);
+            Ok(())
+        },
+    )?;
+    if times_s.is_empty() {
+        return Err(ImportError::record(
+            video.display().to_string(),
+            "it holds no video stream",
+        ));
+    }
+    Ok(times_s)
 }
 
-/// The presentation times of all frames in seconds, in order, without decoding them. Errors: `Program`, `Record`.
-pub(super) fn packet_times(video: &Path) -> Result<Vec<f64>, ImportError> {
-    let found = probe(video, "packet=pts_time")?;
-    let packets = found["packets"].as_array().map(Vec::as_slice).unwrap_or_default();
-    let time = |packet: &Value| packet["pts_time"].as_str()?.parse::<f64>().ok();
-    let mut times_s: Vec<f64> = packets.iter().filter_map(time).collect();
+/// The presentation times of all frames in seconds, in order, without decoding them. Errors: `Program`, `Record`, `Stopped`.
+pub(super) fn packet_times(video: &Path, cancelled: &AtomicBool) -> Result<Vec<f64>, ImportError> {
+    let mut times_s = Vec::new();
+    probe(video, "packet=pts_time", cancelled, |fields| {
+        times_s.extend(number(fields, "pts_time"));
+        Ok(())
+    })?;
     times_s.sort_by(f64::total_cmp);
     Ok(times_s)
 }
 
-fn probe(video: &Path, entries: &str) -> Result<Value, ImportError> {
+/// Passes each entry of the first video stream on, as `name=value|name=value`.
+fn probe(
+    video: &Path,
+    entries: &str,
+    cancelled: &AtomicBool,
+    mut take: impl FnMut(&str) -> Result<(), ImportError>,
+) -> Result<(), ImportError> {
+    let failed = |error| failure("ffprobe", video, error);
     let mut command = Command::new("ffprobe");
-    command
-        .args(CONTAINERS)
-        .args([
-            "-v",
-            "error",
-            "-select_streams",
-            "v:0",
-            "-of",
-            "json",
-            "-show_entries",
-            entries,
-        ])
-        .arg(argument(video));
-    let output = run(command, "ffprobe", video)?;
-    serde_json::from_slice(&output)
-        .map_err(|error| ImportError::Program(format!("ffprobe's answer on {} is not JSON: {error}", video.display())))
+    command.args(ALLOWED).args(["-v", "error", "-select_streams", "v:0"]);
+    command.args(["-of", "compact=print_section=0", "-show_entries", entries]);
+    let mut output = ProgramOutput::start(command.arg(argument(video))).map_err(failed)?;
+    while let Some(line) = output.line(cancelled).map_err(failed)? {
+        if !line.is_empty() {
+            take(&line)?;
+        }
+    }
+    output.finish(cancelled).map_err(failed)
 }
 
-/// Writes all frames as 8-bit gray, one after the other.
-pub(super) fn decode(video: &Path, decoded: &Path) -> Result<(), ImportError> {
-    let mut command = Command::new("ffmpeg");
-    command
-        .args(["-v", "error", "-nostdin", "-y", "-xerror"])
-        .args(CONTAINERS)
-        .arg("-i")
-        .arg(argument(video))
-        .args([
-            "-map",
-            "0:v:0",
-            "-fps_mode",
-            "passthrough",
-            "-pix_fmt",
-            "gray",
-            "-f",
-            "rawvideo",
-        ])
-        .arg(decoded);
-    run(command, "ffmpeg", video).map(drop)
+/// A number among the fields of an entry.
+fn number(fields: &str, name: &str) -> Option<f64> {
+    let mut fields = fields.split('|').filter_map(|field| field.split_once('='));
+    let (_, value) = fields.find(|(found, _)| *found == name)?;
+    value.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
 /// A path that ffmpeg cannot take for an option or a protocol.
@@ -162,22 +122,171 @@ fn argument(video: &Path) -> PathBuf {
     }
 }
 
-fn run(mut command: Command, program: &str, video: &Path) -> Result<Vec<u8>, ImportError> {
-    let output = command.stdin(Stdio::null()).output().map_err(|error| {
-        ImportError::Program(match error.kind() {
-            std::io::ErrorKind::NotFound => format!(
-                "{program} is not installed; it reads videos (Debian: apt-get install ffmpeg). Or extract the frames to a folder"
-            ),
-            _ => format!("{program} could not be started: {error}"),
-        })
-    })?;
-    if output.status.success() {
-        return Ok(output.stdout);
+fn failure(program: &str, video: &Path, error: ProgramError) -> ImportError {
+    match error {
+        ProgramError::Missing => ImportError::Program(format!(
+            "{program} is not installed; it reads videos (Debian: apt-get install ffmpeg). Or extract the frames to a folder"
+        )),
+        ProgramError::Start(_) => ImportError::Program(format!("{program}: {error}")),
+        ProgramError::Cancelled => ImportError::Stopped,
+        ProgramError::Failed(reason) => ImportError::record(
+            video.display().to_string(),
+            format!("{program} cannot read the video: {reason}"),
+        ),
     }
-    let reason = String::from_utf8_lossy(&output.stderr);
-    let first = reason.lines().next().unwrap_or("it gave no reason");
-    Err(ImportError::Record {
-        place: video.display().to_string(),
-        reason: format!("{program} cannot read the video: {first}"),
-    })
+}
+
+/// Frames of videos. They are decoded in the order in which they are wanted; going back starts the video again.
+pub(super) struct VideoFrames {
+    /// Each video and its number of frames.
+    videos: Vec<(PathBuf, usize)>,
+    /// Video and frame of each image.
+    places: Vec<(usize, usize)>,
+    stream: Mutex<Option<FrameStream>>,
+}
+
+impl VideoFrames {
+    pub(super) fn new(videos: Vec<(PathBuf, usize)>, places: Vec<(usize, usize)>) -> Self {
+        Self {
+            videos,
+            places,
+            stream: Mutex::new(None),
+        }
+    }
+
+    /// Decodes the wanted frames and passes each to `fit`. Errors, for each frame: those of `fit`, `Program`, `Record`, `Stopped`.
+    pub(super) fn read_all(
+        &self,
+        wanted: &[WantedImage<'_>],
+        fit: FitImage<'_>,
+        cancelled: &AtomicBool,
+    ) -> Vec<Result<Frame, ImportError>> {
+        let mut stream = self.stream.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut fitted = Vec::with_capacity(wanted.len());
+        for some in wanted.chunks(DECODED_FRAMES) {
+            let decoded: Vec<_> = some
+                .iter()
+                .map(|wanted| (self.decode(&mut stream, wanted, cancelled), wanted))
+                .collect();
+            let fit = |(decoded, wanted): (Result<Frame, ImportError>, &WantedImage<'_>)| fit(&decoded?, wanted.place);
+            fitted.par_extend(decoded.into_par_iter().map(fit));
+        }
+        fitted
+    }
+
+    fn decode(
+        &self,
+        stream: &mut Option<FrameStream>,
+        wanted: &WantedImage<'_>,
+        cancelled: &AtomicBool,
+    ) -> Result<Frame, ImportError> {
+        let (video, frame) = self.places[wanted.image];
+        let (path, frames) = &self.videos[video];
+        let stream = match stream {
+            Some(open) if open.video == video && open.next <= frame => open,
+            other => other.insert(FrameStream::start(video, path)?),
+        };
+        stream.frame(frame, *frames, path, cancelled)
+    }
+}
+
+/// A video that is being decoded.
+struct FrameStream {
+    video: usize,
+    /// The frame that comes next.
+    next: usize,
+    /// `None` after the end.
+    output: Option<ProgramOutput>,
+    /// Why no more frames come.
+    fault: String,
+}
+
+impl FrameStream {
+    /// Errors: `Program`.
+    fn start(video: usize, path: &Path) -> Result<Self, ImportError> {
+        let mut command = Command::new("ffmpeg");
+        command
+            .args(["-v", "error", "-nostdin", "-xerror"])
+            .args(ALLOWED)
+            .arg("-i");
+        command.arg(argument(path));
+        // Each frame comes as a PGM image, which states its size.
+        command.args(["-map", "0:v:0", "-fps_mode", "passthrough", "-pix_fmt", "gray"]);
+        command.args(["-c:v", "pgm", "-f", "image2pipe", "pipe:1"]);
+        let output = ProgramOutput::start(&mut command).map_err(|error| failure("ffmpeg", path, error))?;
+        Ok(Self {
+            video,
+            next: 0,
+            output: Some(output),
+            fault: String::new(),
+        })
+    }
+
+    /// Decodes frame `wanted`, which has not come yet, of a video that announced `frames` frames. Errors: `Record`, `Program`,
+    /// `Stopped`.
+    fn frame(
+        &mut self,
+        wanted: usize,
+        frames: usize,
+        path: &Path,
+        cancelled: &AtomicBool,
+    ) -> Result<Frame, ImportError> {
+        let Some(output) = &mut self.output else {
+            return Err(ImportError::record(
+                format!("{} frame {wanted}", path.display()),
+                &self.fault,
+            ));
+        };
+        loop {
+            match read_pgm(output, cancelled) {
+                Ok(Some(frame)) => {
+                    self.next += 1;
+                    if self.next > wanted {
+                        return Ok(frame);
+                    }
+                }
+                Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
+                ended => {
+                    let result = match (ended, self.output.take()) {
+                        (Ok(_), Some(output)) => output.finish(cancelled),
+                        (ended, _) => ended.map(drop),
+                    };
+                    self.fault = match result {
+                        Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
+                        Err(error) => format!("ffmpeg cannot read the video: {error}"),
+                        Ok(()) => format!("the video ends here; it announces {frames} frames"),
+                    };
+                    let place = format!("{} frame {}", path.display(), self.next);
+                    return Err(ImportError::record(place, &self.fault));
+                }
+            }
+        }
+    }
+}
+
+/// Reads an image `P5 WIDTH HEIGHT 255` with its pixels; `None` at the end of the output. Errors: `Failed`, `Cancelled`.
+fn read_pgm(output: &mut ProgramOutput, cancelled: &AtomicBool) -> Result<Option<Frame>, ProgramError> {
+    let wrong = |what: &str| ProgramError::Failed(format!("its output is no PGM image: {what}"));
+    let Some(magic) = output.line(cancelled)? else {
+        return Ok(None);
+    };
+    let mut header = || Ok::<_, ProgramError>(output.line(cancelled)?.unwrap_or_default());
+    let (size, maximum) = (header()?, header()?);
+    let sides = size.split_once(' ');
+    let sides = sides.and_then(|(width, height)| Some((width.parse::<u32>().ok()?, height.parse::<u32>().ok()?)));
+    let (Some((width, height)), "P5", "255") = (sides, magic.as_str(), maximum.as_str()) else {
+        return Err(wrong("its header is not P5, two sides and 255"));
+    };
+    if width.max(height) > MAX_SIDE_PX {
+        return Err(ProgramError::Failed(format!(
+            "its frames are {width}×{height} px; each side may be {MAX_SIDE_PX} px at most"
+        )));
+    }
+    let mut pixels = vec![0; width as usize * height as usize];
+    if output.read(&mut pixels, cancelled)? < pixels.len() {
+        return Err(wrong("it was cut off"));
+    }
+    Frame::new(width, height, pixels)
+        .map(Some)
+        .map_err(|error| wrong(&error.to_string()))
 }

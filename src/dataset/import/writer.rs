@@ -7,7 +7,6 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rayon::prelude::*;
 use serde::Serialize;
 
 use super::super::collection::lock_file;
@@ -16,10 +15,11 @@ use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use super::super::shard::{EncodedEpisode, ShardStart, build};
 use super::super::store::{FinishedShard, complete};
 use super::super::{DatasetInfo, EpisodeData};
-use super::recording::{Record, Recording};
+use super::recording::{Record, Recording, WantedImage};
 use super::timing::{ImportPlan, PlannedFrame};
-use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, video};
+use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem};
 use crate::files::remove_partials;
+use crate::frame::Frame;
 use crate::frame::fit::fit;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.
@@ -179,11 +179,11 @@ impl<'a> Directory<'a> {
         if written.iter().all(|shard| shard.records.is_empty()) {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
-        let listed = plan.recording.skipped.iter().cloned();
+        let listed = plan.recording.skipped.items().into_iter();
         let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
-        video::clean_up(&self.config.out);
+        remove_partials(&self.config.out);
         let info = complete(&self.config.out, info, &written)?;
         Ok(Imported {
             info,
@@ -276,23 +276,28 @@ impl ShardWriter<'_> {
     ) -> Result<(Option<Vec<EncodedEpisode>>, Vec<SkippedItem>), ImportError> {
         let Recording { records, images, .. } = &self.plan.recording;
         let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
+        let resize = |image: &Frame, place: &str| {
+            let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
+            fit(image, width, height, self.options.fit).map_err(|source| ImportError::Image {
+                place: place.to_owned(),
+                path: place.into(),
+                source,
+            })
+        };
         for episode in &self.plan.episodes[episodes] {
             let mut data = EpisodeData::default();
             for chunk in episode.chunks(CHUNK_FRAMES) {
                 if cancelled.load(Ordering::Relaxed) {
                     return Ok((None, bad));
                 }
-                let read = |frame: &PlannedFrame| {
-                    let record = &records[frame.record];
-                    let image = images.read(record.image, &record.place)?;
-                    let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
-                    fit(&image, width, height, self.options.fit).map_err(|source| ImportError::Image {
-                        place: record.place.clone(),
-                        path: record.place.clone().into(),
-                        source,
-                    })
-                };
-                let frames: Vec<_> = chunk.par_iter().map(read).collect();
+                let wanted = chunk.iter().map(|frame| WantedImage {
+                    image: records[frame.record].image,
+                    place: &records[frame.record].place,
+                });
+                let frames = images.read_all(&wanted.collect::<Vec<_>>(), &resize, cancelled);
+                if cancelled.load(Ordering::Relaxed) {
+                    return Ok((None, bad));
+                }
                 for (planned, frame) in chunk.iter().zip(frames) {
                     match frame {
                         Ok(frame) => push(&mut data, planned, &records[planned.record], frame.pixels()),

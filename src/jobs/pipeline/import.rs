@@ -11,7 +11,7 @@ use super::super::runner::{JobFailure, JobResult};
 use super::super::spec::ImportSpec;
 use super::{Pipeline, failed};
 use crate::dataset::DatasetError;
-use crate::dataset::import::{ImportError, ImportProgress, SkippedItem, import, saved_shards};
+use crate::dataset::import::{ImportConfig, ImportError, ImportProgress, Imported, import, saved_shards};
 
 /// How many left-out items are written to the job's log; all are in the data set.
 const LOGGED_ITEMS: usize = 200;
@@ -27,6 +27,10 @@ impl Pipeline {
         let config = spec
             .config(data_dir, self.import_dir.as_deref())
             .map_err(|error| failed(&error))?;
+        let config = ImportConfig {
+            disk_mib: self.import_disk_mib,
+            ..config
+        };
         report.progress(0, 0, "reading the recording");
         let patience = self.patience(report, cancelled);
         patience.run(async || datasets::clear_stale_import(self.store.objects(), &spec.name, &config).await)?;
@@ -37,13 +41,13 @@ impl Pipeline {
         let is_busy = |error: &ImportError| matches!(error, ImportError::Dataset(DatasetError::Busy { .. }));
         // After an error it continues with the shards that are finished.
         let imported = patience.repeat(|| retry_while_busy(work, is_busy, cancelled))?;
-        log_skipped(&imported.skipped, report);
+        log_skipped(&imported, report);
         self.push_dataset(&spec.name, &patience)?;
-        let info = imported.info;
+        let info = &imported.info;
         Ok(JobResult {
             result: json!({
                 "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
-                "content_hash": info.content_hash, "skipped": imported.skipped.len(),
+                "content_hash": info.content_hash, "skipped": imported.skipped_count(),
             }),
             published: None,
             measured: None,
@@ -51,14 +55,14 @@ impl Pipeline {
     }
 }
 
-fn log_skipped(skipped: &[SkippedItem], report: &JobReporter) {
-    for item in skipped.iter().take(LOGGED_ITEMS) {
+fn log_skipped(imported: &Imported, report: &JobReporter) {
+    for item in imported.skipped.iter().take(LOGGED_ITEMS) {
         report.line(format!("left out {}: {}", item.place, item.reason));
     }
-    if skipped.len() > LOGGED_ITEMS {
-        let count = skipped.len();
+    if imported.skipped.len() > LOGGED_ITEMS {
+        let count = imported.skipped_count();
         report.line(format!(
-            "left out {count} items; all are in the data set's meta/skipped.json"
+            "left out {count} items; the data set's meta/skipped.json lists them"
         ));
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{AvailableInputs, check_name};
-use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, check_out, parse_size};
+use crate::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, check_out, parse_size};
 use crate::dataset::is_finished;
 use crate::error_text;
 use crate::frame::fit::Fit;
@@ -130,6 +130,7 @@ impl ImportSpec {
             source,
             out: data_dir.join("datasets").join(&self.name),
             options,
+            disk_mib: DEFAULT_DISK_MIB,
         })
     }
 

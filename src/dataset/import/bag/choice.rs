@@ -2,7 +2,7 @@
 
 use super::collector::{Collector, Content, Topic, ValueStream};
 use super::messages::{Projection, RosType};
-use crate::dataset::import::{ImportError, ImportOptions};
+use crate::dataset::import::{ImportError, ImportOptions, listed};
 use crate::types::Channel;
 
 /// In place of a topic: none at all.
@@ -90,12 +90,11 @@ impl Choice<'_> {
                 topic.name, topic.type_name, topic.messages
             )
         };
-        let known: Vec<String> = self.topics().iter().map(describe).collect();
-        let known = if known.is_empty() {
-            "none".to_owned()
-        } else {
-            known.join(", ")
-        };
+        // Those that are read come first.
+        let is_read = |topic: &&Topic| !matches!(topic.content, Content::Unused);
+        let read = self.topics().iter().filter(is_read);
+        let others = self.topics().iter().filter(|topic| !is_read(topic));
+        let known = listed(read.chain(others).map(describe));
         ImportError::Option(format!(
             "the bag has {what}; name one of type {} with {}; its topics are: {known}",
             role.types, role.option
@@ -209,11 +208,10 @@ impl Choice<'_> {
 fn field_position(stream: &ValueStream, topic: &Topic, name: &str) -> Result<usize, ImportError> {
     let found = stream.fields.iter().position(|(field, _)| field == name);
     found.ok_or_else(|| {
-        let known: Vec<&str> = stream.fields.iter().map(|(field, _)| field.as_str()).collect();
         ImportError::Option(format!(
             "{} has no field \"{name}\"; its fields are: {}",
             topic.name,
-            known.join(", ")
+            listed(stream.fields.iter().map(|(field, _)| field))
         ))
     })
 }

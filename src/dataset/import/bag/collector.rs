@@ -6,7 +6,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
-use crate::dataset::import::{ImportError, ImportOptions, SkippedItem};
+use crate::dataset::import::{ImportError, ImportOptions, SkippedItem, SkippedList};
+
+/// A bag has at most this number of topics that can be used, and of others.
+const MAX_TOPICS: usize = 4096;
+/// A topic has at most this number of fields.
+const MAX_FIELDS: usize = 4096;
+/// The longest name of a topic, a type or a field, in bytes.
+pub(super) const MAX_NAME_BYTES: usize = 1024;
 
 /// Where a message lies in its file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,7 +61,19 @@ pub(super) struct ValueStream {
 }
 
 impl ValueStream {
-    fn push(&mut self, time: MessageTime, number: u64, fields: Vec<FieldValue>) {
+    /// Errors: why the message is refused.
+    fn push(&mut self, time: MessageTime, number: u64, fields: Vec<FieldValue>) -> Result<(), String> {
+        let is_new = |field: &&FieldValue| !self.positions.contains_key(&*field.name);
+        let (mut count, mut longest) = (self.fields.len(), 0);
+        for field in fields.iter().filter(is_new) {
+            (count, longest) = (count + 1, longest.max(field.name.len()));
+        }
+        if count > MAX_FIELDS || longest > MAX_NAME_BYTES {
+            return Err(format!(
+                "its topic has {count} fields with names of {longest} bytes; at most {MAX_FIELDS} fields with names of \
+                 {MAX_NAME_BYTES} bytes are read"
+            ));
+        }
         for FieldValue { name, unit, value } in fields {
             let field = self.field(&name, unit);
             self.is_ever_other_than_0[field as usize] |= value != 0.0;
@@ -63,6 +82,7 @@ impl ValueStream {
         self.times.push(time);
         self.numbers.push(number);
         self.ends.push(self.values.len());
+        Ok(())
     }
 
     /// The position of a field, which is new or known.
@@ -102,7 +122,7 @@ pub(super) struct Topic {
     pub(super) messages: u64,
     pub(super) content: Content,
     /// Messages that cannot be read. If damage is not left out, the first one.
-    pub(super) faults: Vec<SkippedItem>,
+    pub(super) faults: SkippedList,
 }
 
 /// Receives all messages of a bag's files, one file after the other.
@@ -112,9 +132,11 @@ pub(super) struct Collector<'a> {
     cancelled: &'a AtomicBool,
     pub(super) topics: Vec<Topic>,
     by_name: HashMap<(String, String), usize>,
+    used_topics: usize,
+    unused_topics: usize,
     pub(super) files: Vec<PathBuf>,
     /// Damage that belongs to no topic.
-    pub(super) skipped: Vec<SkippedItem>,
+    pub(super) skipped: SkippedList,
 }
 
 impl<'a> Collector<'a> {
@@ -125,15 +147,17 @@ impl<'a> Collector<'a> {
             cancelled,
             topics: Vec::new(),
             by_name: HashMap::new(),
+            used_topics: 0,
+            unused_topics: 0,
             files: Vec::new(),
-            skipped: Vec::new(),
+            skipped: SkippedList::default(),
         }
     }
 
-    /// Errors: `Cancelled` if the import was cancelled.
+    /// Errors: `Stopped` if the import was cancelled.
     pub(super) fn check_cancelled(&self) -> Result<(), ImportError> {
         if self.cancelled.load(Ordering::Relaxed) {
-            return Err(ImportError::Cancelled { done: 0, total: 0 });
+            return Err(ImportError::Stopped);
         }
         Ok(())
     }
@@ -148,15 +172,21 @@ impl<'a> Collector<'a> {
         if !self.options.skip_bad {
             return Err(ImportError::Record { place, reason });
         }
-        self.skipped.push(SkippedItem { place, reason });
+        self.skipped.push(SkippedItem::new(&place, &reason));
         Ok(())
     }
 
-    /// The number of a topic, the same for the same name and type.
-    pub(super) fn topic(&mut self, name: String, type_name: String, encoding: String) -> usize {
+    /// The number of a topic, the same for the same name and type. Errors: why it is refused.
+    pub(super) fn topic(&mut self, name: String, type_name: String, encoding: String) -> Result<usize, String> {
         let key = (name, type_name);
         if let Some(&known) = self.by_name.get(&key) {
-            return known;
+            return Ok(known);
+        }
+        let longest = key.0.len().max(key.1.len()).max(encoding.len());
+        if longest > MAX_NAME_BYTES {
+            return Err(format!(
+                "a name of the topic has {longest} bytes; at most {MAX_NAME_BYTES} are read"
+            ));
         }
         let (name, type_name) = key.clone();
         let kind = RosType::of(&type_name);
@@ -176,6 +206,17 @@ impl<'a> Collector<'a> {
             _ if is_value && (kind.is_command() || kind.is_measurement()) => Content::Values(ValueStream::default()),
             _ => Content::Unused,
         };
+        let is_unused = matches!(content, Content::Unused);
+        let count = if is_unused {
+            &mut self.unused_topics
+        } else {
+            &mut self.used_topics
+        };
+        if *count == MAX_TOPICS {
+            let what = if is_unused { "topics of other types" } else { "topics" };
+            return Err(format!("the bag has more than {MAX_TOPICS} {what}; record fewer"));
+        }
+        *count += 1;
         self.by_name.insert(key, self.topics.len());
         self.topics.push(Topic {
             name,
@@ -184,9 +225,9 @@ impl<'a> Collector<'a> {
             encoding,
             messages: 0,
             content,
-            faults: Vec::new(),
+            faults: SkippedList::default(),
         });
-        self.topics.len() - 1
+        Ok(self.topics.len() - 1)
     }
 
     /// Where a message is, for people.
@@ -221,7 +262,7 @@ impl<'a> Collector<'a> {
             let of = &self.topics[topic];
             if self.options.skip_bad || of.faults.is_empty() {
                 let place = self.place(file, of, number, position);
-                self.topics[topic].faults.push(SkippedItem { place, reason });
+                self.topics[topic].faults.push(SkippedItem::new(&place, &reason));
             }
         }
     }
@@ -264,7 +305,7 @@ fn take(
             if let Some(wrong) = values.iter().find(|field| !(field.value as f32).is_finite()) {
                 return Err(format!("{} is {}; it must be a finite number", wrong.name, wrong.value));
             }
-            stream.push(at(stamp), number, values);
+            stream.push(at(stamp), number, values)?;
         }
     }
     Ok(())

@@ -8,7 +8,7 @@
 use super::choice::{ChosenTopics, ChosenValues};
 use super::collector::{Collector, Content, ImageEntry, MessageTime, ValueStream};
 use crate::dataset::import::recording::Record;
-use crate::dataset::import::{ImportError, ImportOptions, SkippedItem};
+use crate::dataset::import::{ImportError, ImportOptions, SkippedItem, SkippedList};
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
 const SAME_CLOCK_NS: i64 = 1_000_000_000;
@@ -75,7 +75,7 @@ impl<'a> HeldValues<'a> {
     fn new(
         collector: &'a Collector<'_>,
         chosen: &ChosenValues,
-        skipped: &mut Vec<SkippedItem>,
+        skipped: &mut SkippedList,
     ) -> Result<Self, ImportError> {
         let (topic, options) = (&collector.topics[chosen.topic], collector.options);
         let empty = ValueStream::default();
@@ -166,7 +166,7 @@ pub(super) struct JoinedImages {
     pub(super) records: Vec<Record>,
     /// For each record, which image it is.
     pub(super) images: Vec<usize>,
-    pub(super) skipped: Vec<SkippedItem>,
+    pub(super) skipped: SkippedList,
 }
 
 /// Joins the chosen topics. Errors: `Option`, `Record`.
@@ -180,7 +180,7 @@ pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<J
     let times: Vec<MessageTime> = entries.iter().map(|entry| entry.time).collect();
     let clock = Clock::of(&times, options)?;
     let times_ns: Vec<i64> = times.into_iter().map(|time| clock.time(time)).collect();
-    let mut skipped = Vec::new();
+    let mut skipped = SkippedList::default();
     let mut held = |values: &[ChosenValues]| -> Result<Vec<HeldValues<'_>>, ImportError> {
         let one = |chosen: &ChosenValues| HeldValues::new(collector, chosen, &mut skipped);
         values.iter().map(one).collect()
@@ -224,7 +224,10 @@ pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<J
         });
         images.push(index);
     }
-    skipped.extend(left_out.items(collector, &topic.name));
+    left_out
+        .items(collector, &topic.name)
+        .into_iter()
+        .for_each(|item| skipped.push(item));
     Ok(JoinedImages {
         records: joined,
         images,
@@ -258,15 +261,12 @@ impl<'a> LeftOut<'a> {
     }
 
     fn items(self, collector: &Collector<'_>, image_topic: &str) -> Vec<SkippedItem> {
-        let item = |(topic, first, last): (&str, u64, u64)| SkippedItem {
-            place: format!(
-                "{} messages {first} to {last} of {image_topic}",
-                collector.source.display()
-            ),
-            reason: format!(
-                "{topic} has no value in the {} s before them (--hold)",
-                collector.options.hold_s
-            ),
+        let (source, hold_s) = (collector.source.display(), collector.options.hold_s);
+        let item = |(topic, first, last): (&str, u64, u64)| {
+            SkippedItem::new(
+                &format!("{source} messages {first} to {last} of {image_topic}"),
+                &format!("{topic} has no value in the {hold_s} s before them (--hold)"),
+            )
         };
         self.0.into_iter().map(item).collect()
     }

@@ -8,7 +8,7 @@ use std::io::{BufReader, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::collector::{Collector, Position};
+use super::collector::{Collector, MAX_NAME_BYTES, Position};
 use super::compression::{self, MAX_RECORD_BYTES};
 use crate::dataset::import::{ImportError, open_file};
 
@@ -275,6 +275,11 @@ impl McapScan<'_, '_> {
         let mut fields = Fields(body);
         match code {
             operation::SCHEMA => match fields.u16().zip(fields.text()) {
+                Some((_, name)) if name.len() > MAX_NAME_BYTES => {
+                    let bytes = name.len();
+                    let reason = format!("the schema's name has {bytes} bytes; at most {MAX_NAME_BYTES} are read");
+                    self.fault(at, reason)?;
+                }
                 Some((id, name)) => drop(self.channels.schemas.insert(id, name)),
                 None => self.fault(at, "the schema's record is too short")?,
             },
@@ -283,8 +288,10 @@ impl McapScan<'_, '_> {
                 match ids.zip(fields.text().zip(fields.text())) {
                     Some(((id, schema), (topic, encoding))) => {
                         let type_name = self.channels.schemas.get(&schema).cloned().unwrap_or_default();
-                        let topic = self.collector.topic(topic, type_name, encoding);
-                        self.channels.topics.insert(id, topic);
+                        match self.collector.topic(topic, type_name, encoding) {
+                            Ok(topic) => drop(self.channels.topics.insert(id, topic)),
+                            Err(reason) => self.fault(at, reason)?,
+                        }
                     }
                     None => self.fault(at, "the channel's record is too short")?,
                 }

@@ -10,7 +10,7 @@ use crate::dataset::import::ImportError;
 const MESSAGES: &str = "SELECT rowid, topic_id, timestamp, data FROM main.messages ORDER BY rowid";
 const TOPICS: &str = "SELECT rowid, id, name, type, serialization_format FROM main.topics ORDER BY rowid";
 
-/// Passes every message of a file to the collector, in the order of recording. Errors: `Io`, `Option`, `Cancelled`, `Record` where
+/// Passes every message of a file to the collector, in the order of recording. Errors: `Io`, `Option`, `Stopped`, `Record` where
 /// damage may not be left out.
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let database = Database::open(path, collector.options.skip_bad)?;
@@ -60,7 +60,7 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
 /// In a damaged database, the same rows can follow each other without end.
 const NOT_IN_ORDER: &str = "the database is damaged after this row: the next one has no greater number";
 
-/// The topics by their number in the database, sorted. Errors: `Record`, `Cancelled`.
+/// The topics by their number in the database, sorted. Errors: `Record`, `Stopped`.
 fn topics(database: &Database, path: &Path, collector: &mut Collector<'_>) -> Result<Vec<(i64, usize)>, ImportError> {
     let wrong = |error: rusqlite::Error| unreadable(path, &error);
     let mut statement = database.for_a_row().prepare(TOPICS).map_err(wrong)?;
@@ -77,7 +77,10 @@ fn topics(database: &Database, path: &Path, collector: &mut Collector<'_>) -> Re
         last = Some(number);
         let read = || Ok((row.get(1)?, row.get(2)?, row.get(3)?, row.get(4)?));
         let (id, name, type_name, encoding) = read().map_err(wrong)?;
-        topics.push((id, collector.topic(name, type_name, encoding)));
+        match collector.topic(name, type_name, encoding) {
+            Ok(topic) => topics.push((id, topic)),
+            Err(reason) => collector.fault(format!("{} topic {id}", path.display()), reason)?,
+        }
     }
     topics.sort_by_key(|(id, _)| *id);
     Ok(topics)

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::super::images::inside;
-use super::super::{ImportError, ImportOptions, read_file, read_text};
+use super::super::{ImportError, ImportOptions, listed, read_file, read_text};
 use super::INFO;
 use super::rows::column_numbers;
 use crate::dataset::shard_reader::batches;
@@ -127,13 +127,7 @@ impl Description {
     pub(super) fn image(&self, options: &ImportOptions) -> Result<ImageFeature, ImportError> {
         let is_image = |feature: &Feature| ["image", "video"].contains(&feature.dtype.as_str());
         let images: Vec<(&String, &Feature)> = self.info.features.iter().filter(|(_, f)| is_image(f)).collect();
-        let names = || {
-            images
-                .iter()
-                .map(|(name, _)| name.as_str())
-                .collect::<Vec<_>>()
-                .join(", ")
-        };
+        let names = || listed(images.iter().map(|(name, _)| name));
         let found = if let Some(wanted) = &options.image {
             images.iter().find(|(name, _)| is_named(name, wanted)).ok_or_else(|| {
                 ImportError::Option(format!(
@@ -186,15 +180,13 @@ impl Description {
                 (Some((name, feature)), _) => components.extend(all(name, feature)),
                 (None, Some(component)) => components.push(component),
                 (None, None) => {
-                    let known: Vec<String> = numbers()
-                        .map(|(name, feature)| {
-                            let components: Vec<_> = all(name, feature).into_iter().map(|c| c.name).collect();
-                            format!("{name} ({})", components.join(", "))
-                        })
-                        .collect();
+                    let known = numbers().map(|(name, feature)| {
+                        let components = all(name, feature).into_iter().map(|component| component.name);
+                        format!("{name} ({})", listed(components))
+                    });
                     return Err(ImportError::Option(format!(
                         "the data set has no numbers {one:?} ({option}); its features and their components are: {}",
-                        known.join("; ")
+                        listed(known)
                     )));
                 }
             }

@@ -1,7 +1,6 @@
-//! The images of a data set of `LeRobot`: columns of tables, or videos. Few of them are in memory at a time.
+//! The images of a data set of `LeRobot` in a column of its tables. Few of them are in memory at a time.
 
 use std::collections::VecDeque;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -10,31 +9,15 @@ use arrow_array::{Array, RecordBatch};
 use parquet::arrow::ProjectionMask;
 
 use super::super::images::inside;
-use super::super::recording::{PixelType, RawImages, read_image};
-use super::super::{ImportError, open_file, video};
+use super::super::recording::read_image;
+use super::super::{ImportError, open_file};
 use crate::dataset::parquet_file;
 use crate::frame::{Frame, codec};
 
 /// Rows that are read together.
 const BLOCK_ROWS: usize = 256;
-/// Blocks of rows, or decoded videos, that are kept: parallel readers are at most so far apart.
+/// Blocks of rows that are kept: parallel readers are at most so far apart.
 const KEPT: usize = 3;
-
-/// Where the images are.
-pub(in super::super) enum LerobotImages {
-    Tables(ImageTable),
-    Videos(VideoFiles),
-}
-
-impl LerobotImages {
-    /// Decodes an image as gray. Errors: `Image`, `Io`, `Record`, `Program`.
-    pub(in super::super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
-        match self {
-            Self::Tables(tables) => tables.read(image, place),
-            Self::Videos(videos) => videos.read(image, place),
-        }
-    }
-}
 
 /// Images in a column of tables.
 pub(in super::super) struct ImageTable {
@@ -72,7 +55,8 @@ impl ImageTable {
         }
     }
 
-    fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
+    /// Decodes an image as gray. Errors: `Image`, `Io`, `Record`.
+    pub(in super::super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
         let (table, row) = self.places[image];
         let path = &self.tables[table];
         let (bytes, path) = match self.stored(table, row)? {
@@ -175,68 +159,4 @@ fn stored_images(batch: &RecordBatch) -> Option<Vec<StoredImage>> {
         (None, None) => StoredImage::Missing,
     };
     Some((0..batch.num_rows()).map(image).collect())
-}
-
-/// Frames of videos, each decoded into a file when it is needed.
-pub(in super::super) struct VideoFiles {
-    out: PathBuf,
-    /// Each video and its number of frames.
-    videos: Vec<(PathBuf, usize)>,
-    /// Video and frame of each image.
-    places: Vec<(usize, usize)>,
-    decoded: Mutex<VecDeque<(usize, RawImages)>>,
-}
-
-impl VideoFiles {
-    pub(super) fn new(out: &Path, videos: Vec<(PathBuf, usize)>, places: Vec<(usize, usize)>) -> Self {
-        Self {
-            out: out.to_owned(),
-            videos,
-            places,
-            decoded: Mutex::new(VecDeque::new()),
-        }
-    }
-
-    fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
-        let (video, frame) = self.places[image];
-        let mut decoded = self.decoded.lock().unwrap_or_else(PoisonError::into_inner);
-        if !decoded.iter().any(|(number, _)| *number == video) {
-            decoded.push_back((video, self.decode(video)?));
-            if decoded.len() > KEPT
-                && let Some((_, old)) = decoded.pop_front()
-            {
-                // It is overwritten or removed later if it stays.
-                let _ = std::fs::remove_file(old.path);
-            }
-        }
-        match decoded.iter().find(|(number, _)| *number == video) {
-            Some((_, images)) => images.read(frame, place),
-            None => Err(ImportError::record(place, "its video was not decoded")),
-        }
-    }
-
-    /// Decodes a whole video into a file of gray frames. Errors: `Program`, `Record`, `Io`.
-    fn decode(&self, number: usize) -> Result<RawImages, ImportError> {
-        let (path, frames) = &self.videos[number];
-        let (width_px, height_px) = video::frame_size(path)?;
-        let decoded = video::decoded_path(&self.out, number);
-        video::decode(path, &decoded)?;
-        let file = File::open(&decoded).map_err(ImportError::io("read", &decoded))?;
-        let frame_bytes = u64::from(width_px) * u64::from(height_px);
-        let found = file.metadata().map_err(ImportError::io("read", &decoded))?.len() / frame_bytes.max(1);
-        if found < *frames as u64 {
-            return Err(ImportError::record(
-                format!("{} frame {found}", path.display()),
-                format!("the video ends here; it announces {frames} frames"),
-            ));
-        }
-        Ok(RawImages {
-            path: decoded,
-            file: Mutex::new(file),
-            width_px,
-            height_px,
-            offsets: (0..found).map(|frame| frame * frame_bytes).collect(),
-            pixel: PixelType::U8,
-        })
-    }
 }
