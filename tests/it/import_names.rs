@@ -255,7 +255,7 @@ fn playlist(kind: usize, target: &str) -> String {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: ProptestConfig::default().cases / 8, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: ProptestConfig::default().cases / 16, ..ProptestConfig::default() })]
 
     #[test]
     fn no_playlist_under_a_videos_name_opens_another_file(
@@ -369,7 +369,7 @@ fn paths_within_a_lerobot_set_are_read() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: ProptestConfig::default().cases / 8, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: ProptestConfig::default().cases / 16, ..ProptestConfig::default() })]
 
     #[test]
     fn a_path_of_a_lerobot_set_never_leaves_it(path in paths_out(), is_video: bool, is_in_name: bool, braces in 0..3usize) {

@@ -43,12 +43,12 @@ const OTHER_COLUMNS: &str = "SELECT count(*) FROM pragma_table_xinfo(?1) WHERE h
      OR (dflt_value IS NOT NULL AND instr(',' || ?2 || ',', ',' || lower(name) || ','))";
 
 /// An open database, whose `topics` and `messages`, if it has them, are plain tables. `rowid` is the number of their rows.
-pub(super) struct Database {
+pub(super) struct BagDatabase {
     connection: Connection,
     steps: Arc<AtomicU32>,
 }
 
-impl Database {
+impl BagDatabase {
     /// Opens a database, perhaps even if it was cut off. Errors: `Io`; `Option` if what is to be read is computed; `Record` if it is
     /// damaged.
     pub(super) fn open(path: &Path, even_if_cut: bool) -> Result<Self, ImportError> {

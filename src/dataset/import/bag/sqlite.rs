@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use super::collector::{Collector, Position};
-use super::database::{Database, unreadable};
+use super::database::{BagDatabase, unreadable};
 use crate::dataset::import::ImportError;
 
 const MESSAGES: &str = "SELECT rowid, topic_id, timestamp, data FROM main.messages ORDER BY rowid";
@@ -13,7 +13,7 @@ const TOPICS: &str = "SELECT rowid, id, name, type, serialization_format FROM ma
 /// Passes every message of a file to the collector, in the order of recording. Errors: `Io`, `Option`, `Stopped`, `Record` where
 /// damage may not be left out.
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
-    let database = Database::open(path, collector.options.skip_bad)?;
+    let database = BagDatabase::open(path, collector.options.skip_bad)?;
     let topics = topics(&database, path, collector)?;
     let mut statement = database
         .for_a_row()
@@ -61,7 +61,11 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
 const NOT_IN_ORDER: &str = "the database is damaged after this row: the next one has no greater number";
 
 /// The topics by their number in the database, sorted. Errors: `Record`, `Stopped`.
-fn topics(database: &Database, path: &Path, collector: &mut Collector<'_>) -> Result<Vec<(i64, usize)>, ImportError> {
+fn topics(
+    database: &BagDatabase,
+    path: &Path,
+    collector: &mut Collector<'_>,
+) -> Result<Vec<(i64, usize)>, ImportError> {
     let wrong = |error: rusqlite::Error| unreadable(path, &error);
     let mut statement = database.for_a_row().prepare(TOPICS).map_err(wrong)?;
     let mut rows = statement.query([]).map_err(wrong)?;
@@ -89,7 +93,7 @@ fn topics(database: &Database, path: &Path, collector: &mut Collector<'_>) -> Re
 /// A database whose messages are read by their row.
 pub(super) struct SqliteFile {
     path: PathBuf,
-    database: Mutex<Database>,
+    database: Mutex<BagDatabase>,
 }
 
 impl SqliteFile {
@@ -97,7 +101,7 @@ impl SqliteFile {
     pub(super) fn open(path: &Path) -> Result<Self, ImportError> {
         Ok(Self {
             path: path.to_owned(),
-            database: Mutex::new(Database::open(path, true)?),
+            database: Mutex::new(BagDatabase::open(path, true)?),
         })
     }
 
