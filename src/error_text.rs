@@ -1,7 +1,10 @@
 //! Texts of errors for people: an error with its causes in one line, and lists of names.
 
 use std::error::Error;
-use std::fmt::Display;
+use std::fmt::{self, Display, Write};
+
+/// The maximum length of a shortened text in bytes, without the mark of what was left out.
+const MAX_SHORTENED_BYTES: usize = 1000;
 
 /// The error and all its causes, joined by colons. A cause that the text already contains is not repeated.
 #[must_use]
@@ -16,6 +19,66 @@ pub fn with_causes(error: &dyn Error) -> String {
         source = cause.source();
     }
     joined
+}
+
+/// The text without its middle if it has more than 1000 bytes: an error may quote a long value that a client sent. The whole text is never
+/// in memory.
+#[must_use]
+pub fn shortened(text: &dyn Display) -> String {
+    let mut ends = Ends::default();
+    // Nothing but a `Display` that fails gives an error here; what it wrote before is kept.
+    let _ = write!(ends, "{text}");
+    ends.joined()
+}
+
+/// The beginning and the end of what is written into it.
+#[derive(Default)]
+struct Ends {
+    head: String,
+    tail: String,
+    is_head_full: bool,
+    is_middle_lost: bool,
+}
+
+impl Ends {
+    /// Bytes of each end.
+    const BYTES: usize = MAX_SHORTENED_BYTES / 2;
+
+    fn joined(mut self) -> String {
+        self.keep_tail();
+        let mark = if self.is_middle_lost { " … " } else { "" };
+        format!("{}{mark}{}", self.head, self.tail)
+    }
+
+    fn keep_tail(&mut self) {
+        let start = self.tail.len().saturating_sub(Self::BYTES);
+        if start > 0 {
+            self.tail.drain(..self.tail.ceil_char_boundary(start));
+            self.is_middle_lost = true;
+        }
+    }
+}
+
+impl Write for Ends {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        let mut rest = text;
+        if !self.is_head_full {
+            let fitting = text.floor_char_boundary(Self::BYTES - self.head.len());
+            self.head.push_str(&text[..fitting]);
+            rest = &text[fitting..];
+            self.is_head_full = !rest.is_empty();
+        }
+        let end = rest.ceil_char_boundary(rest.len().saturating_sub(Self::BYTES));
+        if end > 0 {
+            self.tail.clear();
+            self.is_middle_lost = true;
+        }
+        self.tail.push_str(&rest[end..]);
+        if self.tail.len() > MAX_SHORTENED_BYTES {
+            self.keep_tail();
+        }
+        Ok(())
+    }
 }
 
 /// The text as a terminal may show it: control characters other than line breaks and tabs are written as escapes, which JSON
@@ -63,6 +126,23 @@ mod tests {
     #[derive(Debug, thiserror::Error)]
     #[error("the shard is lost: {0}")]
     struct WithCause(#[source] WithoutCause);
+
+    #[test]
+    fn a_long_text_keeps_its_beginning_and_its_end() {
+        assert_eq!(shortened(&"short"), "short");
+        let whole = "ä".repeat(MAX_SHORTENED_BYTES / 2);
+        assert_eq!(shortened(&whole), whole);
+        for length in [1000, 1001, 100_000] {
+            let long = shortened(&format_args!("unknown field `{}` at line {}", "ä".repeat(length), 1));
+            assert!(
+                long.len() < MAX_SHORTENED_BYTES + 10 && long.starts_with("unknown field `ä"),
+                "{long}"
+            );
+            assert!(long.contains("ä … ä") && long.ends_with("ä` at line 1"), "{long}");
+        }
+        let in_pieces = fmt::from_fn(|f| (0..2000).try_for_each(|number| write!(f, "{number},")));
+        assert_eq!(shortened(&in_pieces), shortened(&in_pieces.to_string()));
+    }
 
     #[test]
     fn control_characters_are_shown_as_escapes() {

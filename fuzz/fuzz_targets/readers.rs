@@ -26,14 +26,16 @@ mod bag_files;
 
 type Reader = fn(&[u8]);
 
-const READERS: [(&str, Reader); 7] = [
+const READERS: [(&str, Reader); 9] = [
     ("messages-json", messages_json),
     ("messages-msgpack", messages_msgpack),
     ("images", images),
     ("states", states),
     ("checkpoints", checkpoints),
     ("shards", shards),
-    ("bags", bags),
+    ("bags", |bytes| imported("bag.mcap", bytes)),
+    ("databases", |bytes| imported("bag.db3", bytes)),
+    ("videos", |bytes| imported("walk.mp4", bytes)),
 ];
 
 static READER: LazyLock<Reader> = LazyLock::new(|| {
@@ -184,24 +186,27 @@ fn shards(bytes: &[u8]) {
     let _ = Dataset::open(&set.dir.path().join("set"));
 }
 
-fn bags(bytes: &[u8]) {
+/// Imports a recording, once with and once without what is damaged.
+fn imported(name: &str, bytes: &[u8]) {
     static DIR: OnceLock<tempfile::TempDir> = OnceLock::new();
     let dir = DIR.get_or_init(in_memory).path();
-    let is_database = bytes.starts_with(b"SQLite format 3");
-    let source = dir.join(if is_database { "bag.db3" } else { "bag.mcap" });
+    let source = dir.join(name);
     std::fs::write(&source, bytes).unwrap();
-    let config = ImportConfig {
-        source,
-        out: dir.join("out"),
-        options: ImportOptions {
-            frame_width_px: 8,
-            frame_height_px: 8,
-            ..ImportOptions::default()
-        },
-        disk_mib: DEFAULT_DISK_MIB,
-    };
-    let _ = import(&config, &|_| {}, &AtomicBool::new(false));
-    let _ = std::fs::remove_dir_all(&config.out);
+    for skip_bad in [false, true] {
+        let config = ImportConfig {
+            source: source.clone(),
+            out: dir.join("out"),
+            options: ImportOptions {
+                frame_width_px: 8,
+                frame_height_px: 8,
+                skip_bad,
+                ..ImportOptions::default()
+            },
+            disk_mib: DEFAULT_DISK_MIB,
+        };
+        let _ = import(&config, &|_| {}, &AtomicBool::new(false));
+        let _ = std::fs::remove_dir_all(&config.out);
+    }
 }
 
 /// A directory in memory where there is one.

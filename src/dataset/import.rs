@@ -365,7 +365,7 @@ fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, Impo
         return lerobot::open(source, options, cancelled);
     }
     if bag::is_bag(source) {
-        return bag::open(source, options);
+        return bag::open(source, options, cancelled);
     }
     if source.is_dir() {
         return images::open(source, options);

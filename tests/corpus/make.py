@@ -5,6 +5,7 @@ frames, 8 features, an action of two numbers and a state of one."""
 import base64
 import io
 import json
+import sqlite3
 import struct
 import zlib
 from pathlib import Path
@@ -119,6 +120,8 @@ def messages():
         "ok-not-a-number.msgpack": pack(binary | {"action": [float("nan"), float("inf")]}),
         "refused-unknown-field.json": json.dumps(frame | {"colour": 1}),
         "refused-long-key.json": json.dumps(frame | {"colour" * 10000: 1}),
+        # The reader, the path and the error each hold the name; a mutation found it.
+        "refused-long-key-with-escapes.json": json.dumps(frame | {("]" * 599 + "\n") * 330: 1}),
         "refused-field-of-another.json": '{"type":"close","seq":1}',
         "refused-unknown-type.json": '{"type":"dance"}',
         "refused-no-type.json": '{"seq":1}',
@@ -238,6 +241,107 @@ def states():
     write("states", "422-key-twice.json", text[:-1] + ',"version":1}')
 
 
+def cdr_image(time_ns):
+    """A `sensor_msgs/Image` of 4×3 gray pixels."""
+    text = lambda value: struct.pack("<I", len(value) + 1) + value + b"\0"
+    padded = lambda content: content + bytes(-len(content) % 4)
+    head = padded(struct.pack("<II", *divmod(time_ns, 10**9)) + text(b"camera"))
+    head = padded(head + struct.pack("<II", 3, 4) + text(b"mono8") + b"\0")
+    return b"\0\1\0\0" + head + struct.pack("<II", 4, 12) + bytes(range(0, 240, 20))
+
+
+TOPICS = "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL"
+MESSAGES = "id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL"
+IMAGE = cdr_image(10**9)
+# Rows that would be a bag, and as many as one likes.
+ROWS = f"WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 6) SELECT i AS id, 1 AS topic_id, i * 100000000 AS timestamp, x'{IMAGE.hex()}' AS data FROM n"
+
+
+def database(*statements, messages=f"CREATE TABLE messages({MESSAGES})", topics=f"CREATE TABLE topics({TOPICS})", count=6):
+    """A database of rosbag2 in small pages; `statements` come after its tables and rows."""
+    path = HERE / "database.tmp"
+    path.unlink(missing_ok=True)
+    connection = sqlite3.connect(path, isolation_level=None)
+    for statement in ("PRAGMA page_size = 512", topics, messages):
+        connection.execute(statement)
+    if "TABLE" in topics:
+        connection.execute("INSERT INTO topics(id, name, type, serialization_format) VALUES (1, '/image', 'sensor_msgs/msg/Image', 'cdr')")
+    if "topic_id" in messages and "VIEW" not in messages:
+        stored = [row[1] for row in connection.execute("PRAGMA table_info(messages)") if row[1] != "data" or not row[4]]
+        for index in range(1, count + 1):
+            row = {"id": index, "topic_id": 1, "timestamp": index * 10**8, "data": cdr_image(index * 10**8)}
+            row = {name: row[name] for name in stored if name in row}
+            marks = ", ".join("?" * len(row))
+            connection.execute(f"INSERT INTO messages({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+    for statement in statements:
+        connection.execute(statement)
+    connection.close()
+    content = bytearray(path.read_bytes())
+    path.unlink()
+    # The version of SQLite that wrote it.
+    content[96:100] = bytes(4)
+    return content
+
+
+def endless(content, page, depth):
+    """The rows below a table's first page again and again: above it come `depth` pages that each name the one below it 40 times."""
+    pages = [bytearray(content[at : at + 512]) for at in range(0, len(content), 512)]
+    root, start = pages[page - 1], 100 if page == 1 else 0
+    # Cells stay at their places; only the head of the first page, which comes after the file's head, moves.
+    head = (12 if root[start] == 5 else 8) + 2 * int.from_bytes(root[start + 3 : start + 5], "big")
+    moved = bytearray(root)
+    moved[:head] = root[start : start + head]
+    pages.append(moved)
+    for level in range(depth):
+        first = start if level == depth - 1 else 0
+        above, below = bytearray(512), len(pages)
+        above[:first] = root[:first]
+        above[first : first + 12] = struct.pack(">BHHHBI", 5, 0, 40, 312, 0, below)
+        for cell in range(40):
+            place = 312 + 5 * cell
+            above[first + 12 + 2 * cell : first + 14 + 2 * cell] = struct.pack(">H", place)
+            above[place : place + 5] = struct.pack(">IB", below, cell + 1)
+        if level == depth - 1:
+            pages[page - 1] = above
+        else:
+            pages.append(above)
+    pages[0][28:32] = struct.pack(">I", len(pages))
+    return b"".join(pages)
+
+
+def bags():
+    sound = database()
+    view = f'CREATE VIEW "Messages" AS {ROWS}'
+    edited = lambda change: ("PRAGMA writable_schema = ON", f"UPDATE sqlite_master SET {change} WHERE name = 'Messages'")
+    without = lambda name: ", ".join(column for column in MESSAGES.split(", ") if not column.startswith(name))
+    for name, content in {
+        "ok-plain.db3": sound,
+        "ok-other-case.db3": database(messages=f'CREATE TABLE "MESSAGES"({MESSAGES})', topics=f"CREATE TABLE [Topics]({TOPICS})"),
+        "ok-index.db3": database("CREATE INDEX timestamp_idx ON messages (timestamp ASC)"),
+        "ok-id-is-no-key.db3": database(messages=f"CREATE TABLE messages({MESSAGES.replace(' PRIMARY KEY', '')})"),
+        "ok-view-of-another-name.db3": database(view.replace("Messages", "meſſages")),
+        "ok-many-pages.db3": database(count=20),
+        "refused-view.db3": database(messages=view),
+        "refused-view-as-table.db3": database(*edited("type = 'table', rootpage = 2"), messages=view),
+        "refused-view-under-another-name.db3": database(*edited("type = 'table', name = 'kept', tbl_name = 'kept'"), messages=view),
+        "refused-view-of-topics.db3": database(topics="CREATE VIEW TOPICS AS SELECT 1 AS id, '/image' AS name, 'sensor_msgs/msg/Image' AS type, 'cdr' AS serialization_format"),
+        "refused-virtual.db3": database(messages="CREATE VIRTUAL TABLE [MESSAGES] USING fts5(id, topic_id, timestamp, data)"),
+        "refused-generated.db3": database(messages=f"CREATE TABLE messages({without('data')}, data BLOB AS(zeroblob(900000000)))"),
+        "refused-generated-and-stored.db3": database(messages=f"CREATE TABLE messages({without('topic')}, topic_id INTEGER aS(1) STORED)"),
+        "refused-default.db3": database(messages=f"CREATE TABLE messages({without('data')}, data BLOB DEFAULT x'{IMAGE.hex()}')"),
+        "refused-without-rowid.db3": database(messages=f"CREATE TABLE messages({MESSAGES}) WITHOUT ROWID"),
+        "refused-column-rowid.db3": database(messages=f"CREATE TABLE messages({MESSAGES}, ROWID TEXT)"),
+        "refused-no-messages.db3": database(messages="CREATE TABLE message(id)"),
+        "refused-rows-without-end.db3": endless(sound, 3, 6),
+        "refused-topics-without-end.db3": endless(sound, 2, 6),
+        "refused-schema-without-end.db3": endless(sound, 1, 6),
+        "refused-cut.db3": sound[:1024],
+        "refused-text.db3": b"no database at all, but long enough to look like one",
+        "refused-nothing.db3": b"",
+    }.items():
+        write("bags", name, bytes(content))
+
+
 if __name__ == "__main__":
-    for make in (images, messages, bodies, states):
+    for make in (images, messages, bodies, states, bags):
         make()

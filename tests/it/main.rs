@@ -30,6 +30,7 @@ mod import;
 mod import_hostile;
 mod import_killed;
 mod import_memory;
+mod import_names;
 mod import_programs;
 mod inspection;
 mod jobs;

@@ -1,8 +1,15 @@
 //! Malformed input through the real entry points: every file of `tests/corpus`, and mutations of each. Nothing panics, every
 //! response is documented, and memory stays within the limit given to [`within_memory`]. This is a separate binary because
 //! its allocator counts.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::result_large_err,
+    missing_docs
+)]
 
+mod bags;
 mod bodies;
 mod corpus;
 #[path = "../it/fixtures.rs"]
@@ -41,6 +48,16 @@ fn within_memory<T>(limit_bytes: usize, what: &str, work: impl FnOnce() -> T) ->
         "{what}: {taken} bytes were allocated; the limit is {limit_bytes}"
     );
     result
+}
+
+#[test]
+fn property_tests_have_a_fixed_seed() {
+    let seed = proptest::test_runner::Config::default().rng_seed;
+    let is_fixed = matches!(seed, proptest::test_runner::RngSeed::Fixed(_));
+    assert!(
+        is_fixed,
+        "PROPTEST_RNG_SEED is not set; cargo reads it from .cargo/config.toml when it runs in the repository"
+    );
 }
 
 #[test]

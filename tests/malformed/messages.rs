@@ -1,6 +1,7 @@
 //! Stream messages in both sub-protocols.
 
 use axum::extract::ws::Message;
+use foreframe::error_text::shortened;
 use foreframe::server::protocol::{ClientMessage, Codec};
 use proptest::prelude::*;
 use proptest::sample::Index;
@@ -9,9 +10,13 @@ use crate::corpus::files;
 use crate::mutation::{mutated, mutations};
 use crate::{exclusive, within_memory};
 
-/// Limit of memory: this many bytes per byte of the message, plus `BASE_BYTES`.
-const BYTES_PER_BYTE: usize = 4;
-const BASE_BYTES: usize = 1 << 20;
+/// Limit of memory: this many bytes per byte of a message, plus `BASE_BYTES`. In text, the name of an unknown field takes the most: two
+/// bytes per byte in the reader's buffer if it has escapes, one in the path, and three while the error's text grows.
+const BYTES_PER_BYTE_OF_TEXT: usize = 6;
+/// In binary, a list of small numbers takes the most: each is one byte, and eight in memory.
+const BYTES_PER_BYTE_OF_BINARY: usize = 9;
+/// For many short lists, whose number is bounded.
+const BASE_BYTES: usize = 384 << 10;
 
 fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     if is_text {
@@ -24,12 +29,17 @@ fn message(is_text: bool, bytes: Vec<u8>) -> (Codec, Message) {
     }
 }
 
-/// Decodes a message within the memory limit. An error must name the sub-protocol.
+/// Decodes a message, and shortens its error as the stream does, within the memory limit. An error must name the sub-protocol.
 fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, String> {
-    let limit = BASE_BYTES + BYTES_PER_BYTE * bytes.len();
+    let per_byte = if is_text {
+        BYTES_PER_BYTE_OF_TEXT
+    } else {
+        BYTES_PER_BYTE_OF_BINARY
+    };
+    let limit = BASE_BYTES + per_byte * bytes.len();
     let (codec, message) = message(is_text, bytes);
     let decoded = within_memory(limit, name, || {
-        codec.decode(&message).map_err(|error| error.to_string())
+        codec.decode(&message).map_err(|error| shortened(&error))
     });
     if let Err(error) = &decoded {
         assert!(error.contains(codec.name()), "{name}: {error}");
@@ -60,6 +70,8 @@ proptest! {
 fn decoding_memory_is_bounded_by_the_message_length() {
     let _alone = exclusive();
     let filled = |head: &[u8], item: &[u8]| [head, &item.repeat((1 << 20) / item.len())].concat();
+    let named = |item: &[u8]| [filled(br#"{"type":"frame","\n"#, item), br#"":0}"#.to_vec()].concat();
+    let numbers = [b"\xDC\x0F\xFF".to_vec(), vec![0; 4095]].concat();
     for (is_text, bytes) in [
         (true, filled(br#"{"type":"frame","plan":["#, b"[],")),
         (true, filled(br#"{"type":"frame","plan":[["#, b"0,")),
@@ -67,6 +79,9 @@ fn decoding_memory_is_bounded_by_the_message_length() {
         (true, filled(br#"{"plan":["#, b"[],")),
         (true, filled(br#"{"colour":["#, b"0,")),
         (true, filled(b"{", br#""":0,"#)),
+        (true, named(b"[")),
+        (true, named(br"[[[[[[[\n")),
+        (true, named(br"\n")),
         (true, filled(br#"{"type":""#, b"\\n")),
         (
             false,
@@ -79,6 +94,10 @@ fn decoding_memory_is_bounded_by_the_message_length() {
         ),
         (false, filled(b"\x82\xA6colour\xDD\x7F\xFF\xFF\xFF", b"\x00")),
         (false, filled(b"\xDF\x7F\xFF\xFF\xFF", b"\xA0\x00")),
+        (
+            false,
+            filled(b"\x82\xA4type\xA5frame\xA4plan\xDD\x7F\xFF\xFF\xFF", &numbers),
+        ),
     ] {
         let name = String::from_utf8_lossy(&bytes[..40]).into_owned();
         assert!(decode(&name, is_text, bytes).is_err(), "{name}");

@@ -1,6 +1,6 @@
 //! Bags of ROS 2: MCAP files, and what `ros2 bag record` writes.
 //!
-//! One pass over the bag's files (`rosbag2`, `mcap`, `sqlite`) collects where the images are and the values of everything else (`collector`, with
+//! One pass over the bag's files (`rosbag2`, `mcap`, `sqlite` with `database`) collects where the images are and the values of everything else (`collector`, with
 //! `messages`, `cdr` and `pixels`); `choice` picks the topics, `join` gives each image its action and state. The images
 //! themselves are read later, one by one.
 
@@ -9,6 +9,8 @@ mod cdr;
 mod choice;
 mod collector;
 mod compression;
+#[cfg(feature = "server")]
+mod database;
 mod join;
 mod mcap;
 mod messages;
@@ -18,6 +20,7 @@ mod rosbag2;
 mod sqlite;
 
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use self::collector::{Collector, Content, Position};
 use self::mcap::McapFile;
@@ -79,11 +82,12 @@ impl BagFile {
     }
 }
 
-/// Reads everything of a bag but its pixels. Errors: `Option`, `Io`, `Record`.
-pub(super) fn open(source: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
-    let mut collector = Collector::new(source, options);
+/// Reads everything of a bag but its pixels. Errors: `Option`, `Io`, `Record`, `Stopped`.
+pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
+    let mut collector = Collector::new(source, options, cancelled);
     let paths = rosbag2::files(source)?;
     for path in &paths {
+        collector.check_cancelled()?;
         collector.file(path.clone());
         BagFile::scan(path, &mut collector)?;
     }

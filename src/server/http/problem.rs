@@ -6,10 +6,10 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::error;
 
+use crate::error_text::shortened;
+
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
-/// The maximum length of a detail in bytes: it may quote a long value that a client sent.
-const MAX_DETAIL_BYTES: usize = 1000;
 
 /// An error as a client sees it: problem details, RFC 9457.
 #[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
@@ -125,7 +125,7 @@ impl IntoResponse for ApiError {
             kind: format!("urn:foreframe:problem:{slug}"),
             title: status.canonical_reason().unwrap_or(slug),
             status: status.as_u16(),
-            detail: bounded(self.detail()),
+            detail: shortened(&self.detail()),
             instance: String::new(),
         });
         response
@@ -154,16 +154,6 @@ pub(in crate::server) fn finish(mut response: Response, request_id: &str) -> Res
 #[expect(clippy::expect_used, reason = "a struct of texts and a number is always valid JSON")]
 fn json(problem: &Problem) -> Vec<u8> {
     serde_json::to_vec(problem).expect("a problem that is not JSON is a bug")
-}
-
-/// The detail, shortened in the middle if it is too long.
-pub(in crate::server) fn bounded(detail: String) -> String {
-    if detail.len() <= MAX_DETAIL_BYTES {
-        return detail;
-    }
-    let head = detail.floor_char_boundary(MAX_DETAIL_BYTES / 2);
-    let tail = detail.ceil_char_boundary(detail.len() - MAX_DETAIL_BYTES / 2);
-    format!("{} … {}", &detail[..head], &detail[tail..])
 }
 
 /// The response to a connection over the limit, as bytes on the wire: no request is read from it.
@@ -214,21 +204,4 @@ pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
         body.len()
     );
     Some([head.as_bytes(), &body].concat())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_long_detail_keeps_its_beginning_and_its_end() {
-        let long = format!("unknown field `{}` at line 1", "ä".repeat(1000));
-        let bounded = bounded(long.clone());
-        assert!(
-            bounded.len() < MAX_DETAIL_BYTES + 10 && bounded.starts_with("unknown field `ä"),
-            "{bounded}"
-        );
-        assert!(bounded.ends_with("ä` at line 1"), "{bounded}");
-        assert_eq!(super::bounded("short".to_owned()), "short");
-    }
 }

@@ -1,6 +1,7 @@
 //! One WebSocket of a session. Three things run at the same time, each in order: it reads and checks messages, computes
 //! the answers to earlier ones, and sends the answers that are ready.
 
+use std::fmt::Display;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,13 +21,13 @@ use super::protocol::{
 };
 use super::session::{Owner, Ownership, Session};
 use super::step::{FrameStep, StepError};
+use crate::error_text::shortened;
 use crate::frame::fit::Fit;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
 use crate::server::http::body_budget;
 use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::message_bytes::MessageBytes;
-use crate::server::http::problem::bounded;
 use crate::server::http::streams::{Streams, stop_requested};
 use crate::server::images::ImageFormat;
 use crate::serving::Predictor;
@@ -44,8 +45,8 @@ enum PipelinedItem {
 
 impl PipelinedItem {
     /// The detail is shortened here already, since it waits in memory.
-    fn refused(code: ErrorCode, detail: String) -> Self {
-        Self::Refused(code, bounded(detail))
+    fn refused(code: ErrorCode, detail: &dyn Display) -> Self {
+        Self::Refused(code, shortened(detail))
     }
 }
 
@@ -182,7 +183,7 @@ impl StreamConnection {
                 Received::Idle => return Ok(ClosingReason::Idle),
                 Received::Unreadable(reason, code, detail) => {
                     inbox
-                        .send(PipelinedItem::refused(code, detail))
+                        .send(PipelinedItem::refused(code, &detail))
                         .await
                         .map_err(|_| ClientGone)?;
                     return Ok(reason);
@@ -193,7 +194,7 @@ impl StreamConnection {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
                     self.checked(frame, fit).await.map_or_else(
-                        |error| PipelinedItem::refused(error.code(), error.to_string()),
+                        |error| PipelinedItem::refused(error.code(), &error),
                         |step| PipelinedItem::Frame(Box::new(step)),
                     )
                 }
@@ -207,7 +208,7 @@ impl StreamConnection {
                     continue;
                 }
                 Ok(ClientMessage::Close(_)) => return Ok(ClosingReason::Asked),
-                Err(error) => PipelinedItem::refused(ErrorCode::Malformed, error.to_string()),
+                Err(error) => PipelinedItem::refused(ErrorCode::Malformed, &error),
             };
             inbox.send(item).await.map_err(|_| ClientGone)?;
         }
@@ -282,7 +283,7 @@ impl StreamConnection {
                         Ok(answer) => answer,
                         // The reader notices it too, and gives the reason.
                         Err(StepError::NotOwner) => return,
-                        Err(error) => self.error(error.code(), bounded(error.to_string())),
+                        Err(error) => self.error(error.code(), shortened(&error)),
                     }
                 }
                 PipelinedItem::Configure(message) => self.ownership.session().configure(message),

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
@@ -128,6 +129,7 @@ pub(super) struct Topic {
 pub(super) struct Collector<'a> {
     pub(super) source: &'a Path,
     pub(super) options: &'a ImportOptions,
+    cancelled: &'a AtomicBool,
     pub(super) topics: Vec<Topic>,
     by_name: HashMap<(String, String), usize>,
     used_topics: usize,
@@ -138,10 +140,11 @@ pub(super) struct Collector<'a> {
 }
 
 impl<'a> Collector<'a> {
-    pub(super) fn new(source: &'a Path, options: &'a ImportOptions) -> Self {
+    pub(super) fn new(source: &'a Path, options: &'a ImportOptions, cancelled: &'a AtomicBool) -> Self {
         Self {
             source,
             options,
+            cancelled,
             topics: Vec::new(),
             by_name: HashMap::new(),
             used_topics: 0,
@@ -149,6 +152,14 @@ impl<'a> Collector<'a> {
             files: Vec::new(),
             skipped: SkippedList::default(),
         }
+    }
+
+    /// Errors: `Stopped` if the import was cancelled.
+    pub(super) fn check_cancelled(&self) -> Result<(), ImportError> {
+        if self.cancelled.load(Ordering::Relaxed) {
+            return Err(ImportError::Stopped);
+        }
+        Ok(())
     }
 
     /// The messages that follow are in this file.
