@@ -97,7 +97,7 @@ async fn create(
         expires_s: expires_in_s.map(|seconds| now_s + seconds),
         requests_per_s,
     };
-    store.add_key(row, &Author::command_line()).await?;
+    store.add_key(row, &Author::CommandLine).await?;
     print_line(key.text)
 }
 
@@ -145,7 +145,7 @@ async fn list(store: &Store) -> Result<(), CliError> {
 
 async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
     let now_s = store.now_s().await?;
-    if store.revoke_key(id, now_s, &Author::command_line()).await? {
+    if store.revoke_key(id, now_s, &Author::CommandLine).await? {
         let is_last = store.list_keys().await?.iter().all(|key| !key.is_valid(now_s));
         let consequence = if is_last {
             "; it was the last valid key: every request is refused until another is created"

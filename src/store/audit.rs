@@ -5,10 +5,6 @@ use tracing::info;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::{Store, StoreError, unix_s};
 
-/// Who changes something while authentication is off.
-const ANONYMOUS: &str = "anonymous";
-/// Who changes something on the command line.
-const COMMAND_LINE: &str = "command line";
 /// How many rows are kept; the oldest are deleted.
 const MAX_ROWS: i64 = 100_000;
 
@@ -31,34 +27,47 @@ pub struct AuditRow {
 
 /// Who makes a change.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Author(String);
+pub enum Author {
+    /// The user of the API key with this id.
+    Key(String),
+    /// A client of a server without authentication.
+    Anonymous,
+    /// The user of the command line.
+    CommandLine,
+}
 
 impl Author {
-    /// The user of an API key; without its id, a client of a server without authentication.
+    /// The user of an API key; without an id, there is no authentication.
     #[must_use]
     pub fn of_key(id: &str) -> Self {
-        Self(if id.is_empty() { ANONYMOUS } else { id }.to_owned())
-    }
-
-    /// The user of the command line.
-    #[must_use]
-    pub fn command_line() -> Self {
-        Self(COMMAND_LINE.to_owned())
+        if id.is_empty() {
+            Self::Anonymous
+        } else {
+            Self::Key(id.to_owned())
+        }
     }
 
     /// The id of the API key; empty without one.
     #[must_use]
     pub fn key_id(&self) -> &str {
-        if [ANONYMOUS, COMMAND_LINE].contains(&self.0.as_str()) {
-            ""
-        } else {
-            &self.0
+        match self {
+            Self::Key(id) => id,
+            Self::Anonymous | Self::CommandLine => "",
+        }
+    }
+
+    /// How the audit trail names them.
+    fn name(&self) -> &str {
+        match self {
+            Self::Key(id) => id,
+            Self::Anonymous => "anonymous",
+            Self::CommandLine => "command line",
         }
     }
 
     pub(super) fn change(&self, action: &'static str, target: impl Into<String>) -> Change {
         Change {
-            who: self.0.clone(),
+            who: self.name().to_owned(),
             action,
             target: target.into(),
         }
@@ -73,24 +82,24 @@ pub(super) struct Change {
 }
 
 impl Change {
-    /// Adds the change to the audit trail. Errors: `Query`.
-    pub(super) async fn record(&self, tx: &mut Tx) -> Result<(), StoreError> {
+    /// Adds the change to the audit trail, commits the transaction that makes it, and logs it. Errors: `Query`.
+    pub(super) async fn commit(self, mut tx: Tx) -> Result<(), StoreError> {
+        let Self { who, action, target } = self;
         // Locked until the commit, so that the numbers are in the order of the commits.
         tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'audit'", vec![])
             .await?;
         let sql = "INSERT INTO audit (number, time_s, who, action, target) \
              SELECT value, $1, $2, $3, $4 FROM counters WHERE name = 'audit'";
-        let (who, target) = (self.who.as_str(), self.target.as_str());
-        let values = vec![unix_s().into(), who.into(), self.action.into(), target.into()];
+        let values = vec![
+            unix_s().into(),
+            who.as_str().into(),
+            action.into(),
+            target.as_str().into(),
+        ];
         tx.execute(sql, values).await?;
         let sql = "DELETE FROM audit WHERE number <= (SELECT value FROM counters WHERE name = 'audit') - $1";
-        tx.execute(sql, vec![MAX_ROWS.into()]).await.map(drop)
-    }
-
-    /// Commits the transaction that made and recorded the change, and logs it. Errors: `Query`.
-    pub(super) async fn commit(self, tx: Tx) -> Result<(), StoreError> {
+        tx.execute(sql, vec![MAX_ROWS.into()]).await?;
         tx.commit().await?;
-        let Self { who, action, target } = self;
         info!(
             audit.who = who,
             audit.action = action,
@@ -113,25 +122,20 @@ impl Store {
         if tx.execute(sql, values).await? == 0 {
             return Ok(false);
         }
-        change.record(&mut tx).await?;
         change.commit(tx).await?;
         Ok(true)
     }
 
     /// Records a deletion of a data set, before its files are deleted: so none is deleted without an entry. Errors: `Query`.
     pub async fn record_dataset_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
-        self.record(by.change("dataset.delete", dataset)).await
+        let change = by.change("dataset.delete", dataset);
+        change.commit(self.database.begin().await?).await
     }
 
     /// Records that the files of a data set could not be deleted, after all. Errors: `Query`.
     pub async fn record_failed_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
-        self.record(by.change("dataset.delete.failed", dataset)).await
-    }
-
-    async fn record(&self, change: Change) -> Result<(), StoreError> {
-        let mut tx = self.database.begin().await?;
-        change.record(&mut tx).await?;
-        change.commit(tx).await
+        let change = by.change("dataset.delete.failed", dataset);
+        change.commit(self.database.begin().await?).await
     }
 
     /// The changes before a number, the newest first. Errors: `Query`.

@@ -218,7 +218,6 @@ impl Store {
         let row = first_job(&tx.fetch(sql, values).await?)?;
         let row = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?;
         let change = Author::of_key(&row.submitter).change("job.create", job_id(row.number));
-        change.record(&mut tx).await?;
         change.commit(tx).await?;
         Ok(EnqueueResult::New(row))
     }
@@ -244,7 +243,6 @@ impl Store {
              stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
         let row = first_job(&tx.fetch(sql, vec![number.into()]).await?)?;
         let change = by.change("job.resume", job_id(number));
-        change.record(&mut tx).await?;
         change.commit(tx).await?;
         Ok(row.map(EnqueueResult::New))
     }

@@ -107,7 +107,7 @@ impl Store {
             expires_s: None,
             requests_per_s: None,
         };
-        self.add_key(key, &Author::command_line()).await
+        self.add_key(key, &Author::CommandLine).await
     }
 
     /// Adds a key. Errors: `Query`, also if the id exists.

@@ -21,7 +21,7 @@ impl Versions {
             self.store.objects().delete(&key(model, version)).await?;
             return Err(error);
         }
-        let by = Author::command_line();
+        let by = Author::CommandLine;
         self.store.publish_version(model, version, unix_s(), &by).await?;
         if activates {
             self.store.set_active(model, version, unix_s(), &by).await?;
@@ -32,7 +32,7 @@ impl Versions {
     /// Makes a version the active one, for servers of the store to load. Errors: `Unknown`, `Refused`, `Store`.
     pub async fn choose(&self, model: &str, version: u32) -> Result<(), VersionError> {
         self.load(model, version).await?;
-        let by = Author::command_line();
+        let by = Author::CommandLine;
         Ok(self.store.set_active(model, version, unix_s(), &by).await?)
     }
 
@@ -70,7 +70,7 @@ impl Versions {
             let (model, version) = of_model(version);
             return Err(VersionError::Shipped { model, version });
         }
-        let by = Author::command_line();
+        let by = Author::CommandLine;
         if version.is_none() {
             match shipped {
                 Some(shipped) => self.store.set_active(model, shipped, unix_s(), &by).await?,

@@ -128,13 +128,19 @@ fn a_damaged_backup_is_not_restored() {
     assert!(fail(dir.path(), &restore).contains("is not empty"));
 }
 
+/// A directory with the backups `one` and, with another model, `two`.
+fn two_backups() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    for (model, backup) in [("mine", "one"), ("other", "two")] {
+        succeed(dir.path(), &["publish", &paper(), "--name", model]);
+        succeed(dir.path(), &["backup", backup]);
+    }
+    dir
+}
+
 #[test]
 fn a_restore_killed_early_is_finished_by_the_next_one() {
-    let dir = tempfile::tempdir().unwrap();
-    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
-    succeed(dir.path(), &["backup", "one"]);
-    succeed(dir.path(), &["publish", &paper(), "--name", "other"]);
-    succeed(dir.path(), &["backup", "two"]);
+    let dir = two_backups();
     let restored = dir.path().join("restored");
     let restore = |backup: &str| succeed(dir.path(), &["restore", backup, "--data-dir", "restored"]);
     let partial = format!("restore-unfinished.{:016x}.partial", 7);
@@ -164,11 +170,7 @@ fn a_restore_killed_early_is_finished_by_the_next_one() {
 
 #[test]
 fn a_restore_killed_at_any_time_leaves_no_file_of_another_backup() {
-    let dir = tempfile::tempdir().unwrap();
-    succeed(dir.path(), &["publish", &paper(), "--name", "mine"]);
-    succeed(dir.path(), &["backup", "one"]);
-    succeed(dir.path(), &["publish", &paper(), "--name", "other"]);
-    succeed(dir.path(), &["backup", "two"]);
+    let dir = two_backups();
     let restored = dir.path().join("restored");
     for delay_ms in [0, 1, 2, 4, 8, 16, 32] {
         let mut killed = crate::process::foreframe(dir.path())

@@ -25,7 +25,7 @@ async fn a_start_finishes_interrupted_deletions() {
     for version in [1, 2] {
         assert!(
             store
-                .delete_version("mine", version, unix_s(), &Author::command_line())
+                .delete_version("mine", version, unix_s(), &Author::CommandLine)
                 .await
                 .unwrap()
         );

@@ -10,7 +10,7 @@ use foreframe::dataset::import::ImportOptions;
 use serde_json::{Value, json};
 
 use crate::import::run;
-use crate::process::{RunningServer, foreframe};
+use crate::process::{RunningServer, foreframe, is_alive, signal};
 use crate::recordings::{self, contents, has_ffmpeg};
 use crate::service::TIMEOUT;
 
@@ -48,16 +48,6 @@ fn wait_for<T>(mut condition: impl FnMut() -> Option<T>) -> T {
         assert!(Instant::now() < deadline, "it did not come");
         std::thread::sleep(Duration::from_millis(2));
     }
-}
-
-fn signal(name: &str, process: u32) {
-    let sent = Command::new("kill").args([name, &process.to_string()]).status();
-    assert!(sent.unwrap().success());
-}
-
-fn is_alive(process: u32) -> bool {
-    let stat = fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
-    !stat.is_empty() && !stat.rsplit_once(") ").is_some_and(|(_, rest)| rest.starts_with('Z'))
 }
 
 /// Waits until the decoder runs, and stops it there: it would stay as it is until somebody kills it.

@@ -4,7 +4,7 @@
 use foreframe::server::ServerConfig;
 use serde_json::{Value, json};
 
-use crate::process::RunningServer;
+use crate::process::{RunningServer, is_alive, signal};
 use crate::service::{app, get, poll_until, post};
 
 const JOBS: &str = "/v1/jobs";
@@ -37,13 +37,6 @@ fn niceness(process: u32) -> i64 {
     rest.split(' ').nth(16).unwrap().parse().unwrap()
 }
 
-fn kill(process: u32) {
-    let killed = std::process::Command::new("kill")
-        .args(["-KILL", &process.to_string()])
-        .status();
-    assert!(killed.unwrap().success());
-}
-
 /// The child that works on the job's given attempt.
 fn child_of(served: &RunningServer, attempt: u64) -> u32 {
     served.wait_for_job("job-1", |job| {
@@ -69,7 +62,7 @@ fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
     assert_eq!(niceness(first), low);
     for attempt in 1..=3 {
         let child = child_of(&served, attempt);
-        kill(child);
+        signal("-KILL", child);
         served.wait_while_alive(child);
     }
     let job = served.ended_job("job-1");
@@ -97,10 +90,7 @@ fn a_job_without_progress_is_stopped() {
     let served = RunningServer::start(dir.path(), &limits);
     served.ask("POST", JOBS, &collect("seen", 1_000_000));
     let child = child_of(&served, 1);
-    let stopped = std::process::Command::new("kill")
-        .args(["-STOP", &child.to_string()])
-        .status();
-    assert!(stopped.unwrap().success());
+    signal("-STOP", child);
     let job = served.ended_job("job-1");
     assert_eq!(job["state"], "failed", "{job}");
     let error = job["error"].as_str().unwrap();
@@ -123,11 +113,6 @@ fn a_job_ends_with_the_server_that_is_killed() {
         assert!(std::time::Instant::now() < deadline);
         std::thread::sleep(std::time::Duration::from_millis(10));
     }
-}
-
-fn is_alive(process: u32) -> bool {
-    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
-    !stat.is_empty() && !stat.rsplit_once(") ").is_some_and(|(_, rest)| rest.starts_with('Z'))
 }
 
 impl RunningServer {

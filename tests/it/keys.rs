@@ -45,7 +45,7 @@ async fn authentication_starts_with_the_first_key() {
     assert_eq!(get(&app, "/v1/models").await.status, 200);
     let key = new_key(&store, &keys).await;
     assert_eq!(get(&app, "/v1/models").await.status, 401);
-    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::CommandLine).await.unwrap());
     keys.refresh().await.unwrap();
     // Revoking the last key does not switch authentication off.
     assert_eq!(get(&app, "/v1/models").await.status, 401);
@@ -71,7 +71,7 @@ async fn the_api_requires_a_valid_key() {
     for path in ["/", "/livez", "/metrics", "/openapi.json", "/docs/"] {
         assert_eq!(get(&app, path).await.status, 200, "{path}");
     }
-    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::CommandLine).await.unwrap());
     keys.refresh().await.unwrap();
     assert_eq!(models_with(&app, &format!("Bearer {}", key.text)).await.status, 401);
 }
@@ -89,7 +89,7 @@ async fn a_stream_ends_when_its_key_is_revoked() {
         tokio_tungstenite::connect_async(request).await.unwrap().0
     };
     let (mut revoked, mut kept) = (connect(&key).await, connect(&other).await);
-    assert!(store.revoke_key(&key.id, 2.0, &Author::command_line()).await.unwrap());
+    assert!(store.revoke_key(&key.id, 2.0, &Author::CommandLine).await.unwrap());
     keys.refresh().await.unwrap();
     let mut messages = Vec::new();
     while let Some(Ok(message)) = tokio::time::timeout(TIMEOUT, revoked.next()).await.unwrap() {
@@ -174,7 +174,7 @@ async fn limited_key(store: &Store, keys: &Keys, limits: impl FnOnce(&mut KeyRow
         requests_per_s: None,
     };
     limits(&mut row);
-    store.add_key(row, &Author::command_line()).await.unwrap();
+    store.add_key(row, &Author::CommandLine).await.unwrap();
     keys.refresh().await.unwrap();
     key
 }
@@ -335,7 +335,7 @@ async fn a_key_sees_its_own_sessions_only() {
             expires_s: None,
             requests_per_s: None,
         };
-        store.add_key(row, &Author::command_line()).await.unwrap();
+        store.add_key(row, &Author::CommandLine).await.unwrap();
         owners.push(key);
     }
     keys.refresh().await.unwrap();

@@ -25,6 +25,19 @@ pub(crate) fn output(dir: &Path, arguments: &[&str]) -> Output {
     foreframe(dir).args(arguments).output().unwrap()
 }
 
+/// Sends a signal, such as `-STOP`, to a process.
+pub(crate) fn signal(name: &str, process: u32) {
+    let sent = Command::new("kill").args([name, &process.to_string()]).status();
+    assert!(sent.unwrap().success());
+}
+
+/// Whether a process runs: it exists and is no zombie.
+#[cfg(target_os = "linux")]
+pub(crate) fn is_alive(process: u32) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+    !stat.is_empty() && !stat.rsplit_once(") ").is_some_and(|(_, rest)| rest.starts_with('Z'))
+}
+
 pub(crate) fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
 }
@@ -69,8 +82,7 @@ impl Program {
     }
 
     pub(crate) fn terminate(&self) {
-        let kill = Command::new("kill").args(["-TERM", &self.id().to_string()]).status();
-        assert!(kill.unwrap().success());
+        signal("-TERM", self.id());
     }
 
     /// Waits for a successful exit and returns the log.

@@ -111,7 +111,7 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         for line in ["one", "two", "three", "four"] {
             assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
-        assert!(store.ask_to_cancel(1, &Author::command_line()).await.unwrap());
+        assert!(store.ask_to_cancel(1, &Author::CommandLine).await.unwrap());
         assert_eq!(
             store.renew_at(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
@@ -188,15 +188,15 @@ async fn the_queue_limit_keys_and_names_are_enforced() {
         assert!(matches!(enqueue(job(None, None)).await, EnqueueResult::New(_)));
         assert_eq!(enqueue(job(None, None)).await, EnqueueResult::Full);
         assert!(
-            store.cancel_queued(1, 1.0, &Author::command_line()).await.unwrap()
-                && !store.cancel_queued(1, 1.0, &Author::command_line()).await.unwrap()
+            store.cancel_queued(1, 1.0, &Author::CommandLine).await.unwrap()
+                && !store.cancel_queued(1, 1.0, &Author::CommandLine).await.unwrap()
         );
         assert!(matches!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::New(row) if row.number == 3));
         assert_eq!(
-            store.requeue(1, 2, &Author::command_line()).await.unwrap(),
+            store.requeue(1, 2, &Author::CommandLine).await.unwrap(),
             Some(EnqueueResult::Taken)
         );
-        assert_eq!(store.requeue(2, 2, &Author::command_line()).await.unwrap(), None);
+        assert_eq!(store.requeue(2, 2, &Author::CommandLine).await.unwrap(), None);
         assert_eq!(store.job_of_key("k").await.unwrap().unwrap().number, 1);
     }
 }
@@ -253,7 +253,7 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
         }
         for number in 1..=3 {
             store
-                .cancel_queued(number, number as f64, &Author::command_line())
+                .cancel_queued(number, number as f64, &Author::CommandLine)
                 .await
                 .unwrap();
         }
@@ -328,22 +328,11 @@ async fn versions_are_numbered_after_the_shipped_one() {
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
         // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
+        assert!(!store.delete_version("m", 5, 1.0, &Author::CommandLine).await.unwrap());
+        store.set_active("m", 4, 1.0, &Author::CommandLine).await.unwrap();
         assert!(
-            !store
-                .delete_version("m", 5, 1.0, &Author::command_line())
-                .await
-                .unwrap()
-        );
-        store.set_active("m", 4, 1.0, &Author::command_line()).await.unwrap();
-        assert!(
-            store
-                .delete_version("m", 6, 1.0, &Author::command_line())
-                .await
-                .unwrap()
-                && !store
-                    .delete_version("m", 6, 1.0, &Author::command_line())
-                    .await
-                    .unwrap()
+            store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()
+                && !store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()
         );
         assert_eq!(reserve(&store, "m").await.1, 7);
     }
@@ -364,8 +353,8 @@ async fn keys_are_found_by_id_and_revoked_once() {
             .collect();
         assert_eq!(names, ["room", "robot"]);
         assert!(
-            store.revoke_key("b", 5.0, &Author::command_line()).await.unwrap()
-                && !store.revoke_key("b", 6.0, &Author::command_line()).await.unwrap()
+            store.revoke_key("b", 5.0, &Author::CommandLine).await.unwrap()
+                && !store.revoke_key("b", 6.0, &Author::CommandLine).await.unwrap()
         );
         assert_eq!(store.find_key("b").await.unwrap().unwrap().revoked_s, Some(5.0));
         assert_eq!(store.find_key("c").await.unwrap(), None);
@@ -501,14 +490,14 @@ async fn a_key_has_its_share_of_the_job_queue() {
             ("b", KeyScope::Admin),
             ("robot", KeyScope::Predict),
         ] {
-            store.add_key(key(id, scope), &Author::command_line()).await.unwrap();
+            store.add_key(key(id, scope), &Author::CommandLine).await.unwrap();
         }
         for _ in 0..4 {
             assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
         }
         assert_eq!(enqueued_by(&store, "a").await, EnqueueResult::ShareFull(4));
         assert!(matches!(enqueued_by(&store, "b").await, EnqueueResult::New(_)));
-        store.revoke_key("b", 1.0, &Author::command_line()).await.unwrap();
+        store.revoke_key("b", 1.0, &Author::CommandLine).await.unwrap();
         assert!(matches!(enqueued_by(&store, "a").await, EnqueueResult::New(_)));
         let stored = store.find_key("robot").await.unwrap().unwrap();
         assert_eq!(stored, key("robot", KeyScope::Predict));

@@ -48,7 +48,7 @@ async fn create(
 ) -> Result<impl IntoResponse, ApiError> {
     let (model, state, settings) = request.resolve(&app)?;
     let now = Instant::now();
-    let created = Session::new(model, state, settings, (caller, now));
+    let created = Session::new(model, state, settings, caller, now);
     let (session, token) = created.map_err(|error| ApiError::Internal(error.to_string()))?;
     let session = app.sessions().insert(session, now)?;
     let created = CreatedSession {

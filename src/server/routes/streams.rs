@@ -91,7 +91,8 @@ async fn model_stream(
         model,
         SessionState::default(),
         SessionSettings::default(),
-        (caller, Instant::now()),
+        caller,
+        Instant::now(),
     );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
     let services = services(&app, caller, messages);

@@ -50,7 +50,8 @@ impl Session {
         model: Arc<LoadedModel>,
         state: SessionState,
         settings: SessionSettings,
-        (maker, now): (Caller, Instant),
+        maker: Caller,
+        now: Instant,
     ) -> Result<(Self, String), getrandom::Error> {
         let (id, token) = (Token::random()?, Token::random()?);
         let session = Self {
