@@ -7,13 +7,11 @@ use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
 use arrow_array::{Array, BinaryArray, RecordBatch, StructArray};
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{
-    ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder,
-};
 
 use super::check::Numbers;
 use super::frame_file::{FrameFileWriter, FrameImage};
 use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
+use super::parquet_file::Batches;
 use super::shard::{EpisodeRecord, RECORDS_KEY};
 use super::{DatasetError, DatasetInfo, Episode, parquet_file};
 use crate::frame::codec;
@@ -24,9 +22,8 @@ const IMAGE_ROWS: usize = 64;
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
 pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let metadata =
-        ArrowReaderMetadata::load(&file, ArrowReaderOptions::default()).map_err(|error| corrupt(path, &error))?;
-    let pairs = metadata.metadata().file_metadata().key_value_metadata();
+    let builder = parquet_file::open(file).map_err(|error| corrupt(path, &error))?;
+    let pairs = builder.metadata().file_metadata().key_value_metadata();
     let text = pairs
         .and_then(|pairs| pairs.iter().find(|pair| pair.key == RECORDS_KEY))
         .and_then(|pair| pair.value.as_deref())
@@ -38,7 +35,7 @@ pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
 pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = parquet_file::open(file)
-        .and_then(ParquetRecordBatchReaderBuilder::build)
+        .and_then(parquet_file::batches)
         .map_err(|error| corrupt(path, &error))?;
     reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, &error))
 }
@@ -128,17 +125,17 @@ pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
     Ok(numbers)
 }
 
-fn reader(path: &Path, with_images: bool) -> Result<ParquetRecordBatchReader, DatasetError> {
+fn reader(path: &Path, with_images: bool) -> Result<Batches, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let built = parquet_file::open(file).and_then(|builder| {
         if with_images {
-            return builder.with_batch_size(IMAGE_ROWS).build();
+            return parquet_file::batches(builder.with_batch_size(IMAGE_ROWS));
         }
         let columns = builder.schema().fields().iter().enumerate();
         let numbers = columns.filter(|(_, column)| ![IMAGE, MASK].contains(&column.name().as_str()));
         let numbers = numbers.map(|(index, _)| index).collect::<Vec<usize>>();
         let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
-        builder.with_projection(columns).build()
+        parquet_file::batches(builder.with_projection(columns))
     });
     built.map_err(|error| corrupt(path, &error))
 }

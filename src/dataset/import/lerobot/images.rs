@@ -119,15 +119,15 @@ impl ImageTable {
             }
             start = end;
         }
-        let reader = builder
+        let builder = builder
             .with_projection(mask)
             .with_row_groups(groups)
             .with_offset(first - skipped)
             .with_limit(BLOCK_ROWS)
-            .with_batch_size(BLOCK_ROWS)
-            .build();
+            .with_batch_size(BLOCK_ROWS);
+        let batches = parquet_file::batches(builder);
         let mut images = Vec::with_capacity(BLOCK_ROWS);
-        for batch in reader.map_err(|error| wrong(error.to_string()))? {
+        for batch in batches.map_err(|error| wrong(error.to_string()))? {
             let batch = batch.map_err(|error| wrong(error.to_string()))?;
             let stored = stored_images(&batch)
                 .ok_or_else(|| wrong(format!("its column {:?} does not hold images", self.column)))?;

@@ -52,12 +52,9 @@ pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> R
     }
     let roots = (0..fields.len()).filter(|&root| wanted.contains(&fields[root].name().as_str()));
     let mask = ProjectionMask::roots(builder.parquet_schema(), roots.collect::<Vec<_>>());
-    let reader = builder
-        .with_projection(mask)
-        .build()
-        .map_err(|error| wrong(error.to_string()))?;
+    let batches = parquet_file::batches(builder.with_projection(mask)).map_err(|error| wrong(error.to_string()))?;
     let mut rows = Vec::new();
-    for batch in reader {
+    for batch in batches {
         let batch = batch.map_err(|error| wrong(error.to_string().trim().to_owned()))?;
         append(&batch, components, &mut rows).map_err(|column| {
             wrong(format!(
