@@ -21,10 +21,10 @@ pub fn with_causes(error: &dyn Error) -> String {
     joined
 }
 
-/// The text without its middle if it has more than 1000 bytes: an error may quote a long value that a client sent. The whole text is never
-/// in memory.
+/// The text; if it has more than 1000 bytes, its beginning and its end: an error may quote a long value that a client sent. Never
+/// holds the whole text.
 #[must_use]
-pub fn shortened(text: &dyn Display) -> String {
+pub fn without_middle(text: &dyn Display) -> String {
     let mut ends = Ends::default();
     // Nothing but a `Display` that fails gives an error here; what it wrote before is kept.
     let _ = write!(ends, "{text}");
@@ -129,11 +129,11 @@ mod tests {
 
     #[test]
     fn a_long_text_keeps_its_beginning_and_its_end() {
-        assert_eq!(shortened(&"short"), "short");
+        assert_eq!(without_middle(&"short"), "short");
         let whole = "ä".repeat(MAX_SHORTENED_BYTES / 2);
-        assert_eq!(shortened(&whole), whole);
+        assert_eq!(without_middle(&whole), whole);
         for length in [1000, 1001, 100_000] {
-            let long = shortened(&format_args!("unknown field `{}` at line {}", "ä".repeat(length), 1));
+            let long = without_middle(&format_args!("unknown field `{}` at line {}", "ä".repeat(length), 1));
             assert!(
                 long.len() < MAX_SHORTENED_BYTES + 10 && long.starts_with("unknown field `ä"),
                 "{long}"
@@ -141,7 +141,7 @@ mod tests {
             assert!(long.contains("ä … ä") && long.ends_with("ä` at line 1"), "{long}");
         }
         let in_pieces = fmt::from_fn(|f| (0..2000).try_for_each(|number| write!(f, "{number},")));
-        assert_eq!(shortened(&in_pieces), shortened(&in_pieces.to_string()));
+        assert_eq!(without_middle(&in_pieces), without_middle(&in_pieces.to_string()));
     }
 
     #[test]

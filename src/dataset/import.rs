@@ -212,8 +212,8 @@ pub enum ImportError {
     Stopped,
     /// The frames need more room beside the data set than they may have.
     #[error(
-        "its frames need {needed_mib} MiB of disk space until they are imported, and may have {limit_mib} MiB (setting \
-         import_disk_mib); raise the setting, or save them without compression"
+        "the compressed frames need {needed_mib} MiB of disk space during the import; the setting import_disk_mib allows \
+         {limit_mib} MiB: raise it, or save the array without compression"
     )]
     Disk {
         /// What they need.

@@ -114,10 +114,12 @@ pub struct ServerConfig {
     pub job_max_attempts: u32,
     /// How long one attempt of a job can run, in seconds; 0 for no limit.
     pub job_time_limit_s: u64,
-    /// How long a running job may report no progress, in seconds; 0 for no limit. Then its process is killed, and the next attempt
-    /// resumes from the last checkpoint.
+    /// How long a running job may report no progress, in seconds; 0 for no limit. After this time its process is killed, and the
+    /// next attempt resumes from the last checkpoint. An import reports no progress while it reads the recording: raise this limit
+    /// for recordings that take longer.
     pub job_stall_limit_s: u64,
-    /// Disk space for the frames of a compressed `.npz` file while they are imported, in MiB. A larger one is refused.
+    /// Disk space for the frames of a compressed `.npz` file while they are imported, in MiB. An import that needs more is refused;
+    /// 0 refuses all compressed frames.
     pub import_disk_mib: u64,
     /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
     #[serde(skip)]

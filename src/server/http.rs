@@ -17,7 +17,7 @@ pub(super) mod page;
 pub(super) mod problem;
 mod rate;
 pub(super) mod request_limit;
-pub(super) mod streams;
+pub(super) mod task_limit;
 pub(super) mod tls;
 
 pub mod keys;

@@ -15,7 +15,7 @@ use super::http::admission::Admission;
 use super::http::body_budget::BodyBudget;
 use super::http::keys::{Caller, Keys};
 use super::http::message_bytes::MessageBytes;
-use super::http::streams::{Streams, stop_requested};
+use super::http::task_limit::{TaskLimit, stop_requested};
 use super::http::tls::ServerTls;
 use super::pictures::Pictures;
 use super::stream::connection::StreamServices;
@@ -80,9 +80,9 @@ pub struct AppParts {
 struct AppState {
     config: Arc<ServerConfig>,
     parts: AppParts,
-    streams: Streams,
-    event_streams: Streams,
-    changes: Streams,
+    streams: TaskLimit,
+    event_streams: TaskLimit,
+    changes: TaskLimit,
     admission: Admission,
     body_budget: BodyBudget,
     predictions: BlockingWork,
@@ -149,9 +149,9 @@ impl App {
     pub fn with_parts(config: ServerConfig, parts: AppParts) -> Self {
         Self {
             shared: Arc::new(AppState {
-                streams: Streams::new("streams", config.max_streams),
-                event_streams: Streams::new("event streams", config.max_event_streams),
-                changes: Streams::new("changes", config.max_requests),
+                streams: TaskLimit::new("streams", config.max_streams),
+                event_streams: TaskLimit::new("event streams", config.max_event_streams),
+                changes: TaskLimit::new("changing requests", config.max_requests),
                 admission: Admission::new(&config),
                 body_budget: BodyBudget::new(&config),
                 predictions: BlockingWork::new("predictions", config.request_threads),
@@ -226,16 +226,16 @@ impl App {
         &self.keys
     }
 
-    pub(super) fn streams(&self) -> &Streams {
+    pub(super) fn streams(&self) -> &TaskLimit {
         &self.shared.streams
     }
 
-    pub(super) fn event_streams(&self) -> &Streams {
+    pub(super) fn event_streams(&self) -> &TaskLimit {
         &self.shared.event_streams
     }
 
     /// The requests that change state and are being completed.
-    pub(super) fn changes(&self) -> &Streams {
+    pub(super) fn changes(&self) -> &TaskLimit {
         &self.shared.changes
     }
 

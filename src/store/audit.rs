@@ -56,8 +56,8 @@ impl Author {
         }
     }
 
-    /// How the audit trail names them.
-    fn name(&self) -> &str {
+    /// The value of the entry's `who`.
+    fn who(&self) -> &str {
         match self {
             Self::Key(id) => id,
             Self::Anonymous => "anonymous",
@@ -67,7 +67,7 @@ impl Author {
 
     pub(super) fn change(&self, action: &'static str, target: impl Into<String>) -> Change {
         Change {
-            who: self.name().to_owned(),
+            who: self.who().to_owned(),
             action,
             target: target.into(),
         }

@@ -180,10 +180,8 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
     let marker = begin_restore(data_dir, database.as_deref(), &index)?;
     for (name, expected) in &index.files {
         let source = inside(from, name).ok_or_else(|| no_backup(from, "names a file outside of it"))?;
-        let to = match (&database, name.as_str()) {
-            (Some(database), DATABASE_FILE) => database.clone(),
-            _ => data_dir.join(name),
-        };
+        let to = restored_path(data_dir, database.as_deref(), name)
+            .ok_or_else(|| no_backup(from, "names a file outside of it"))?;
         let found = none_if_missing(copy(&source, &to)).map_err(BackupError::io("copy", &source))?;
         if found.as_ref() != Some(expected) {
             return Err(BackupError::Damaged { path: source });
@@ -213,7 +211,8 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
         created.map_err(BackupError::io("write", &marker))?;
     }
     let text = none_if_missing(std::fs::read(&marker)).map_err(BackupError::io("read", &marker))?;
-    // A marker without a list was written just before the kill: no file was copied yet.
+    // An empty marker: no file was copied yet. An older version's marker holds a sentence instead of a list: its files are not
+    // known, and those that this backup does not replace stay.
     let mut begun: BTreeSet<String> = serde_json::from_slice(&text.unwrap_or_default()).unwrap_or_default();
     let stale: Vec<String> = begun
         .iter()
@@ -224,7 +223,7 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
     let text = serde_json::to_vec(&begun).map_err(io::Error::other);
     let written = text.and_then(|text| write_atomically(&marker, &text));
     written.map_err(BackupError::io("write", &marker))?;
-    for path in stale.iter().filter_map(|name| inside(data_dir, name)) {
+    for path in stale.iter().filter_map(|name| restored_path(data_dir, database, name)) {
         none_if_missing(std::fs::remove_file(&path)).map_err(BackupError::io("delete", &path))?;
     }
     Ok(marker)
@@ -319,6 +318,14 @@ fn is_kept(file: &Path) -> bool {
     !(is_passing || is_hidden(file) || text.starts_with(DATABASE_FILE) || text == WRITE_PROBE || text == RESTORING)
 }
 
+/// Where a file of a backup is restored; `None` if that would be outside of the data directory.
+fn restored_path(data_dir: &Path, database: Option<&Path>, name: &str) -> Option<PathBuf> {
+    match database {
+        Some(database) if name == DATABASE_FILE => Some(database.to_owned()),
+        _ => inside(data_dir, name),
+    }
+}
+
 /// The path of a name from the list of files, if it stays in the directory.
 fn inside(dir: &Path, name: &str) -> Option<PathBuf> {
     let mut parts = Path::new(name).components();
@@ -333,8 +340,13 @@ fn is_empty(dir: &Path) -> Result<bool, BackupError> {
 
 /// Whether a directory holds nothing but what may be ignored.
 fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<bool, BackupError> {
-    let entries = std::fs::read_dir(dir).map_err(BackupError::io("read", dir))?;
-    Ok(entries.flatten().all(|entry| is_ignored(&entry.path())))
+    for entry in std::fs::read_dir(dir).map_err(BackupError::io("read", dir))? {
+        let path = entry.map_err(BackupError::io("read", dir))?.path();
+        if !is_ignored(&path) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 /// Copies a file, with its directory, and reports what was copied.

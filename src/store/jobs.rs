@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::audit::Author;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
+use super::models::version_id;
 use super::reports::{JobReport, write_report};
 use super::{ModelMetrics, Store, StoreError};
 
@@ -377,7 +378,7 @@ impl Store {
              checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
              stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
              WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
-             owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running'";
+             owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running' RETURNING submitter";
         let values = vec![
             lease.number.into(),
             lease.token.into(),
@@ -389,18 +390,25 @@ impl Store {
             report.checkpoint.into(),
             i64::from(outcome.crashed).into(),
         ];
-        if tx.execute(sql, values).await? == 0 {
+        let rows = tx.fetch(sql, values).await?;
+        let Some(row) = rows.first() else {
             return Ok(false);
-        }
+        };
+        let mut change = None;
         if let Some((model, version, activates)) = outcome.published {
             let now_s = outcome.ended_s.unwrap_or_default();
             super::models::write_published(&mut tx, (&model, version), activates, now_s).await?;
+            let by = Author::of_key(&row.get::<String>("submitter")?);
+            change = Some(by.change("version.publish", version_id(&model, version)));
         }
         if let Some(measured) = outcome.measured {
             super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;
         }
         write_report(&mut tx, lease.number, report).await?;
-        tx.commit().await?;
+        match change {
+            Some(change) => change.commit(tx).await?,
+            None => tx.commit().await?,
+        }
         Ok(true)
     }
 

@@ -156,7 +156,7 @@ impl Store {
 }
 
 /// A version in the audit trail.
-fn version_id(model: &str, version: u32) -> String {
+pub(super) fn version_id(model: &str, version: u32) -> String {
     format!("{model}@{version}")
 }
 

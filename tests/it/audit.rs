@@ -181,7 +181,7 @@ async fn with_versions(dir: &Path, count: u64) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn no_version_is_activated_without_its_entry() {
+async fn the_active_version_is_the_last_audited_one() {
     let dir = tempfile::tempdir().unwrap();
     with_versions(dir.path(), 2).await;
     let request = |number| {

@@ -144,11 +144,11 @@ fn a_restore_killed_early_is_finished_by_the_next_one() {
     let restored = dir.path().join("restored");
     let restore = |backup: &str| succeed(dir.path(), &["restore", backup, "--data-dir", "restored"]);
     let partial = format!("restore-unfinished.{:016x}.partial", 7);
-    // What a kill leaves: an older version's marker that was half written, this version's empty one, and one with its list.
+    // What a kill leaves: of an older version, a half-written marker or a whole one; of this version, an empty one.
     for (left, content, is_noticed) in [
         (partial.as_str(), "foreframe rest", false),
         ("restore-unfinished", "", true),
-        ("restore-unfinished", "[\"models/ol", true),
+        ("restore-unfinished", "foreframe restore did not finish\n", true),
     ] {
         std::fs::create_dir(&restored).unwrap();
         std::fs::write(restored.join(left), content).unwrap();
@@ -166,6 +166,18 @@ fn a_restore_killed_early_is_finished_by_the_next_one() {
         assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
         std::fs::remove_dir_all(&restored).unwrap();
     }
+}
+
+#[test]
+fn a_restore_of_another_backup_removes_the_first_ones_files() {
+    let dir = two_backups();
+    let restored = dir.path().join("restored");
+    succeed(dir.path(), &["restore", "two", "--data-dir", "restored"]);
+    let names: Vec<PathBuf> = contents(&restored).into_iter().map(|(path, _)| path).collect();
+    // As after a kill behind the last copy.
+    std::fs::write(restored.join("restore-unfinished"), serde_json::to_vec(&names).unwrap()).unwrap();
+    succeed(dir.path(), &["restore", "one", "--data-dir", "restored"]);
+    assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::Output;
 
 use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, import};
+use serde_json::Value;
 
 use crate::bag_files::endless_topics;
 use crate::import::npz;
@@ -46,6 +47,33 @@ fn a_catalog_of_bad_lines_needs_little_memory() {
 }
 
 #[test]
+fn endless_damaged_images_are_listed_up_to_the_limit() {
+    let dir = tempfile::tempdir().unwrap();
+    recordings::tub(&dir.path().join("tub"), 20);
+    fs::write(dir.path().join("tub/images/bad.jpg"), "no image").unwrap();
+    let catalog = dir.path().join("tub/catalog_0.catalog");
+    let mut lines = fs::read_to_string(&catalog).unwrap();
+    let bad: u64 = 12_000;
+    for index in 20..20 + bad {
+        let line = serde_json::json!({
+            "_index": index, "_session_id": "9", "_timestamp_ms": 1_000_000 + 50 * index, "cam/image_array": "bad.jpg",
+            "user/angle": 0.5, "user/throttle": 0.5, "user/mode": "user",
+        });
+        lines.push_str(&line.to_string());
+        lines.push('\n');
+    }
+    fs::write(&catalog, lines).unwrap();
+    let output = import_with_little_memory(dir.path(), "tub");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let text = fs::read(dir.path().join("set/meta/skipped.json")).unwrap();
+    let listed: Vec<(Value, Value)> = serde_json::from_slice(&text).unwrap();
+    let counts = listed.iter().map(|(_, item)| item["count"].as_u64().unwrap_or(1));
+    assert_eq!(counts.sum::<u64>(), bad);
+    // The shards that are written after the limit count theirs together.
+    assert!(listed.len() <= 10_010, "{}", listed.len());
+}
+
+#[test]
 fn a_catalog_line_without_end_is_left_out() {
     let dir = tempfile::tempdir().unwrap();
     recordings::tub(&dir.path().join("tub"), 20);
@@ -68,7 +96,7 @@ fn a_bag_of_endless_topics_needs_little_memory() {
     assert!(output.status.success(), "{}", text(&output.stderr));
     let printed = text(&output.stdout);
     assert!(
-        printed.contains("the bag has more than 4096 topics of other types"),
+        printed.contains("the bag has more than 4096 topics that are not imported"),
         "{printed}"
     );
 }

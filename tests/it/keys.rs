@@ -324,21 +324,8 @@ async fn a_key_sees_its_own_sessions_only() {
     let (_dir, store, keys, app) = app_with_keys(true).await;
     let mut owners = Vec::new();
     for scope in [KeyScope::Predict, KeyScope::Predict, KeyScope::Admin] {
-        let key = NewKey::generate().unwrap();
-        let row = KeyRow {
-            id: key.id.clone(),
-            name: "robot".to_owned(),
-            hash: key.hash.clone(),
-            created_s: 1.0,
-            revoked_s: None,
-            scope,
-            expires_s: None,
-            requests_per_s: None,
-        };
-        store.add_key(row, &Author::CommandLine).await.unwrap();
-        owners.push(key);
+        owners.push(limited_key(&store, &keys, |row| row.scope = scope).await);
     }
-    keys.refresh().await.unwrap();
     let (one, other, admin) = (&owners[0], &owners[1], &owners[2]);
     let open = json!({"model": "plain"});
     let created = send_with(&app, one, ("POST", "/v1/sessions"), &open).await.json();

@@ -326,6 +326,12 @@ async fn versions_are_numbered_after_the_shipped_one() {
         );
         let listed = store.published_versions().await.unwrap();
         assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
+        let entries = store.audit(None, 10).await.unwrap();
+        let published = entries.iter().filter(|entry| entry.action == "version.publish");
+        assert_eq!(
+            published.map(|entry| &*entry.target).collect::<Vec<_>>(),
+            ["m@6", "m@5"]
+        );
         // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
         assert!(!store.delete_version("m", 5, 1.0, &Author::CommandLine).await.unwrap());

@@ -1,7 +1,7 @@
 //! Stream messages in both sub-protocols.
 
 use axum::extract::ws::Message;
-use foreframe::error_text::shortened;
+use foreframe::error_text::without_middle;
 use foreframe::server::protocol::{ClientMessage, Codec};
 use proptest::prelude::*;
 use proptest::sample::Index;
@@ -39,7 +39,7 @@ fn decode(name: &str, is_text: bool, bytes: Vec<u8>) -> Result<ClientMessage, St
     let limit = BASE_BYTES + per_byte * bytes.len();
     let (codec, message) = message(is_text, bytes);
     let decoded = within_memory(limit, name, || {
-        codec.decode(&message).map_err(|error| shortened(&error))
+        codec.decode(&message).map_err(|error| without_middle(&error))
     });
     if let Err(error) = &decoded {
         assert!(error.contains(codec.name()), "{name}: {error}");

@@ -87,7 +87,6 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
     let mut collector = Collector::new(source, options, cancelled);
     let paths = rosbag2::files(source)?;
     for path in &paths {
-        collector.check_cancelled()?;
         collector.file(path.clone());
         BagFile::scan(path, &mut collector)?;
     }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// How many items are listed; more are only counted, so that a recording with endless damage needs little memory.
-const MAX_ITEMS: usize = 10_000;
+pub(super) const MAX_ITEMS: usize = 10_000;
 /// The longest text of an item, in bytes.
 const MAX_TEXT_BYTES: usize = 500;
 /// How many names a message lists, and how much of each.
@@ -13,9 +13,9 @@ const LISTED_BYTES: usize = 200;
 /// Something in the recording that was left out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedItem {
-    /// File and line, frame or position; 500 bytes at most.
+    /// File and line, frame or position; about 500 bytes at most.
     pub place: String,
-    /// What was wrong; 500 bytes at most.
+    /// What was wrong; about 500 bytes at most.
     pub reason: String,
     /// How many items this entry stands for: 1, or more in an entry for all that are not listed.
     #[serde(default = "one", skip_serializing_if = "is_one")]
@@ -37,6 +37,17 @@ impl SkippedItem {
             place: shortened(place, MAX_TEXT_BYTES),
             reason: shortened(reason, MAX_TEXT_BYTES),
             count: 1,
+        }
+    }
+
+    /// An entry for items that are only counted.
+    pub(super) fn not_listed(count: u64) -> Self {
+        Self {
+            count,
+            ..Self::new(
+                "after these",
+                &format!("{count} more items were left out; they are not listed"),
+            )
         }
     }
 }
@@ -96,11 +107,7 @@ impl SkippedList {
 
     /// The listed items, and one for all others.
     pub(super) fn items(&self) -> Vec<SkippedItem> {
-        let others = (self.more > 0).then(|| SkippedItem {
-            place: "after these".to_owned(),
-            reason: format!("{} more items were left out; they are not listed", self.more),
-            count: self.more,
-        });
+        let others = (self.more > 0).then(|| SkippedItem::not_listed(self.more));
         self.items.iter().cloned().chain(others).collect()
     }
 }

@@ -16,6 +16,7 @@ use super::super::shard::{EncodedEpisode, ShardStart, build};
 use super::super::store::{FinishedShard, complete};
 use super::super::{DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording, WantedImage};
+use super::skipped::MAX_ITEMS;
 use super::timing::{ImportPlan, PlannedFrame};
 use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem};
 use crate::files::remove_partials;
@@ -168,7 +169,12 @@ impl<'a> Directory<'a> {
                 let Some(encoded) = encoded else {
                     return Err(ImportError::Cancelled { done, total });
                 };
-                skipped.extend(bad.into_iter().map(|item| (Some(shard), item)));
+                let room = MAX_ITEMS.saturating_sub(skipped.len());
+                let not_listed = bad.len().saturating_sub(room) as u64;
+                skipped.extend(bad.into_iter().take(room).map(|item| (Some(shard), item)));
+                if not_listed > 0 {
+                    skipped.push((Some(shard), SkippedItem::not_listed(not_listed)));
+                }
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }

@@ -13,7 +13,7 @@ use super::{Pipeline, failed};
 use crate::dataset::DatasetError;
 use crate::dataset::import::{ImportConfig, ImportError, ImportProgress, Imported, import, saved_shards};
 
-/// How many left-out items are written to the job's log; all are in the data set.
+/// How many left-out items are written to the job's log; `meta/skipped.json` lists up to 10,000.
 const LOGGED_ITEMS: usize = 200;
 
 impl Pipeline {
@@ -62,7 +62,7 @@ fn log_skipped(imported: &Imported, report: &JobReporter) {
     if imported.skipped.len() > LOGGED_ITEMS {
         let count = imported.skipped_count();
         report.line(format!(
-            "left out {count} items; the data set's meta/skipped.json lists them"
+            "left out {count} items in all; the data set's meta/skipped.json lists the first 10,000"
         ));
     }
 }

@@ -7,11 +7,11 @@ use tracing::Instrument as _;
 
 use super::access::is_audited;
 use super::problem::ApiError;
-use super::streams::Streams;
+use super::task_limit::TaskLimit;
 
 /// Runs a request that changes state in a task of its own. Otherwise the server would drop the request with its connection, perhaps
 /// between the change and what belongs to it.
-pub(in crate::server) async fn complete(State(tasks): State<Streams>, request: Request, next: Next) -> Response {
+pub(in crate::server) async fn complete(State(tasks): State<TaskLimit>, request: Request, next: Next) -> Response {
     let route = request.extensions().get::<MatchedPath>();
     if !is_audited(request.method(), route.map_or("", MatchedPath::as_str)) {
         return next.run(request).await;

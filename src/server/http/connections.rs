@@ -24,7 +24,7 @@ use super::connection_table::{BusyConnection, ConnectionPlace};
 use super::http_stream::HttpStream;
 use super::listener::{BoundedConnection, BoundedListener};
 use super::message_bytes::MessageBytes;
-use super::streams::stop_requested;
+use super::task_limit::stop_requested;
 use super::tls::ServerTls;
 use crate::server::config::ServerConfig;
 

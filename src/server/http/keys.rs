@@ -276,11 +276,11 @@ impl Keys {
         self.shared.is_required || self.known().exist
     }
 
-    /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown key: the whole text is hashed, then
-    /// looked up.
+    /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown
+    /// key: the whole text is hashed, then looked up.
     fn check(&self, presented: Option<&str>, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
         if !self.are_required() {
-            return Ok((Caller::default(), Author::of_key("")));
+            return Ok((Caller::default(), Author::Anonymous));
         }
         let key = presented.ok_or(ApiError::Unauthorized(
             "this server requires an API key: send the header Authorization: Bearer KEY; create a key with foreframe keys \

@@ -82,7 +82,7 @@ pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request
     response
 }
 
-/// Errors: `Malformed` unless the request names one host, as HTTP/1.1 demands, the same in its target and in its header.
+/// Errors: `Malformed` unless the request has one valid Host header (HTTP/1.0: at most one), and its target names no other host.
 fn check_host(request: &Request) -> Result<(), ApiError> {
     let wrong = |what: &str| {
         Err(ApiError::Malformed(format!(

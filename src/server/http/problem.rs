@@ -6,7 +6,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::error;
 
-use crate::error_text::shortened;
+use crate::error_text::without_middle;
 
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -125,7 +125,7 @@ impl IntoResponse for ApiError {
             kind: format!("urn:foreframe:problem:{slug}"),
             title: status.canonical_reason().unwrap_or(slug),
             status: status.as_u16(),
-            detail: shortened(&self.detail()),
+            detail: without_middle(&self.detail()),
             instance: String::new(),
         });
         response

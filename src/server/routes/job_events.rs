@@ -18,7 +18,7 @@ use crate::jobs::{Job, JobError};
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
-use crate::server::http::streams::stop_requested;
+use crate::server::http::task_limit::stop_requested;
 use crate::server::state::App;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {

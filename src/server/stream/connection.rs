@@ -21,14 +21,14 @@ use super::protocol::{
 };
 use super::session::{Owner, Ownership, Session};
 use super::step::{FrameStep, StepError};
-use crate::error_text::shortened;
+use crate::error_text::without_middle;
 use crate::frame::fit::Fit;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
 use crate::server::http::body_budget;
 use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::message_bytes::MessageBytes;
-use crate::server::http::streams::{Streams, stop_requested};
+use crate::server::http::task_limit::{TaskLimit, stop_requested};
 use crate::server::images::ImageFormat;
 use crate::serving::Predictor;
 use crate::telemetry::names;
@@ -44,9 +44,9 @@ enum PipelinedItem {
 }
 
 impl PipelinedItem {
-    /// The detail is shortened here already, since it waits in memory.
+    /// The detail loses its middle here already, since it waits in memory.
     fn refused(code: ErrorCode, detail: &dyn Display) -> Self {
-        Self::Refused(code, shortened(detail))
+        Self::Refused(code, without_middle(detail))
     }
 }
 
@@ -67,7 +67,7 @@ pub(in crate::server) struct StreamServices {
     pub(in crate::server) config: Arc<ServerConfig>,
     pub(in crate::server) predictor: Predictor,
     pub(in crate::server) blocking: BlockingWork,
-    pub(in crate::server) streams: Streams,
+    pub(in crate::server) streams: TaskLimit,
     pub(in crate::server) keys: Keys,
     /// Who opened the stream.
     pub(in crate::server) caller: Caller,
@@ -283,7 +283,7 @@ impl StreamConnection {
                         Ok(answer) => answer,
                         // The reader notices it too, and gives the reason.
                         Err(StepError::NotOwner) => return,
-                        Err(error) => self.error(error.code(), shortened(&error)),
+                        Err(error) => self.error(error.code(), without_middle(&error)),
                     }
                 }
                 PipelinedItem::Configure(message) => self.ownership.session().configure(message),

@@ -8,7 +8,7 @@ use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
 use crate::dataset::import::{ImportError, ImportOptions, SkippedItem, SkippedList};
 
-/// A bag has at most this number of topics that can be used, and of others.
+/// The maximum number of topics that can be imported, and of others.
 const MAX_TOPICS: usize = 4096;
 /// A topic has at most this number of fields.
 const MAX_FIELDS: usize = 4096;
@@ -70,8 +70,8 @@ impl ValueStream {
         }
         if count > MAX_FIELDS || longest > MAX_NAME_BYTES {
             return Err(format!(
-                "its topic has {count} fields with names of {longest} bytes; at most {MAX_FIELDS} fields with names of \
-                 {MAX_NAME_BYTES} bytes are read"
+                "its topic would have {count} fields, the longest new name with {longest} bytes; at most {MAX_FIELDS} fields \
+                 and {MAX_NAME_BYTES} bytes per name are read"
             ));
         }
         for FieldValue { name, unit, value } in fields {
@@ -185,7 +185,7 @@ impl<'a> Collector<'a> {
         let longest = key.0.len().max(key.1.len()).max(encoding.len());
         if longest > MAX_NAME_BYTES {
             return Err(format!(
-                "a name of the topic has {longest} bytes; at most {MAX_NAME_BYTES} are read"
+                "the topic's name, type or encoding has {longest} bytes; at most {MAX_NAME_BYTES} are read"
             ));
         }
         let (name, type_name) = key.clone();
@@ -213,7 +213,11 @@ impl<'a> Collector<'a> {
             &mut self.used_topics
         };
         if *count == MAX_TOPICS {
-            let what = if is_unused { "topics of other types" } else { "topics" };
+            let what = if is_unused {
+                "topics that are not imported"
+            } else {
+                "topics"
+            };
             return Err(format!("the bag has more than {MAX_TOPICS} {what}; record fewer"));
         }
         *count += 1;

@@ -24,10 +24,10 @@ const LIMITS: [(Limit, i32); 11] = [
     (Limit::SQLITE_LIMIT_TRIGGER_DEPTH, 1),
     (Limit::SQLITE_LIMIT_WORKER_THREADS, 0),
 ];
-/// Instructions of SQLite from one look at the bound to the next.
+/// After this number of instructions, SQLite calls our check of the bound.
 const STEP_INSTRUCTIONS: i32 = 1000;
-/// The bound on what SQLite does for one row, in these steps: a row of a table takes some ten instructions. All together take
-/// less than a second.
+/// How many such calls the work on one row may take. Reading a row takes about ten instructions; all 5,000 calls together take less
+/// than a second.
 const MAX_STEPS: u32 = 5000;
 
 /// The tables that are read, with the columns that are read of each.
@@ -70,9 +70,12 @@ impl BagDatabase {
         Ok(database)
     }
 
-    /// The connection, for one more row: it may take the time of one.
-    pub(super) fn for_a_row(&self) -> &Connection {
+    /// Starts the work on the next row: the bound counts from here.
+    pub(super) fn begin_row(&self) {
         self.steps.store(0, Ordering::Relaxed);
+    }
+
+    pub(super) fn connection(&self) -> &Connection {
         &self.connection
     }
 
@@ -102,16 +105,18 @@ impl BagDatabase {
             .map(drop)
     }
 
-    /// Whether SQLite itself, which does not look at the case of names, takes one of the tables for anything but a plain one.
+    /// Whether SQLite itself says that one of the tables is not a plain one. SQLite ignores the case of names.
     fn is_computed(&self) -> rusqlite::Result<bool> {
         let mut count = 0;
         for (table, columns) in TABLES {
+            self.begin_row();
             count += self
-                .for_a_row()
+                .connection
                 .query_row(OTHER_TABLES, [table], |row| row.get::<_, i64>(0))?;
+            self.begin_row();
             let columns = (table, columns);
             count += self
-                .for_a_row()
+                .connection
                 .query_row(OTHER_COLUMNS, columns, |row| row.get::<_, i64>(0))?;
         }
         Ok(count > 0)

@@ -151,7 +151,7 @@ struct McapScan<'a, 'b> {
     collector: &'a mut Collector<'b>,
 }
 
-/// Passes every message of a file to the collector. Errors: `Io`, `Record` where damage may not be left out.
+/// Passes every message of a file to the collector. Errors: `Io`, `Stopped`, `Record` where damage may not be left out.
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let file = open_file(path)?;
     let length = file.metadata().map_err(ImportError::io("read", path))?.len();
@@ -181,6 +181,7 @@ impl McapScan<'_, '_> {
     fn records(&mut self) -> Result<(), ImportError> {
         let (mut offset, mut body) = (MAGIC.len() as u64, Vec::new());
         loop {
+            self.collector.check_cancelled()?;
             let mut header = [0; RECORD_HEADER_BYTES as usize];
             let left = self.length.saturating_sub(offset.saturating_add(RECORD_HEADER_BYTES));
             if offset.saturating_add(RECORD_HEADER_BYTES) > self.length {

@@ -15,15 +15,16 @@ const TOPICS: &str = "SELECT rowid, id, name, type, serialization_format FROM ma
 pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
     let database = BagDatabase::open(path, collector.options.skip_bad)?;
     let topics = topics(&database, path, collector)?;
+    database.begin_row();
     let mut statement = database
-        .for_a_row()
+        .connection()
         .prepare(MESSAGES)
         .map_err(|error| unreadable(path, &error))?;
     let mut rows = statement.query([]).map_err(|error| unreadable(path, &error))?;
     let mut last = None;
     loop {
         collector.check_cancelled()?;
-        database.for_a_row();
+        database.begin_row();
         let place = |row: i64| format!("{} row {row} of the messages", path.display());
         let row = match rows.next() {
             Ok(Some(row)) => row,
@@ -67,12 +68,13 @@ fn topics(
     collector: &mut Collector<'_>,
 ) -> Result<Vec<(i64, usize)>, ImportError> {
     let wrong = |error: rusqlite::Error| unreadable(path, &error);
-    let mut statement = database.for_a_row().prepare(TOPICS).map_err(wrong)?;
+    database.begin_row();
+    let mut statement = database.connection().prepare(TOPICS).map_err(wrong)?;
     let mut rows = statement.query([]).map_err(wrong)?;
     let (mut topics, mut last) = (Vec::new(), None);
     while let Some(row) = rows.next().map_err(wrong)? {
         collector.check_cancelled()?;
-        database.for_a_row();
+        database.begin_row();
         let number: i64 = row.get(0).map_err(wrong)?;
         if let Some(last) = last.filter(|last| *last >= number) {
             let place = format!("{} row {last} of the topics", path.display());
@@ -112,8 +114,9 @@ impl SqliteFile {
             return Err(ImportError::record(place, "a message of it has no row"));
         };
         let database = self.database.lock().unwrap_or_else(PoisonError::into_inner);
+        database.begin_row();
         let read = database
-            .for_a_row()
+            .connection()
             .prepare("SELECT data FROM main.messages WHERE rowid = ?1")
             .and_then(|mut statement| statement.query_row([row], |row| row.get(0)));
         read.map_err(|error| {

@@ -1,5 +1,5 @@
-//! The number of open streams (WebSocket and event streams), the signal that they shall stop, and a way to wait for
-//! their end. An HTTP server's own graceful shutdown does not wait for them.
+//! The limit of tasks that outlive their HTTP connection (streams, and requests that change state), the signal that they shall
+//! stop, and a way to wait for their end. An HTTP server's own graceful shutdown does not wait for them.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use super::problem::ApiError;
 
 /// The places of streams and their stop signal; clones share them.
 #[derive(Clone)]
-pub(in crate::server) struct Streams {
+pub(in crate::server) struct TaskLimit {
     places: Arc<Semaphore>,
     /// What they are, for error messages.
     kind: &'static str,
@@ -17,7 +17,7 @@ pub(in crate::server) struct Streams {
     stop: watch::Sender<bool>,
 }
 
-impl Streams {
+impl TaskLimit {
     pub(in crate::server) fn new(kind: &'static str, limit: usize) -> Self {
         let limit = u32::try_from(limit).unwrap_or(u32::MAX);
         Self {
