@@ -10,6 +10,7 @@ pub mod keys;
 pub mod models;
 pub mod objects;
 pub mod reports;
+mod restore;
 mod wal;
 
 use std::error::Error as _;
@@ -28,6 +29,7 @@ pub use self::keys::{KeyRow, KeyScope};
 pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
+pub use self::restore::restore;
 use crate::files;
 
 /// The embedded database's file in the data directory.

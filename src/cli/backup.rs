@@ -58,7 +58,11 @@ impl UsageError for BackupError {
     fn is_usage(&self) -> bool {
         matches!(
             self,
-            Self::NotEmpty { .. } | Self::Inside { .. } | Self::NoBackup { .. } | Self::OtherDatabase
+            Self::NotEmpty { .. }
+                | Self::Inside { .. }
+                | Self::NoBackup { .. }
+                | Self::Restoring { .. }
+                | Self::OtherDatabase
         )
     }
 }

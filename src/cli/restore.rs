@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::settings::CommonArgs;
 use super::{CliError, print_line};
-use crate::store::backup;
+use crate::store::restore;
 
 /// Restore a backup into a new data directory.
 ///
@@ -22,7 +22,7 @@ pub(super) struct RestoreArgs {
 
 pub(super) fn run(args: &RestoreArgs) -> Result<(), CliError> {
     let config = args.settings.start()?;
-    let index = backup::restore(&args.dir, &config.server.store())?;
+    let index = restore(&args.dir, &config.server.store())?;
     print_line(format!(
         "{} files with {} bytes are restored to {}",
         index.files.len(),

@@ -153,8 +153,9 @@ impl ProgramOutput {
         }
     }
 
-    /// Waits for the program's end, after its output has ended. Errors: `Failed`, `Cancelled`.
-    pub(super) fn finish(mut self, cancelled: &AtomicBool) -> Result<(), ProgramError> {
+    /// Waits for the program's end, after its output has ended. Returns the first line of its error output; empty without any.
+    /// Errors: `Failed`, `Cancelled`.
+    pub(super) fn finish(mut self, cancelled: &AtomicBool) -> Result<String, ProgramError> {
         let status = loop {
             match self.child.try_wait() {
                 Ok(Some(status)) => break status,
@@ -163,12 +164,13 @@ impl ProgramOutput {
                 Err(error) => return Err(ProgramError::Failed(error.to_string())),
             }
         };
-        if status.success() {
-            return Ok(());
-        }
         let reason = self.reason.take().and_then(|reason| reason.join().ok());
-        let reason = reason.filter(|reason| !reason.is_empty());
-        Err(ProgramError::Failed(reason.unwrap_or_else(|| status.to_string())))
+        let reason = reason.unwrap_or_default();
+        match (status.success(), reason.is_empty()) {
+            (true, _) => Ok(reason),
+            (false, true) => Err(ProgramError::Failed(status.to_string())),
+            (false, false) => Err(ProgramError::Failed(reason)),
+        }
     }
 }
 

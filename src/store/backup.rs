@@ -12,11 +12,8 @@ use std::time::{Duration, SystemTime};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-use super::database::Database;
-use super::{DATABASE_FILE, Store, StoreConfig, StoreError, WRITE_PROBE, unix_s};
-use crate::files::{
-    files_below, hex, is_hidden, is_partial, is_partial_of, none_if_missing, remove_partials, write_atomically,
-};
+use super::{DATABASE_FILE, Store, StoreError, WRITE_PROBE, unix_s};
+use crate::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
 const INDEX_FILE: &str = "backup.json";
@@ -66,6 +63,12 @@ pub enum BackupError {
     /// The backup holds SQLite's database, but the settings name PostgreSQL.
     #[error("the backup holds an SQLite database, but database_url names PostgreSQL; restore it without database_url")]
     OtherDatabase,
+    /// Another process restores into the directory.
+    #[error("another restore into {} is running; wait for its end", data_dir.display())]
+    Restoring {
+        /// The data directory.
+        data_dir: PathBuf,
+    },
     /// Files were deleted each time while they were copied.
     #[error("files in {} are being deleted all the time; try again later", data_dir.display())]
     Unstable {
@@ -88,7 +91,7 @@ pub enum BackupError {
 }
 
 impl BackupError {
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self + use<> {
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }
@@ -138,7 +141,7 @@ impl Store {
             let (path, data_dir) = (to.to_owned(), data_dir.to_owned());
             return Err(BackupError::Inside { path, data_dir });
         }
-        if !is_empty(to)? {
+        if !is_empty_but(to, |_| false)? {
             return Err(BackupError::NotEmpty { path: to.to_owned() });
         }
         let mut copied = Copied::default();
@@ -162,71 +165,6 @@ impl Store {
         }
         Err(unstable(data_dir))
     }
-}
-
-/// Restores a backup into a new or empty data directory. No server may use the directory meanwhile. Errors: `NoBackup`,
-/// `Damaged`, `NotEmpty`, `OtherDatabase`, `Io`, `Store`.
-pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupError> {
-    let index = read_index(from)?;
-    let data_dir = &config.data_dir;
-    let database = match &config.database {
-        None => Some(data_dir.join(DATABASE_FILE)),
-        Some(url) => Database::file_of(url)?,
-    };
-    if index.has_database && database.is_none() {
-        return Err(BackupError::OtherDatabase);
-    }
-    std::fs::create_dir_all(data_dir).map_err(BackupError::io("make", data_dir))?;
-    let marker = begin_restore(data_dir, database.as_deref(), &index)?;
-    for (name, expected) in &index.files {
-        let source = inside(from, name).ok_or_else(|| no_backup(from, "names a file outside of it"))?;
-        let to = restored_path(data_dir, database.as_deref(), name)
-            .ok_or_else(|| no_backup(from, "names a file outside of it"))?;
-        let found = none_if_missing(copy(&source, &to)).map_err(BackupError::io("copy", &source))?;
-        if found.as_ref() != Some(expected) {
-            return Err(BackupError::Damaged { path: source });
-        }
-    }
-    remove_partials(data_dir);
-    std::fs::remove_file(&marker).map_err(BackupError::io("delete", &marker))?;
-    Ok(index)
-}
-
-/// Marks the directory as one that is being restored, and removes what an earlier restore that did not finish has written there.
-/// Returns the marker. Errors: `NotEmpty`, `Io`.
-fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) -> Result<PathBuf, BackupError> {
-    let marker = data_dir.join(RESTORING);
-    let is_taken = |path: &Path| BackupError::NotEmpty { path: path.to_owned() };
-    if !marker.exists() {
-        if let Some(path) = database.filter(|path| path.exists()) {
-            return Err(is_taken(path));
-        }
-        // Older versions wrote the marker under another name first, and left it there if they were killed.
-        let is_left = |path: &PathBuf| is_partial_of(&marker, path);
-        if !is_empty_but(data_dir, is_left)? {
-            return Err(is_taken(data_dir));
-        }
-        // The first step in the directory: whatever is killed after it, the directory is known as unfinished.
-        let created = File::create_new(&marker).and_then(|file| file.sync_all());
-        created.map_err(BackupError::io("write", &marker))?;
-    }
-    let text = none_if_missing(std::fs::read(&marker)).map_err(BackupError::io("read", &marker))?;
-    // An empty marker: no file was copied yet. An older version's marker holds a sentence instead of a list: its files are not
-    // known, and those that this backup does not replace stay.
-    let mut begun: BTreeSet<String> = serde_json::from_slice(&text.unwrap_or_default()).unwrap_or_default();
-    let stale: Vec<String> = begun
-        .iter()
-        .filter(|name| !index.files.contains_key(*name))
-        .cloned()
-        .collect();
-    begun.extend(index.files.keys().cloned());
-    let text = serde_json::to_vec(&begun).map_err(io::Error::other);
-    let written = text.and_then(|text| write_atomically(&marker, &text));
-    written.map_err(BackupError::io("write", &marker))?;
-    for path in stale.iter().filter_map(|name| restored_path(data_dir, database, name)) {
-        none_if_missing(std::fs::remove_file(&path)).map_err(BackupError::io("delete", &path))?;
-    }
-    Ok(marker)
 }
 
 /// The files that were copied, with the time of their last change.
@@ -318,28 +256,16 @@ fn is_kept(file: &Path) -> bool {
     !(is_passing || is_hidden(file) || text.starts_with(DATABASE_FILE) || text == WRITE_PROBE || text == RESTORING)
 }
 
-/// Where a file of a backup is restored; `None` if that would be outside of the data directory.
-fn restored_path(data_dir: &Path, database: Option<&Path>, name: &str) -> Option<PathBuf> {
-    match database {
-        Some(database) if name == DATABASE_FILE => Some(database.to_owned()),
-        _ => inside(data_dir, name),
-    }
-}
-
 /// The path of a name from the list of files, if it stays in the directory.
-fn inside(dir: &Path, name: &str) -> Option<PathBuf> {
+pub(super) fn inside(dir: &Path, name: &str) -> Option<PathBuf> {
     let mut parts = Path::new(name).components();
     parts
         .all(|part| matches!(part, Component::Normal(_)))
         .then(|| dir.join(name))
 }
 
-fn is_empty(dir: &Path) -> Result<bool, BackupError> {
-    is_empty_but(dir, |_| false)
-}
-
 /// Whether a directory holds nothing but what may be ignored.
-fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<bool, BackupError> {
+pub(super) fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<bool, BackupError> {
     for entry in std::fs::read_dir(dir).map_err(BackupError::io("read", dir))? {
         let path = entry.map_err(BackupError::io("read", dir))?.path();
         if !is_ignored(&path) {
@@ -350,7 +276,7 @@ fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<boo
 }
 
 /// Copies a file, with its directory, and reports what was copied.
-fn copy(from: &Path, to: &Path) -> io::Result<BackupFile> {
+pub(super) fn copy(from: &Path, to: &Path) -> io::Result<BackupFile> {
     let mut source = File::open(from)?;
     std::fs::create_dir_all(to.parent().unwrap_or(to))?;
     let mut target = File::create(to)?;
@@ -394,7 +320,7 @@ fn write_index(to: &Path, index: &BackupIndex) -> Result<(), BackupError> {
     written.map_err(BackupError::io("write", &path))
 }
 
-fn read_index(from: &Path) -> Result<BackupIndex, BackupError> {
+pub(super) fn read_index(from: &Path) -> Result<BackupIndex, BackupError> {
     let path = from.join(INDEX_FILE);
     let text = none_if_missing(std::fs::read(&path)).map_err(BackupError::io("read", &path))?;
     let text = text.ok_or_else(|| no_backup(from, "is missing"))?;
@@ -406,7 +332,7 @@ fn read_index(from: &Path) -> Result<BackupIndex, BackupError> {
     Ok(index)
 }
 
-fn no_backup(path: &Path, reason: &str) -> BackupError {
+pub(super) fn no_backup(path: &Path, reason: &str) -> BackupError {
     BackupError::NoBackup {
         path: path.to_owned(),
         reason: reason.to_owned(),

@@ -420,10 +420,14 @@ impl Store {
             .await
     }
 
-    /// Asks a running job to stop. Returns whether it is running. Errors: `Query`.
+    /// Asks a running job to stop, if it was not asked before. Returns whether it is running. Errors: `Query`.
     pub async fn ask_to_cancel(&self, number: i64, by: &Author) -> Result<bool, StoreError> {
-        let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running'";
+        let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running' AND cancelling = 0";
         let change = by.change("job.cancel", job_id(number));
-        self.execute_recorded(sql, vec![number.into()], change).await
+        if self.execute_recorded(sql, vec![number.into()], change).await? {
+            return Ok(true);
+        }
+        let sql = "SELECT 1 FROM jobs WHERE number = $1 AND state = 'running'";
+        Ok(!self.database.fetch(sql, vec![number.into()]).await?.is_empty())
     }
 }

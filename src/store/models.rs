@@ -135,10 +135,11 @@ impl Store {
         rows.iter().map(metrics).collect()
     }
 
-    /// Makes a version active. Errors: `Query`.
+    /// Makes a version active, if it is not. Errors: `Query`.
     pub async fn set_active(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
-             ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s";
+             ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s \
+             WHERE active_versions.version <> excluded.version";
         let values = vec![model.into(), version.into(), now_s.into()];
         let change = by.change("version.activate", version_id(model, version));
         self.execute_recorded(sql, values, change).await.map(drop)

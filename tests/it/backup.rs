@@ -175,8 +175,47 @@ fn a_restore_of_another_backup_removes_the_first_ones_files() {
     succeed(dir.path(), &["restore", "two", "--data-dir", "restored"]);
     let names: Vec<PathBuf> = contents(&restored).into_iter().map(|(path, _)| path).collect();
     // As after a kill behind the last copy.
-    std::fs::write(restored.join("restore-unfinished"), serde_json::to_vec(&names).unwrap()).unwrap();
+    let marker = serde_json::json!({"database": restored.join("foreframe.db"), "files": names});
+    std::fs::write(restored.join("restore-unfinished"), marker.to_string()).unwrap();
     succeed(dir.path(), &["restore", "one", "--data-dir", "restored"]);
+    assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
+}
+
+#[test]
+fn an_unfinished_restore_does_not_allow_another_database() {
+    let dir = two_backups();
+    succeed(dir.path(), &["keys", "create", "robot", "--data-dir", "live"]);
+    let live = std::fs::read(dir.path().join("live/foreframe.db")).unwrap();
+    let restored = dir.path().join("restored");
+    std::fs::create_dir(&restored).unwrap();
+    std::fs::write(restored.join("restore-unfinished"), "").unwrap();
+    let elsewhere = [
+        "restore",
+        "one",
+        "--data-dir",
+        "restored",
+        "--database-url",
+        "sqlite:live/foreframe.db",
+    ];
+    let refused = fail(dir.path(), &elsewhere);
+    assert!(refused.contains("foreframe.db is not empty"), "{refused}");
+    assert_eq!(std::fs::read(dir.path().join("live/foreframe.db")).unwrap(), live);
+    succeed(dir.path(), &["restore", "one", "--data-dir", "restored"]);
+    assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
+}
+
+#[test]
+fn two_restores_into_one_directory_do_not_run_at_once() {
+    let dir = two_backups();
+    let restored = dir.path().join("restored");
+    std::fs::create_dir(&restored).unwrap();
+    let lock = std::fs::File::create(restored.join("restore.lock")).unwrap();
+    lock.lock().unwrap();
+    let restore = ["restore", "one", "--data-dir", "restored"];
+    let refused = fail(dir.path(), &restore);
+    assert!(refused.contains("is running; wait for its end"), "{refused}");
+    drop(lock);
+    succeed(dir.path(), &restore);
     assert_eq!(contents(&restored), contents_of_backup(&dir.path().join("one")));
 }
 

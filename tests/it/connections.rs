@@ -333,6 +333,9 @@ fn a_request_names_one_host() {
         ("/v1/models", "host: localhost\r\n"),
         ("/v1/models", "host: 127.0.0.1:8642\r\n"),
         ("http://LOCALHOST/v1/models", "host: localhost\r\n"),
+        ("http://localhost/v1/models", "host: localhost:80\r\n"),
+        ("/v1/models", "host: [::1]:8642\r\n"),
+        ("/v1/models", "host: LOCALHOST\r\norigin: http://localhost:80\r\n"),
     ] {
         assert_eq!(get(target, hosts), 200, "{target} {hosts}");
     }
@@ -344,6 +347,15 @@ fn a_request_names_one_host() {
         ("/v1/models", "host: l\u{f6}calhost\r\n"),
         ("/v1/models", "host: user@localhost\r\n"),
         ("/v1/models", "host: local host\r\n"),
+        ("/v1/models", "host: localhost:http\r\n"),
+        ("/v1/models", "host: localhost:99999\r\n"),
+        ("/v1/models", "host: [::1]x\r\n"),
+        ("/v1/models", "host: []\r\n"),
+        ("/v1/models", "host: [evil.com]:80\r\n"),
+        (
+            "/v1/models",
+            "host: localhost\r\norigin: http://localhost\r\norigin: http://evil.com\r\n",
+        ),
         ("/v1/models", "host: localhost\r\nhost: localhost\r\n"),
         ("http://robot-7/v1/models", "host: localhost\r\n"),
         ("http://localhost:1/v1/models", "host: localhost\r\n"),
@@ -352,4 +364,10 @@ fn a_request_names_one_host() {
     }
     // HTTP/1.0 has no Host header.
     assert_eq!(status("GET /livez HTTP/1.0\r\n\r\n"), 200);
+    // Other hosts and other origins than the server's own.
+    assert_eq!(status("GET http://evil.com/v1/models HTTP/1.0\r\n\r\n"), 403);
+    assert_eq!(
+        get("/v1/models", "host: localhost\r\norigin: evil://localhost\r\n"),
+        403
+    );
 }

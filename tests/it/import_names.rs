@@ -205,6 +205,33 @@ proptest! {
 }
 
 #[test]
+fn a_transaction_that_was_not_finished_is_not_read() {
+    let (dir, path) = changed_bag("PRAGMA journal_mode = DELETE");
+    let mut large = frame(0);
+    large.content = image(false, 0, "mono8", (64, 64), &[7; 4096]);
+    let more = (5..200).map(|index| BagMessage {
+        log_ns: index * 100_000_000,
+        content: large.content.clone(),
+        ..frame(index)
+    });
+    fs::remove_file(&path).unwrap();
+    database(&path, &more.collect::<Vec<_>>());
+    let connection = rusqlite::Connection::open(&path).unwrap();
+    // With so small a cache, the changes are written before the commit.
+    let change = "PRAGMA cache_size = 2; BEGIN; UPDATE messages SET timestamp = timestamp * 2";
+    connection.execute_batch(change).unwrap();
+    let copied = dir.path().join("copied.db3");
+    fs::copy(&path, &copied).unwrap();
+    fs::copy(
+        dir.path().join("drive.db3-journal"),
+        dir.path().join("copied.db3-journal"),
+    )
+    .unwrap();
+    let error = run(copied, small()).unwrap_err().to_string();
+    assert!(error.contains("it is damaged"), "{error}");
+}
+
+#[test]
 fn a_cancelled_import_of_a_bag_is_stopped_while_it_is_read() {
     let (dir, database) = changed_bag("SELECT 1");
     let bag = dir.path().join("drive.mcap");

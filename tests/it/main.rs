@@ -32,6 +32,7 @@ mod import_killed;
 mod import_memory;
 mod import_names;
 mod import_programs;
+mod import_videos;
 mod inspection;
 mod jobs;
 mod jobs_checkpoints;

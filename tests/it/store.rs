@@ -111,7 +111,11 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
         for line in ["one", "two", "three", "four"] {
             assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
-        assert!(store.ask_to_cancel(1, &Author::CommandLine).await.unwrap());
+        for _ in 0..2 {
+            assert!(store.ask_to_cancel(1, &Author::CommandLine).await.unwrap());
+        }
+        let entries = store.audit(None, 10).await.unwrap();
+        assert_eq!(entries.iter().filter(|entry| entry.action == "job.cancel").count(), 1);
         assert_eq!(
             store.renew_at(lease, 20.0, JobReport::default()).await.unwrap(),
             Some(true)
@@ -335,7 +339,17 @@ async fn versions_are_numbered_after_the_shipped_one() {
         // The first version stays active until another is activated.
         assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
         assert!(!store.delete_version("m", 5, 1.0, &Author::CommandLine).await.unwrap());
-        store.set_active("m", 4, 1.0, &Author::CommandLine).await.unwrap();
+        for _ in 0..2 {
+            store.set_active("m", 4, 1.0, &Author::CommandLine).await.unwrap();
+        }
+        let entries = store.audit(None, 10).await.unwrap();
+        assert_eq!(
+            entries
+                .iter()
+                .filter(|entry| entry.action == "version.activate")
+                .count(),
+            1
+        );
         assert!(
             store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()
                 && !store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()

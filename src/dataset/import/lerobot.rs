@@ -12,7 +12,7 @@ use self::description::{Description, EpisodeEntry, VideoPart};
 pub(super) use self::images::ImageTable;
 use self::rows::{Row, read_rows};
 use super::recording::{Images, Record, Recording};
-use super::video::{VideoFrames, packet_times};
+use super::video::{ListedFrames, VideoFrames, frames_of};
 use super::{ImportError, ImportOptions, SkippedList};
 use crate::types::Channel;
 
@@ -80,18 +80,24 @@ struct VideoTimes {
 }
 
 impl VideoTimes {
-    /// The video's number.
-    fn probe(&mut self, path: &Path, cancelled: &AtomicBool) -> Result<usize, ImportError> {
+    /// The video's number and, when it is probed, what is wrong with it.
+    fn probe(&mut self, path: &Path, cancelled: &AtomicBool) -> Result<(usize, Option<ImportError>), ImportError> {
         if let Some(&number) = self.by_path.get(path) {
-            return Ok(number);
+            return Ok((number, None));
         }
         if !path.is_file() {
             return Err(ImportError::record(path.display().to_string(), "the video is missing"));
         }
-        let times_s = packet_times(path, cancelled)?;
+        let ListedFrames { times_s, damage } = frames_of(path, cancelled)?;
+        if !times_s.is_sorted() {
+            return Err(ImportError::record(
+                path.display().to_string(),
+                "its frames are not in the order of their times",
+            ));
+        }
         self.files.push((path.to_owned(), times_s));
         self.by_path.insert(path.to_owned(), self.files.len() - 1);
-        Ok(self.files.len() - 1)
+        Ok((self.files.len() - 1, damage))
     }
 
     /// The frame nearest to a time, if one is within half a frame.
@@ -179,7 +185,9 @@ impl RecordCollector<'_> {
     ) -> Result<(), ImportError> {
         let video = match &episode.video {
             Some(part) if self.is_video => {
-                Some((self.videos.probe(&self.source.join(&part.path), self.cancelled)?, part))
+                let (number, damage) = self.videos.probe(&self.source.join(&part.path), self.cancelled)?;
+                damage.map_or(Ok(()), |damage| self.leave_out(damage))?;
+                Some((number, part))
             }
             _ => None,
         };

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::PoisonError;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 
@@ -111,7 +111,12 @@ impl Images {
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
         let in_parallel = |read: &(dyn Fn(&WantedImage<'_>) -> Result<Frame, ImportError> + Sync)| {
-            let fitted = |wanted: &WantedImage<'_>| fit(&read(wanted)?, wanted.place);
+            let fitted = |wanted: &WantedImage<'_>| {
+                if cancelled.load(Ordering::Relaxed) {
+                    return Err(ImportError::Stopped);
+                }
+                fit(&read(wanted)?, wanted.place)
+            };
             wanted.par_iter().map(fitted).collect()
         };
         match self {

@@ -27,7 +27,11 @@ pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool
                 .to_owned(),
         ));
     }
-    let times_s = frame_times(video, cancelled)?;
+    let ListedFrames { times_s, damage } = frames_of(video, cancelled)?;
+    let mut skipped = SkippedList::default();
+    if let Some(damage) = damage {
+        skipped.push(damage.skippable().filter(|_| options.skip_bad).ok_or(damage)?);
+    }
     let record = |(index, &timestamp_s): (usize, &f64)| Record {
         timestamp_s,
         session: String::new(),
@@ -48,14 +52,22 @@ pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool
             vec![(video.to_owned(), times_s.len())],
             (0..times_s.len()).map(|frame| (0, frame)).collect(),
         )),
-        skipped: SkippedList::default(),
+        skipped,
     })
 }
 
-/// The presentation time of every frame, in seconds.
-fn frame_times(video: &Path, cancelled: &AtomicBool) -> Result<Vec<f64>, ImportError> {
+/// The frames of a video.
+pub(super) struct ListedFrames {
+    /// The presentation time of every frame, in seconds.
+    pub(super) times_s: Vec<f64>,
+    /// What is wrong with the video; frames can be missing.
+    pub(super) damage: Option<ImportError>,
+}
+
+/// Lists the frames by decoding the video: not every packet of a file becomes a frame. Errors: `Program`, `Record`, `Stopped`.
+pub(super) fn frames_of(video: &Path, cancelled: &AtomicBool) -> Result<ListedFrames, ImportError> {
     let mut times_s = Vec::new();
-    probe(
+    let complaint = probe(
         video,
         "frame=pts_time,best_effort_timestamp_time",
         cancelled,
@@ -72,27 +84,21 @@ fn frame_times(video: &Path, cancelled: &AtomicBool) -> Result<Vec<f64>, ImportE
             "it holds no video stream",
         ));
     }
-    Ok(times_s)
+    let damage = (!complaint.is_empty()).then(|| {
+        let (count, complaint) = (times_s.len(), without_sender(&complaint));
+        let reason = format!("the video is damaged; {count} frames can be read: {complaint}");
+        ImportError::record(video.display().to_string(), reason)
+    });
+    Ok(ListedFrames { times_s, damage })
 }
 
-/// The presentation times of all frames in seconds, in order, without decoding them. Errors: `Program`, `Record`, `Stopped`.
-pub(super) fn packet_times(video: &Path, cancelled: &AtomicBool) -> Result<Vec<f64>, ImportError> {
-    let mut times_s = Vec::new();
-    probe(video, "packet=pts_time", cancelled, |fields| {
-        times_s.extend(number(fields, "pts_time"));
-        Ok(())
-    })?;
-    times_s.sort_by(f64::total_cmp);
-    Ok(times_s)
-}
-
-/// Passes each entry of the first video stream on, as `name=value|name=value`.
+/// Passes each entry of the first video stream on, as `name=value|name=value`. Returns what ffprobe says is wrong with the video.
 fn probe(
     video: &Path,
     entries: &str,
     cancelled: &AtomicBool,
     mut take: impl FnMut(&str) -> Result<(), ImportError>,
-) -> Result<(), ImportError> {
+) -> Result<String, ImportError> {
     let failed = |error| failure("ffprobe", video, error);
     let mut command = Command::new("ffprobe");
     command.args(ALLOWED).args(["-v", "error", "-select_streams", "v:0"]);
@@ -122,6 +128,12 @@ fn argument(video: &Path) -> PathBuf {
     }
 }
 
+/// A message of ffmpeg or ffprobe without the part of the program that wrote it, as in `[matroska,webm @ 0x55fc6ae96800]`.
+fn without_sender(message: &str) -> &str {
+    let sent = message.strip_prefix('[').and_then(|rest| rest.split_once("] "));
+    sent.map_or(message, |(_, message)| message)
+}
+
 fn failure(program: &str, video: &Path, error: ProgramError) -> ImportError {
     match error {
         ProgramError::Missing => ImportError::Program(format!(
@@ -131,7 +143,7 @@ fn failure(program: &str, video: &Path, error: ProgramError) -> ImportError {
         ProgramError::Cancelled => ImportError::Stopped,
         ProgramError::Failed(reason) => ImportError::record(
             video.display().to_string(),
-            format!("{program} cannot read the video: {reason}"),
+            format!("{program} cannot read the video: {}", without_sender(&reason)),
         ),
     }
 }
@@ -183,7 +195,7 @@ impl VideoFrames {
         let (video, frame) = self.places[wanted.image];
         let (path, frames) = &self.videos[video];
         let stream = match stream {
-            Some(open) if open.video == video && open.next <= frame => open,
+            Some(open) if open.video == video && open.can_give(frame) => open,
             other => other.insert(FrameStream::start(video, path)?),
         };
         stream.frame(frame, *frames, path, cancelled)
@@ -195,6 +207,8 @@ struct FrameStream {
     video: usize,
     /// The frame that comes next.
     next: usize,
+    /// The frame before it, for a recording that shows a frame several times.
+    last: Option<Frame>,
     /// `None` after the end.
     output: Option<ProgramOutput>,
     /// Why no more frames come.
@@ -217,13 +231,18 @@ impl FrameStream {
         Ok(Self {
             video,
             next: 0,
+            last: None,
             output: Some(output),
             fault: String::new(),
         })
     }
 
-    /// Decodes frame `wanted`, which has not come yet, of a video that announced `frames` frames. Errors: `Record`, `Program`,
-    /// `Stopped`.
+    /// Whether a frame is the last one or has not come yet.
+    fn can_give(&self, frame: usize) -> bool {
+        self.next <= frame || (self.next == frame + 1 && self.last.is_some())
+    }
+
+    /// Frame `wanted`, which can be given, of a video that announced `frames` frames. Errors: `Record`, `Program`, `Stopped`.
     fn frame(
         &mut self,
         wanted: usize,
@@ -231,6 +250,9 @@ impl FrameStream {
         path: &Path,
         cancelled: &AtomicBool,
     ) -> Result<Frame, ImportError> {
+        if let Some(last) = self.last.as_ref().filter(|_| wanted < self.next) {
+            return Ok(last.clone());
+        }
         let Some(output) = &mut self.output else {
             return Err(ImportError::record(
                 format!("{} frame {wanted}", path.display()),
@@ -242,18 +264,19 @@ impl FrameStream {
                 Ok(Some(frame)) => {
                     self.next += 1;
                     if self.next > wanted {
+                        self.last = Some(frame.clone());
                         return Ok(frame);
                     }
                 }
                 Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
                 ended => {
                     let result = match (ended, self.output.take()) {
-                        (Ok(_), Some(output)) => output.finish(cancelled),
+                        (Ok(_), Some(output)) => output.finish(cancelled).map(drop),
                         (ended, _) => ended.map(drop),
                     };
                     self.fault = match result {
                         Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
-                        Err(error) => format!("ffmpeg cannot read the video: {error}"),
+                        Err(error) => format!("ffmpeg cannot read the video: {}", without_sender(&error.to_string())),
                         Ok(()) => format!("the video ends here; it announces {frames} frames"),
                     };
                     let place = format!("{} frame {}", path.display(), self.next);
@@ -289,4 +312,36 @@ fn read_pgm(output: &mut ProgramOutput, cancelled: &AtomicBool) -> Result<Option
     Frame::new(width, height, pixels)
         .map(Some)
         .map_err(|error| wrong(&error.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_repeated_frame_does_not_start_the_video_again() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("walk.mkv");
+        let mut command = Command::new("ffmpeg");
+        command.args(["-v", "error", "-f", "lavfi", "-i", "testsrc=size=16x12:rate=5"]);
+        let Ok(status) = command.args(["-frames:v", "3", "-c:v", "mpeg4"]).arg(&path).status() else {
+            eprintln!("skipped: ffmpeg is not installed");
+            return;
+        };
+        assert!(status.success());
+        let places = [0, 0, 1, 1, 2, 2].map(|frame| (0, frame));
+        let frames = VideoFrames::new(vec![(path.clone(), 3)], places.to_vec());
+        let read = |images: std::ops::Range<usize>| -> Vec<Vec<u8>> {
+            let wanted: Vec<_> = images.map(|image| WantedImage { image, place: "" }).collect();
+            let whole: FitImage<'_> = &|frame, _| Ok(frame.clone());
+            let read = frames.read_all(&wanted, whole, &AtomicBool::new(false));
+            read.into_iter().map(|frame| frame.unwrap().pixels().to_vec()).collect()
+        };
+        let mut all = read(0..1);
+        // Starting it again would fail.
+        std::fs::remove_file(&path).unwrap();
+        all.extend(read(1..6));
+        assert!(all[0] == all[1] && all[2] == all[3] && all[4] == all[5]);
+        assert!(all[1] != all[2] && all[3] != all[4]);
+    }
 }

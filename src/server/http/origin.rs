@@ -4,12 +4,12 @@
 //!
 //! `tower-http`'s `CorsLayer` only adds headers. This also refuses the requests of other pages and of other hosts.
 
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, Ipv6Addr};
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
 use axum::http::uri::Authority;
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Version, header};
+use axum::http::{HeaderValue, Method, StatusCode, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -40,12 +40,13 @@ impl OriginPolicy {
 /// Refuses requests to a foreign host and requests of a foreign page, unless they are configured. Answers preflight
 /// requests.
 pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request: Request, next: Next) -> Response {
-    if let Err(wrong) = check_host(&request) {
-        return wrong.into_response();
-    }
+    let host = match requested_host(&request) {
+        Ok(host) => host,
+        Err(wrong) => return wrong.into_response(),
+    };
     let allowed = &policy.allowed;
     if !policy.keys.are_required()
-        && let Some(host) = foreign_host(request.headers(), allowed)
+        && let Some(host) = host.as_ref().filter(|host| is_foreign(host, allowed))
     {
         return ApiError::Forbidden(format!(
             "authentication is off, so this server answers only to localhost, IP addresses and names without a dot, not to \
@@ -53,10 +54,14 @@ pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request
         ))
         .into_response();
     }
-    let Some(origin) = request.headers().get(header::ORIGIN).cloned() else {
+    let mut origins = request.headers().get_all(header::ORIGIN).iter().cloned();
+    let Some(origin) = origins.next() else {
         return next.run(request).await;
     };
-    if is_own(&origin, request.headers()) {
+    if origins.next().is_some() {
+        return ApiError::Malformed("there is more than one Origin header".to_owned()).into_response();
+    }
+    if host.is_some_and(|host| is_own(&origin, &host)) {
         return next.run(request).await;
     }
     if !allowed.iter().any(|allowed| allowed.as_bytes() == origin.as_bytes()) {
@@ -82,48 +87,70 @@ pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request
     response
 }
 
-/// Errors: `Malformed` unless the request has one valid Host header (HTTP/1.0: at most one), and its target names no other host.
-fn check_host(request: &Request) -> Result<(), ApiError> {
+/// The host that is asked; `None` in HTTP/1.0, which need not name one. Errors: `Malformed` unless the request has one valid Host
+/// header (HTTP/1.0: at most one), and its target names no other host.
+fn requested_host(request: &Request) -> Result<Option<Authority>, ApiError> {
     let wrong = |what: &str| {
         Err(ApiError::Malformed(format!(
             "{what}; a request names its host once, as in Host: 127.0.0.1:8642"
         )))
     };
+    let target = request.uri().authority();
     let mut hosts = request.headers().get_all(header::HOST).iter();
     let host = match (hosts.next(), hosts.next()) {
-        (Some(host), None) => host,
+        (Some(host), None) => Authority::try_from(host.as_bytes()).ok(),
         (Some(_), Some(_)) => return wrong("there is more than one Host header"),
         // Before HTTP/1.1, there was no such header.
-        (None, _) if request.version() < Version::HTTP_11 => return Ok(()),
+        (None, _) if request.version() < Version::HTTP_11 => match target {
+            Some(target) => Some(target.clone()),
+            None => return Ok(None),
+        },
         (None, _) => return wrong("there is no Host header"),
     };
-    let Some(authority) = Authority::try_from(host.as_bytes())
-        .ok()
-        .filter(|host| !host.host().is_empty() && !host.as_str().contains('@'))
-    else {
+    let Some(host) = host.filter(is_host_and_port) else {
         return wrong("the Host header is no host with an optional port");
     };
-    match request.uri().authority() {
-        Some(target) if *target != authority => wrong("the request's target and its Host header name different hosts"),
-        _ => Ok(()),
+    let scheme = request.uri().scheme_str().unwrap_or_default();
+    if target.is_some_and(|target| !are_same(&host, target, scheme)) {
+        return wrong("the request's target and its Host header name different hosts");
     }
+    Ok(Some(host))
 }
 
-/// The requested host, if it is a domain name that anybody could point at this machine.
-fn foreign_host<'a>(headers: &'a HeaderMap, allowed: &[String]) -> Option<&'a str> {
-    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok())?;
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+/// A name or an address and at most a port, without a user.
+fn is_host_and_port(authority: &Authority) -> bool {
+    let host = authority.host();
+    let is_host = match host.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
+        Some(address) => address.parse::<Ipv6Addr>().is_ok(),
+        None => !host.is_empty() && !host.contains(['[', ']']),
+    };
+    let port = authority.as_str().strip_prefix(host);
+    let is_port = |port: &str| port.is_empty() || port == ":" || authority.port_u16().is_some();
+    is_host && port.is_some_and(is_port)
+}
+
+/// Whether two hosts are the same, in a URL of this scheme.
+fn are_same(one: &Authority, other: &Authority, scheme: &str) -> bool {
+    let port = |of: &Authority| of.port_u16().unwrap_or(if scheme == "https" { 443 } else { 80 });
+    one.host().eq_ignore_ascii_case(other.host()) && port(one) == port(other)
+}
+
+/// Whether the host is a domain name that anybody could point at this machine.
+fn is_foreign(host: &Authority, allowed: &[String]) -> bool {
+    let name = host.host();
     let is_address = name.starts_with('[') || name.parse::<Ipv4Addr>().is_ok();
     let is_local = !name.contains('.') || name.ends_with(".localhost");
     let is_allowed = allowed
         .iter()
-        .any(|origin| origin.split_once("://").is_some_and(|(_, of)| of == host));
-    (!is_address && !is_local && !is_allowed).then_some(host)
+        .any(|origin| origin.split_once("://").is_some_and(|(_, of)| of == host.as_str()));
+    !is_address && !is_local && !is_allowed
 }
 
-/// Whether the page came from this server: its origin ends in the requested host.
-fn is_own(origin: &HeaderValue, headers: &HeaderMap) -> bool {
-    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok());
+/// Whether the page came from this server: its origin names the requested host.
+fn is_own(origin: &HeaderValue, host: &Authority) -> bool {
     let of_page = origin.to_str().ok().and_then(|origin| origin.split_once("://"));
-    matches!((host, of_page), (Some(host), Some((_, of_page))) if host == of_page)
+    let Some((scheme @ ("http" | "https"), of_page)) = of_page else {
+        return false;
+    };
+    of_page.parse().is_ok_and(|of_page| are_same(host, &of_page, scheme))
 }

@@ -13,8 +13,8 @@ use crate::dataset::import::{ImportError, MAX_FILE_BYTES, open_file};
 /// What a database may ask of SQLite. Those of rosbag2 have a few tables of less than ten columns, and our statements are short.
 const LIMITS: [(Limit, i32); 11] = [
     (Limit::SQLITE_LIMIT_LENGTH, MAX_FILE_BYTES as i32),
-    (Limit::SQLITE_LIMIT_SQL_LENGTH, 16 << 10),
-    (Limit::SQLITE_LIMIT_COLUMN, 100),
+    (Limit::SQLITE_LIMIT_SQL_LENGTH, 1 << 20),
+    (Limit::SQLITE_LIMIT_COLUMN, 2000),
     (Limit::SQLITE_LIMIT_EXPR_DEPTH, 20),
     (Limit::SQLITE_LIMIT_COMPOUND_SELECT, 2),
     (Limit::SQLITE_LIMIT_VDBE_OP, 10_000),
@@ -123,14 +123,19 @@ impl BagDatabase {
     }
 }
 
-/// The database's name. Without a write-ahead log it is opened as one that never changes, so that SQLite writes nothing beside it.
+/// The database's name. Without a write-ahead log and a rollback journal it is opened as one that never changes, so that SQLite
+/// writes nothing beside it.
 fn uri(path: &Path) -> PathBuf {
     let Some(text) = path.to_str() else {
         return path.to_owned();
     };
-    let log = PathBuf::from(format!("{text}-wal"));
+    let has = |ending: &str| PathBuf::from(format!("{text}{ending}")).exists();
     let escaped = text.replace('%', "%25").replace('?', "%3f").replace('#', "%23");
-    let option = if log.exists() { "" } else { "?immutable=1" };
+    let option = if has("-wal") || has("-journal") {
+        ""
+    } else {
+        "?immutable=1"
+    };
     // Two slashes before a relative path would name a host.
     let root = if path.is_absolute() { "//" } else { "" };
     PathBuf::from(format!("file:{root}{escaped}{option}"))

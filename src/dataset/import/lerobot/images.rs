@@ -18,6 +18,10 @@ use crate::frame::{Frame, codec};
 const BLOCK_ROWS: usize = 256;
 /// Blocks of rows that are kept: parallel readers are at most so far apart.
 const KEPT: usize = 3;
+/// A block ends after the row at which its images have this number of bytes.
+const BLOCK_BYTES: usize = 64 << 20;
+/// Rows that the library decodes at a time.
+const BATCH_ROWS: usize = 8;
 
 /// Images in a column of tables.
 pub(in super::super) struct ImageTable {
@@ -42,6 +46,16 @@ enum StoredImage {
     Bytes(Vec<u8>),
     File(String),
     Missing,
+}
+
+impl StoredImage {
+    fn bytes(&self) -> usize {
+        match self {
+            Self::Bytes(bytes) => bytes.len(),
+            Self::File(name) => name.len(),
+            Self::Missing => 0,
+        }
+    }
 }
 
 impl ImageTable {
@@ -83,19 +97,21 @@ impl ImageTable {
             let mut found = blocks.iter().filter(holds);
             found.find_map(|block| block.images.get(row - block.first).cloned())
         };
-        if let Some(image) = find(&blocks) {
-            return Ok(image);
-        }
-        let first = row / BLOCK_ROWS * BLOCK_ROWS;
-        let images = self.load(table, first)?;
-        blocks.push_back(ImageBlock { table, first, images });
-        if blocks.len() > KEPT {
-            blocks.pop_front();
+        // A block of large images can end before the row.
+        for first in [row / BLOCK_ROWS * BLOCK_ROWS, row] {
+            if let Some(image) = find(&blocks) {
+                return Ok(image);
+            }
+            let images = self.load(table, first)?;
+            blocks.push_back(ImageBlock { table, first, images });
+            if blocks.len() > KEPT {
+                blocks.pop_front();
+            }
         }
         Ok(find(&blocks).unwrap_or(StoredImage::Missing))
     }
 
-    /// The images of a block of rows. Errors: `Io`, `Record`.
+    /// The images of a block of rows, which ends early if they are large. Errors: `Io`, `Record`.
     fn load(&self, table: usize, first: usize) -> Result<Vec<StoredImage>, ImportError> {
         let path = &self.tables[table];
         let wrong = |reason: String| ImportError::record(path.display().to_string(), reason.trim());
@@ -124,14 +140,18 @@ impl ImageTable {
             .with_row_groups(groups)
             .with_offset(first - skipped)
             .with_limit(BLOCK_ROWS)
-            .with_batch_size(BLOCK_ROWS);
+            .with_batch_size(BATCH_ROWS);
         let batches = parquet_file::batches(builder);
-        let mut images = Vec::with_capacity(BLOCK_ROWS);
+        let (mut images, mut bytes) = (Vec::with_capacity(BLOCK_ROWS), 0);
         for batch in batches.map_err(|error| wrong(error.to_string()))? {
             let batch = batch.map_err(|error| wrong(error.to_string()))?;
             let stored = stored_images(&batch)
                 .ok_or_else(|| wrong(format!("its column {:?} does not hold images", self.column)))?;
+            bytes += stored.iter().map(StoredImage::bytes).sum::<usize>();
             images.extend(stored);
+            if bytes >= BLOCK_BYTES {
+                break;
+            }
         }
         Ok(images)
     }
