@@ -33,6 +33,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use self::error::CliError;
+use crate::dataset::silence_caught_panics;
 use crate::error_text::printable;
 
 /// Predicts the next camera frames of a robot from its frames, its state and its actions.
@@ -78,6 +79,7 @@ enum Command {
 /// Runs the program with the arguments of the process and returns its exit code.
 #[must_use]
 pub fn main() -> ExitCode {
+    silence_caught_panics();
     let Err(error) = run(Cli::parse().command) else {
         return ExitCode::SUCCESS;
     };

@@ -41,6 +41,7 @@ pub use collection::CollectionStatus;
 pub use error::DatasetError;
 use frame_store::{FrameStore, HeldFrames};
 pub use layout::{IMPORT_ARGUMENTS, INFO, METADATA};
+pub use parquet_file::silence_caught_panics;
 pub use preview::{describe, describe_metadata};
 pub use sampler::{Split, Splits, WindowShape};
 

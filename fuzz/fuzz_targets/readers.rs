@@ -2,7 +2,6 @@
 //! the reader. With `FUZZ_SEEDS=DIR` it writes the seeds that are not in tests/corpus and ends.
 #![no_main]
 
-use std::panic::{set_hook, take_hook};
 use std::path::{Path, PathBuf};
 use std::process::exit;
 use std::sync::atomic::AtomicBool;
@@ -10,7 +9,7 @@ use std::sync::{LazyLock, OnceLock};
 
 use axum::extract::ws::Message;
 use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
-use foreframe::dataset::{CollectConfig, Dataset, collect};
+use foreframe::dataset::{CollectConfig, Dataset, collect, silence_caught_panics};
 use foreframe::files::sha256_hex;
 use foreframe::frame::codec;
 use foreframe::nn::ModelSpec;
@@ -53,21 +52,10 @@ static READER: LazyLock<Reader> = LazyLock::new(|| {
         );
         exit(2)
     };
-    tolerate_caught_panics();
+    // The fuzzer's hook would abort before they are caught.
+    silence_caught_panics();
     *reader
 });
-
-/// The reader of Parquet files makes errors of the panics of its libraries, at which the fuzzer would abort before they are
-/// caught. A panic that nothing catches still ends it.
-fn tolerate_caught_panics() {
-    let abort = take_hook();
-    set_hook(Box::new(move |panic| {
-        let place = panic.location().map_or("", |location| location.file());
-        if !["/parquet-", "/arrow-"].iter().any(|library| place.contains(library)) {
-            abort(panic);
-        }
-    }));
-}
 
 fuzz_target!(init: LazyLock::force(&READER), |bytes: &[u8]| READER(bytes));
 

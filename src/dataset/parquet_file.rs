@@ -2,8 +2,9 @@
 //! that parses or decodes goes through here, where a panic becomes an error.
 
 use std::any::Any;
+use std::cell::Cell;
 use std::fs::File;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
 
 use arrow_array::RecordBatch;
 use arrow_schema::ArrowError;
@@ -56,9 +57,27 @@ impl Iterator for Batches {
     }
 }
 
+thread_local! {
+    /// Whether a panic of this thread becomes an error.
+    static IS_GUARDED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Keeps the present panic hook from panics that become errors: nobody needs to read of them.
+pub fn silence_caught_panics() {
+    let hook = take_hook();
+    set_hook(Box::new(move |panic| {
+        if !IS_GUARDED.get() {
+            hook(panic);
+        }
+    }));
+}
+
 /// The result of `work`, after whose panic nothing that it changed is used. Error: what the panic said.
 fn guarded<T>(work: impl FnOnce() -> T) -> Result<T, String> {
-    catch_unwind(AssertUnwindSafe(work)).map_err(|panic| format!("it is damaged: {}", message(panic.as_ref())))
+    IS_GUARDED.set(true);
+    let result = catch_unwind(AssertUnwindSafe(work));
+    IS_GUARDED.set(false);
+    result.map_err(|panic| format!("it is damaged: {}", message(panic.as_ref())))
 }
 
 fn message(panic: &(dyn Any + Send)) -> &str {

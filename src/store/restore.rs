@@ -28,17 +28,14 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
         return Err(BackupError::OtherDatabase);
     }
     std::fs::create_dir_all(data_dir).map_err(BackupError::io("make", data_dir))?;
-    let data_dir = &std::path::absolute(data_dir).map_err(BackupError::io("find", data_dir))?;
-    let database = match database {
-        Some(path) => Some(std::path::absolute(&path).map_err(BackupError::io("find", &path))?),
-        None => None,
-    };
+    let absolute = |path: &Path| std::path::absolute(path).map_err(BackupError::io("find", path));
+    let data_dir = &absolute(data_dir)?;
+    let database = database.map(|path| absolute(&path)).transpose()?;
     let _lock = RestoreLock::take(data_dir)?;
     let marker = begin_restore(data_dir, database.as_deref(), &index)?;
     for (name, expected) in &index.files {
-        let source = inside(from, name).ok_or_else(|| no_backup(from, "names a file outside of it"))?;
-        let to = restored_path(data_dir, database.as_deref(), name)
-            .ok_or_else(|| no_backup(from, "names a file outside of it"))?;
+        let places = inside(from, name).zip(restored_path(data_dir, database.as_deref(), name));
+        let (source, to) = places.ok_or_else(|| no_backup(from, "names a file outside of it"))?;
         let found = none_if_missing(copy(&source, &to)).map_err(BackupError::io("copy", &source))?;
         if found.as_ref() != Some(expected) {
             return Err(BackupError::Damaged { path: source });
@@ -110,7 +107,9 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
         let created = File::create_new(&marker).and_then(|file| file.sync_all());
         created.map_err(BackupError::io("write", &marker))?;
     }
-    let path_of = |name: &String| restored_path(data_dir, begun.database.as_deref(), name).filter(|path| is_own(path));
+    // A database elsewhere can be in use by now.
+    let may_be_deleted = |path: &PathBuf| path.starts_with(data_dir) || database == Some(path);
+    let path_of = |name: &String| restored_path(data_dir, begun.database.as_deref(), name).filter(may_be_deleted);
     let stale: Vec<PathBuf> = begun.files.iter().filter_map(path_of).collect();
     let now = BegunRestore {
         database: database.map(Path::to_owned),

@@ -1,8 +1,8 @@
 //! Bags of ROS 2: MCAP files, and what `ros2 bag record` writes.
 //!
-//! One pass over the bag's files (`rosbag2`, `mcap`, `sqlite` with `database`) collects where the images are and the values of everything else (`collector`, with
-//! `messages`, `cdr` and `pixels`); `choice` picks the topics, `join` gives each image its action and state. The images
-//! themselves are read later, one by one.
+//! One pass over the bag's files (`rosbag2`, `mcap`, `sqlite` with `database`) collects where the images are and the values of
+//! everything else (`collector`, with `messages`, `cdr` and `pixels`); `choice` picks the topics, `join` gives each image its action
+//! and state. The images themselves are read later, one by one.
 
 mod camera;
 mod cdr;

@@ -62,7 +62,7 @@ fn log_skipped(imported: &Imported, report: &JobReporter) {
     if imported.skipped.len() > LOGGED_ITEMS {
         let count = imported.skipped_count();
         report.line(format!(
-            "left out {count} items in all; the data set's meta/skipped.json lists the first 10,000"
+            "left out {count} items in all; the data set's meta/skipped.json lists them, up to 10,000"
         ));
     }
 }

@@ -7,7 +7,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::problem::ApiError;
 
-/// The places of streams and their stop signal; clones share them.
+/// The places of tasks of one kind, and their stop signal; clones share them.
 #[derive(Clone)]
 pub(in crate::server) struct TaskLimit {
     places: Arc<Semaphore>,
@@ -28,7 +28,7 @@ impl TaskLimit {
         }
     }
 
-    /// A place, held until the stream's task ends. Errors: `Unavailable` if all are taken.
+    /// A place, held until the task ends. Errors: `Unavailable` if all are taken.
     pub(in crate::server) fn enter(&self) -> Result<OwnedSemaphorePermit, ApiError> {
         let (limit, kind) = (self.limit, self.kind);
         Arc::clone(&self.places)
@@ -41,24 +41,24 @@ impl TaskLimit {
         (self.limit as usize).saturating_sub(self.places.available_permits())
     }
 
-    /// Becomes true when streams shall stop.
+    /// Becomes true when the tasks shall stop.
     pub(in crate::server) fn stopping(&self) -> watch::Receiver<bool> {
         self.stop.subscribe()
     }
 
-    /// Signals every stream to stop.
+    /// Signals every task to stop.
     pub(in crate::server) fn stop(&self) {
         self.stop.send_replace(true);
     }
 
-    /// Waits until every stream's task has ended.
+    /// Waits until every task has ended.
     pub(in crate::server) async fn ended(&self) {
-        // All places are free only if no stream is open. An error means that the places are closed for good.
+        // All places are free only if no task runs. An error means that the places are closed for good.
         let _ = self.places.acquire_many(self.limit).await;
     }
 }
 
-/// Waits until streams shall stop.
+/// Waits until the tasks shall stop.
 pub(in crate::server) async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
     // An error means that the sender is gone, and with it the server.
     let _ = stopping.wait_for(|stopping| *stopping).await;

@@ -10,7 +10,8 @@ use rusqlite::{Connection, OpenFlags};
 
 use crate::dataset::import::{ImportError, MAX_FILE_BYTES, open_file};
 
-/// What a database may ask of SQLite. Those of rosbag2 have a few tables of less than ten columns, and our statements are short.
+/// What a database may ask of SQLite. The tables of rosbag2 have less than ten columns and our statements are short; other tables of
+/// the file may be larger.
 const LIMITS: [(Limit, i32); 11] = [
     (Limit::SQLITE_LIMIT_LENGTH, MAX_FILE_BYTES as i32),
     (Limit::SQLITE_LIMIT_SQL_LENGTH, 1 << 20),

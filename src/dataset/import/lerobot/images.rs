@@ -102,6 +102,9 @@ impl ImageTable {
             if let Some(image) = find(&blocks) {
                 return Ok(image);
             }
+            if blocks.iter().any(|block| block.table == table && block.first == first) {
+                continue;
+            }
             let images = self.load(table, first)?;
             blocks.push_back(ImageBlock { table, first, images });
             if blocks.len() > KEPT {
