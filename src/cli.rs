@@ -35,6 +35,7 @@ use clap::{Parser, Subcommand};
 use self::error::CliError;
 use crate::dataset::silence_caught_panics;
 use crate::error_text::printable;
+use crate::program;
 
 /// Predicts the next camera frames of a robot from its frames, its state and its actions.
 ///
@@ -80,6 +81,7 @@ enum Command {
 #[must_use]
 pub fn main() -> ExitCode {
     silence_caught_panics();
+    program::announce();
     let Err(error) = run(Cli::parse().command) else {
         return ExitCode::SUCCESS;
     };

@@ -32,54 +32,28 @@
 //! # }
 //! ```
 //!
-//! The modules in reading order; each uses only those above it:
+//! The modules in reading order; each uses only those above it. The first ones are in crates of their own, one a layer:
+//! `foreframe-core`, `foreframe-sim`, `foreframe-data`, `foreframe-train` and `foreframe-jobs`.
 #![deny(unsafe_code)]
-// Some crate-private helpers serve only the modules of a feature. The default features use all of them, and are checked.
-#![cfg_attr(not(feature = "server"), allow(dead_code, unused_imports))]
 
-pub mod types;
-
-mod vectorized;
-
-pub mod files;
-
-#[cfg(feature = "train")]
-pub mod settings;
-
-pub mod error_text;
-pub mod telemetry;
-
-pub mod frame;
-
-pub mod nn;
+pub use foreframe_core::{error_text, files, frame, metric_names, nn, registry, serving, types};
 
 #[cfg(feature = "sim")]
-pub mod sim;
+pub use foreframe_sim as sim;
 
 #[cfg(feature = "train")]
-pub mod dataset;
-
+pub use foreframe_data::{dataset, inspection};
 #[cfg(feature = "train")]
-pub mod inspection;
-
-pub mod registry;
-
-#[cfg(feature = "train")]
-pub mod training;
-
-#[cfg(feature = "train")]
-pub mod evaluation;
-
-pub mod serving;
+pub use foreframe_train::{evaluation, settings, training};
 
 #[cfg(feature = "server")]
-pub mod store;
+pub use foreframe_jobs::{jobs, store, versions};
 
 #[cfg(feature = "server")]
-pub mod versions;
+mod program;
 
 #[cfg(feature = "server")]
-pub mod jobs;
+pub mod telemetry;
 
 #[cfg(feature = "server")]
 pub mod server;

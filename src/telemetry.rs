@@ -1,17 +1,13 @@
 //! Logs, metrics and traces. Logs go to standard error, at level `info` and above unless `RUST_LOG` sets another level.
-//! Metrics have the [`names`] listed there; [`install_recorder`] starts to record them and [`render`] writes them for
+//! Metrics have the names of [`metric_names`](crate::metric_names); [`install_recorder`] starts to record them and [`render`] writes them for
 //! Prometheus. With the feature `otlp`, spans are sent as traces.
-
-pub mod names;
 
 #[cfg(feature = "otlp")]
 mod otlp;
-#[cfg(feature = "server")]
 mod prometheus;
 
 use serde::{Deserialize, Serialize};
 
-#[cfg(feature = "server")]
 pub use prometheus::{install_recorder, render, run_upkeep};
 
 /// Format of log lines.
@@ -46,7 +42,6 @@ pub struct Telemetry {
 
 /// Installs the log subscriber of the process; a second call changes nothing. If `otlp_endpoint` is given, for example
 /// `http://127.0.0.1:4318`, spans are sent there. Errors: `NoOtlp`, `Otlp`.
-#[cfg(feature = "server")]
 pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry, TelemetryError> {
     use std::io::IsTerminal as _;
 

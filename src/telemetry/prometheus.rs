@@ -8,7 +8,8 @@ use metrics::gauge;
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
 use tracing::error;
 
-use super::names;
+use crate::metric_names;
+use crate::program::GIT_COMMIT;
 
 /// Histogram buckets in seconds: from half a millisecond (a small model) to the longest sensible deadline.
 const SECONDS: [f64; 16] = [
@@ -32,14 +33,17 @@ pub fn install_recorder() {
 fn install() -> Result<PrometheusHandle, BuildError> {
     let handle = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &SECONDS)?
-        .set_buckets_for_metric(Matcher::Full(names::PREDICTION_BATCH_SIZE.to_owned()), &BATCH_SIZES)?
+        .set_buckets_for_metric(
+            Matcher::Full(metric_names::PREDICTION_BATCH_SIZE.to_owned()),
+            &BATCH_SIZES,
+        )?
         .install_recorder()?;
-    names::describe();
-    names::initialize_counters();
-    let commit = env!("GIT_COMMIT_AT_BUILD");
-    gauge!(names::BUILD_INFO, "version" => env!("CARGO_PKG_VERSION"), "commit" => commit).set(1.0);
+    metric_names::describe();
+    metric_names::initialize_counters();
+    let commit = GIT_COMMIT;
+    gauge!(metric_names::BUILD_INFO, "version" => env!("CARGO_PKG_VERSION"), "commit" => commit).set(1.0);
     let started = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    gauge!(names::PROCESS_START_SECONDS).set(started.unwrap_or_default().as_secs_f64());
+    gauge!(metric_names::PROCESS_START_SECONDS).set(started.unwrap_or_default().as_secs_f64());
     Ok(handle)
 }
 
@@ -70,13 +74,13 @@ fn measure_process() {
         line.split_whitespace().next()?.parse().ok()
     };
     if let Some(kib) = field("VmRSS:") {
-        gauge!(names::PROCESS_RESIDENT_BYTES).set(kib * 1024.0);
+        gauge!(metric_names::PROCESS_RESIDENT_BYTES).set(kib * 1024.0);
     }
     if let Some(threads) = field("Threads:") {
-        gauge!(names::PROCESS_THREADS).set(threads);
+        gauge!(metric_names::PROCESS_THREADS).set(threads);
     }
     if let Ok(open) = fs::read_dir("/proc/self/fd") {
         // Listing the directory opens one file.
-        gauge!(names::PROCESS_OPEN_FDS).set(open.count().saturating_sub(1) as f64);
+        gauge!(metric_names::PROCESS_OPEN_FDS).set(open.count().saturating_sub(1) as f64);
     }
 }

@@ -5,10 +5,10 @@ use std::net::TcpStream;
 use std::path::Path;
 use std::time::Instant;
 
+use foreframe::metric_names;
 use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, OnLate, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
-use foreframe::telemetry::names;
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
@@ -76,11 +76,11 @@ async fn every_metric_is_measured() {
     assert_metric(&server, "foreframe_model_loads_total{outcome=\"ok\"}", 3.0);
     assert_metric(&server, "foreframe_model_loads_total{outcome=\"refused\"}", 1.0);
     for name in [
-        names::SESSIONS_EVICTED,
-        names::STREAM_DROPPED,
-        names::AUTH_REFUSED,
-        names::HTTP_CONNECTIONS_REFUSED,
-        names::HTTP_CONNECTIONS_EVICTED,
+        metric_names::SESSIONS_EVICTED,
+        metric_names::STREAM_DROPPED,
+        metric_names::AUTH_REFUSED,
+        metric_names::HTTP_CONNECTIONS_REFUSED,
+        metric_names::HTTP_CONNECTIONS_EVICTED,
     ] {
         assert_metric(&server, name, 0.0);
     }
@@ -91,7 +91,7 @@ async fn every_metric_is_measured() {
     jobs(&server);
     connections(&server);
     let text = server.get("/metrics");
-    for name in names::ALL {
+    for name in metric_names::ALL {
         assert!(text.contains(&format!("# HELP {name} ")), "{name} is not in\n{text}");
     }
     server.terminate();

@@ -11,8 +11,8 @@ use metrics::counter;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::problem::ApiError;
+use crate::metric_names;
 use crate::server::config::ServerConfig;
-use crate::telemetry::names;
 
 /// The places of requests for predictions; clones share them.
 #[derive(Clone)]
@@ -45,7 +45,7 @@ impl Admission {
     }
 
     fn full(&self) -> ApiError {
-        counter!(names::PREDICTIONS_REFUSED, "reason" => "full").increment(1);
+        counter!(metric_names::PREDICTIONS_REFUSED, "reason" => "full").increment(1);
         ApiError::unavailable(format!(
             "{} predictions are waiting already; try again in 1 s",
             self.capacity

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use metrics::counter;
 use tokio::sync::Notify;
 
-use crate::telemetry::names;
+use crate::metric_names;
 
 /// The limits of a [`ConnectionTable`].
 pub(super) struct ConnectionLimits {
@@ -86,7 +86,7 @@ impl OpenConnections {
         let idlest = candidates.min_by_key(|(_, connection)| connection.idle_since)?;
         let id = *idlest.0;
         self.remove(id)?.evicted.notify_one();
-        counter!(names::HTTP_CONNECTIONS_EVICTED).increment(1);
+        counter!(metric_names::HTTP_CONNECTIONS_EVICTED).increment(1);
         Some(())
     }
 

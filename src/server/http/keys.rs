@@ -19,8 +19,8 @@ use tracing::warn;
 use super::access::required_scope;
 use super::problem::ApiError;
 use super::rate::RateLimit;
+use crate::metric_names;
 use crate::store::{Author, KeyRow, KeyScope, Store, StoreError};
-use crate::telemetry::names;
 
 /// The beginning of every key, so that leaked keys are easy to find.
 const PREFIX: &str = "ffk";
@@ -316,7 +316,7 @@ pub(in crate::server) async fn check(State(keys): State<Keys>, mut request: Requ
     let (caller, author) = match keys.check(presented(request.headers()), needed) {
         Ok(caller) => caller,
         Err(refused) => {
-            counter!(names::AUTH_REFUSED).increment(1);
+            counter!(metric_names::AUTH_REFUSED).increment(1);
             return refused.into_response();
         }
     };

@@ -18,8 +18,8 @@ use tracing::warn;
 
 use super::connection_table::{ConnectionLimits, ConnectionPlace, ConnectionTable};
 use super::problem::CONNECTIONS_FULL_RESPONSE;
+use crate::metric_names;
 use crate::server::config::ServerConfig;
-use crate::telemetry::names;
 
 /// How many connections can be refused with a response at the same time; more are closed without one.
 const MAX_REFUSING: usize = 64;
@@ -92,7 +92,7 @@ impl BoundedListener {
 
     fn refuse(&self, stream: TcpStream) {
         warn!("too many connections: refused one");
-        counter!(names::HTTP_CONNECTIONS_REFUSED).increment(1);
+        counter!(metric_names::HTTP_CONNECTIONS_REFUSED).increment(1);
         if let Ok(place) = Arc::clone(&self.refusing).try_acquire_owned() {
             tokio::spawn(async move {
                 // A client that is gone or slow gets no more time.
@@ -147,7 +147,7 @@ pub(in crate::server) struct BoundedConnection {
 
 impl BoundedConnection {
     fn new(stream: TcpStream, place: ConnectionPlace, write_stall: Duration) -> Self {
-        gauge!(names::HTTP_CONNECTIONS).increment(1.0);
+        gauge!(metric_names::HTTP_CONNECTIONS).increment(1.0);
         Self {
             open: Some((stream, Arc::new(place))),
             write_stall,
@@ -190,7 +190,7 @@ impl BoundedConnection {
 
 impl Drop for BoundedConnection {
     fn drop(&mut self) {
-        gauge!(names::HTTP_CONNECTIONS).decrement(1.0);
+        gauge!(metric_names::HTTP_CONNECTIONS).decrement(1.0);
         let open = self.open.take().filter(|(_, place)| !place.is_evicted());
         // Without a runtime, the connection is closed at once.
         if let (Some((stream, place)), Ok(runtime)) = (open, Handle::try_current()) {

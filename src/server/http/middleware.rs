@@ -12,8 +12,8 @@ use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
 use super::problem::{self, ApiError};
+use crate::metric_names;
 use crate::server::config::ServerConfig;
-use crate::telemetry::names;
 
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// The maximum length of a client's own id; a longer one is replaced.
@@ -92,8 +92,9 @@ pub(in crate::server) async fn trace(trace: RequestTrace, request: Request, next
             "answered"
         );
         let status = status.as_str().to_owned();
-        counter!(names::HTTP_REQUESTS, "method" => method, "route" => route.clone(), "status" => status).increment(1);
-        histogram!(names::HTTP_REQUEST_SECONDS, "route" => route).record(elapsed);
+        counter!(metric_names::HTTP_REQUESTS, "method" => method, "route" => route.clone(), "status" => status)
+            .increment(1);
+        histogram!(metric_names::HTTP_REQUEST_SECONDS, "route" => route).record(elapsed);
         response
     };
     let mut response = problem::finish(work.instrument(span).await, &id);

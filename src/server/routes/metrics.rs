@@ -14,7 +14,7 @@ use utoipa_axum::routes;
 use crate::jobs::{JobSpec, JobState};
 use crate::server::state::App;
 use crate::store::Store;
-use crate::telemetry::{self, names};
+use crate::{metric_names, telemetry};
 
 pub(in crate::server) const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 /// How often the samples of histograms are sorted into their buckets.
@@ -30,9 +30,9 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     responses((status = 200, description = "Prometheus' text format", content_type = "text/plain"))
 )]
 async fn metrics(State(app): State<App>) -> impl IntoResponse {
-    gauge!(names::STREAMS).set(app.streams().count() as f64);
-    gauge!(names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
-    gauge!(names::MODELS_LOADED).set(app.predictor().models().len() as f64);
+    gauge!(metric_names::STREAMS).set(app.streams().count() as f64);
+    gauge!(metric_names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
+    gauge!(metric_names::MODELS_LOADED).set(app.predictor().models().len() as f64);
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], text(app.store()).await)
 }
 
@@ -53,7 +53,8 @@ fn measure_jobs(counts: &[(String, String, i64)]) {
             let found = counts
                 .iter()
                 .find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
-            gauge!(names::JOBS, "kind" => kind, "state" => state).set(found.map_or(0, |(.., count)| *count) as f64);
+            gauge!(metric_names::JOBS, "kind" => kind, "state" => state)
+                .set(found.map_or(0, |(.., count)| *count) as f64);
         }
     }
 }

@@ -23,6 +23,7 @@ use super::session::{Owner, Ownership, Session};
 use super::step::{FrameStep, StepError};
 use crate::error_text::without_middle;
 use crate::frame::fit::Fit;
+use crate::metric_names;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
 use crate::server::http::body_budget;
@@ -31,7 +32,6 @@ use crate::server::http::message_bytes::MessageBytes;
 use crate::server::http::task_limit::{TaskLimit, stop_requested};
 use crate::server::images::ImageFormat;
 use crate::serving::Predictor;
-use crate::telemetry::names;
 
 /// How long a client may take to close the socket after the last message, so that it can read it.
 const LINGER: Duration = Duration::from_secs(1);
@@ -98,8 +98,8 @@ impl StreamConnection {
         let ownership = session.connect();
         let model = &session.model().manifest.name;
         Self {
-            frames: counter!(names::STREAM_FRAMES, "model" => model.clone()),
-            overtaken: counter!(names::STREAM_OVERTAKEN, "model" => model.clone()),
+            frames: counter!(metric_names::STREAM_FRAMES, "model" => model.clone()),
+            overtaken: counter!(metric_names::STREAM_OVERTAKEN, "model" => model.clone()),
             services,
             ownership,
             is_persistent,

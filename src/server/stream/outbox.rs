@@ -8,7 +8,7 @@ use metrics::counter;
 use tokio::sync::Notify;
 
 use super::protocol::{ClosingReason, ServerMessage, WarningCode};
-use crate::telemetry::names;
+use crate::metric_names;
 
 /// The assumed size of a message without its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
@@ -120,7 +120,7 @@ impl OutboxState {
         };
         self.bytes -= bytes(&message);
         self.dropped += 1;
-        counter!(names::STREAM_DROPPED).increment(1);
+        counter!(metric_names::STREAM_DROPPED).increment(1);
         true
     }
 

@@ -8,10 +8,10 @@ use metrics::counter;
 use tracing::info;
 
 use super::session::Session;
+use crate::metric_names;
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::ApiError;
 use crate::server::token::TokenHash;
-use crate::telemetry::names;
 
 /// Why a session is not available.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
@@ -153,7 +153,7 @@ impl SessionTable {
             let is_over = session.left(self.grace, now).is_some_and(|left| left.is_zero());
             if is_over {
                 info!(session.id = %id, frames = session.next_seq(), "session expired");
-                counter!(names::SESSIONS_EVICTED).increment(1);
+                counter!(metric_names::SESSIONS_EVICTED).increment(1);
                 session.delete();
                 expired.push_back(id.clone());
             }

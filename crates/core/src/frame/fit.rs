@@ -1,0 +1,184 @@
+//! Resizes a frame of any size to the size that a model takes.
+
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::resize::{GrayView, resize};
+use super::{Frame, FrameError, MAX_SIDE_PX};
+
+/// How a frame of another shape becomes one of the wanted shape.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Fit {
+    /// Keeps the proportions and cuts off what does not fit, equally on both sides.
+    Crop,
+    /// Keeps the proportions and the whole picture; adds equal black bars on both sides.
+    Letterbox,
+    /// Keeps the whole picture and changes its proportions.
+    Stretch,
+}
+
+/// A name that is no way to fit a frame.
+#[derive(Debug, thiserror::Error)]
+#[error("fit is \"{}\"; it must be crop, letterbox or stretch", .0.escape_default())]
+pub struct FitError(String);
+
+impl FromStr for Fit {
+    type Err = FitError;
+
+    fn from_str(name: &str) -> Result<Self, FitError> {
+        match name {
+            "crop" => Ok(Self::Crop),
+            "letterbox" => Ok(Self::Letterbox),
+            "stretch" => Ok(Self::Stretch),
+            other => Err(FitError(other.to_owned())),
+        }
+    }
+}
+
+/// The frame at `width_px`×`height_px`, resized with a Catmull-Rom filter (widened when it makes the frame smaller, so
+/// that details do not alias). A frame of that size comes back unchanged. Errors: `Size` if a side is out of range.
+pub fn fit(frame: &Frame, width_px: u32, height_px: u32, fit: Fit) -> Result<Frame, FrameError> {
+    let sides = 1..=MAX_SIDE_PX;
+    if !sides.contains(&width_px) || !sides.contains(&height_px) {
+        return Err(FrameError::Size {
+            width: width_px,
+            height: height_px,
+        });
+    }
+    if (frame.width(), frame.height()) == (width_px, height_px) {
+        return Ok(frame.clone());
+    }
+    let view = GrayView {
+        pixels: frame.pixels(),
+        stride: frame.width() as usize,
+        width: frame.width() as usize,
+        height: frame.height() as usize,
+    };
+    let fitted = match fit {
+        Fit::Crop => crop(view, width_px, height_px),
+        Fit::Letterbox => letterbox(view, width_px, height_px),
+        Fit::Stretch => resize(view, width_px as usize, height_px as usize),
+    };
+    Frame::new(width_px, height_px, fitted)
+}
+
+fn crop(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
+    let (width, height) = (view.width as u32, view.height as u32);
+    let kept_width = width.min(scaled(height, width_px, height_px));
+    let kept_height = height.min(scaled(width, height_px, width_px));
+    let (left, top) = ((width - kept_width) / 2, (height - kept_height) / 2);
+    let kept = GrayView {
+        pixels: &view.pixels[top as usize * view.stride + left as usize..],
+        stride: view.stride,
+        width: kept_width as usize,
+        height: kept_height as usize,
+    };
+    resize(kept, width_px as usize, height_px as usize)
+}
+
+fn letterbox(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
+    let (width, height) = (view.width as u32, view.height as u32);
+    let inner_width = width_px.min(scaled(height_px, width, height)) as usize;
+    let inner_height = height_px.min(scaled(width_px, height, width)) as usize;
+    let inner = resize(view, inner_width, inner_height);
+    let (width, height) = (width_px as usize, height_px as usize);
+    let (left, top) = ((width - inner_width) / 2, (height - inner_height) / 2);
+    let mut whole = vec![0; width * height];
+    for (row, pixels) in inner.chunks(inner_width).enumerate() {
+        whole[(top + row) * width + left..][..inner_width].copy_from_slice(pixels);
+    }
+    whole
+}
+
+/// `length` · `numerator` / `denominator`, rounded, at least 1. Sides are at most [`MAX_SIDE_PX`], so nothing overflows.
+fn scaled(length: u32, numerator: u32, denominator: u32) -> u32 {
+    ((length * numerator + denominator / 2) / denominator).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const WAYS: [Fit; 3] = [Fit::Crop, Fit::Letterbox, Fit::Stretch];
+
+    fn flat(width: u32, height: u32, value: u8) -> Frame {
+        Frame::new(width, height, vec![value; (width * height) as usize]).unwrap()
+    }
+
+    fn rows(frame: &Frame) -> Vec<&[u8]> {
+        frame.pixels().chunks(frame.width() as usize).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn every_fit_gives_the_asked_size(
+            from in (1u32..90, 1u32..90), to in (1u32..90, 1u32..90), value in any::<u8>(), way in 0usize..3,
+        ) {
+            let fitted = fit(&flat(from.0, from.1, value), to.0, to.1, WAYS[way]).unwrap();
+            prop_assert_eq!((fitted.width(), fitted.height()), to);
+            let is_expected = |&pixel: &u8| pixel.abs_diff(value) <= 1 || (way == 1 && pixel == 0);
+            prop_assert!(fitted.pixels().iter().all(is_expected));
+        }
+    }
+
+    #[test]
+    fn a_frame_of_the_right_size_stays_as_it_is() {
+        let frame = Frame::new(3, 2, vec![9, 1, 200, 4, 77, 255]).unwrap();
+        for way in WAYS {
+            assert_eq!(fit(&frame, 3, 2, way).unwrap(), frame);
+        }
+    }
+
+    #[test]
+    fn crop_cuts_both_sides_equally() {
+        let row: Vec<u8> = [[0; 4], [200; 4], [200; 4], [0; 4]].concat();
+        let wide = Frame::new(16, 8, row.repeat(8)).unwrap();
+        assert_eq!(fit(&wide, 4, 4, Fit::Crop).unwrap(), flat(4, 4, 200));
+    }
+
+    #[test]
+    fn letterbox_adds_equal_bars() {
+        let fitted = fit(&flat(16, 8, 200), 4, 4, Fit::Letterbox).unwrap();
+        assert_eq!(rows(&fitted), [[0; 4], [200; 4], [200; 4], [0; 4]]);
+    }
+
+    #[test]
+    fn stretch_keeps_the_whole_picture() {
+        let halves = Frame::new(64, 8, [[0; 32], [200; 32]].concat().repeat(8)).unwrap();
+        let fitted = fit(&halves, 8, 8, Fit::Stretch).unwrap();
+        assert!(rows(&fitted).iter().all(|row| row[0] == 0 && row[7] == 200));
+    }
+
+    #[test]
+    fn fine_stripes_average_instead_of_aliasing() {
+        let stripes = Frame::new(64, 64, [0u8, 200].repeat(64 * 32)).unwrap();
+        let fitted = fit(&stripes, 8, 8, Fit::Stretch).unwrap();
+        assert!(
+            fitted.pixels().iter().all(|pixel| pixel.abs_diff(100) < 12),
+            "{fitted:?}"
+        );
+    }
+
+    #[test]
+    fn a_size_out_of_range_is_refused() {
+        assert!(matches!(
+            fit(&flat(2, 2, 0), 0, 4, Fit::Crop),
+            Err(FrameError::Size { .. })
+        ));
+        assert!(matches!(
+            fit(&flat(2, 2, 0), 4, 5000, Fit::Crop),
+            Err(FrameError::Size { .. })
+        ));
+        assert_eq!("crop".parse::<Fit>().unwrap(), Fit::Crop);
+        let error = "zoom".parse::<Fit>().unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "fit is \"zoom\"; it must be crop, letterbox or stretch"
+        );
+    }
+}

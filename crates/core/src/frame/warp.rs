@@ -1,0 +1,198 @@
+//! Moving pixels: sampling a frame at other places, and where a turning camera sees each of its new pixels in the old
+//! picture.
+//!
+//! A grid holds one coordinate [column, row] per pixel, in pixels from the top left corner; the centre of the first pixel
+//! is [0.5, 0.5].
+
+use serde::{Deserialize, Serialize};
+
+use super::FrameError;
+
+/// Depths below this are treated as this deep, so that what is beside or behind the camera lands far outside the frame.
+const MIN_DEPTH: f32 = 1e-3;
+
+/// How a pinhole camera with square pixels projects. It looks ahead of the robot, tilted down.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(try_from = "UncheckedCameraModel")]
+pub struct CameraModel {
+    /// Angle between the left and the right edge of the image, in radians: above 0, below π.
+    pub horizontal_fov_rad: f32,
+    /// How far the camera looks down from the horizontal, in radians: above −π/2, below π/2.
+    pub tilt_down_rad: f32,
+}
+
+/// A camera model as it is read, before its ranges are checked.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct UncheckedCameraModel {
+    horizontal_fov_rad: f32,
+    tilt_down_rad: f32,
+}
+
+impl TryFrom<UncheckedCameraModel> for CameraModel {
+    type Error = FrameError;
+
+    fn try_from(unchecked: UncheckedCameraModel) -> Result<Self, FrameError> {
+        Self::new(unchecked.horizontal_fov_rad, unchecked.tilt_down_rad)
+    }
+}
+
+impl CameraModel {
+    /// A camera of that field of view and tilt, in radians. Errors: `Camera` if one is out of range.
+    pub fn new(horizontal_fov_rad: f32, tilt_down_rad: f32) -> Result<Self, FrameError> {
+        let model = Self {
+            horizontal_fov_rad,
+            tilt_down_rad,
+        };
+        model.validate()?;
+        Ok(model)
+    }
+
+    /// Errors: `Camera` if the field of view or the tilt is out of range.
+    pub fn validate(&self) -> Result<(), FrameError> {
+        use std::f32::consts::{FRAC_PI_2, PI};
+        // NaN fails both comparisons.
+        let fov_is_valid = self.horizontal_fov_rad > 0.0 && self.horizontal_fov_rad < PI;
+        if fov_is_valid && self.tilt_down_rad.abs() < FRAC_PI_2 {
+            return Ok(());
+        }
+        Err(FrameError::Camera {
+            horizontal_fov_rad: self.horizontal_fov_rad,
+            tilt_down_rad: self.tilt_down_rad,
+        })
+    }
+}
+
+/// For each pixel of the view after the camera turned by `yaw_rad` about the vertical (counter-clockwise is positive),
+/// its place in the view before: a grid of width · height coordinates, row by row.
+#[must_use]
+pub fn rotation_grid(camera: CameraModel, width: usize, height: usize, yaw_rad: f32) -> Vec<[f32; 2]> {
+    let pixel_size = 2.0 * (camera.horizontal_fov_rad / 2.0).tan() / width as f32;
+    let (tilt_sin, tilt_cos) = camera.tilt_down_rad.sin_cos();
+    let (yaw_sin, yaw_cos) = yaw_rad.sin_cos();
+    let (middle_column, middle_row) = (width as f32 / 2.0, height as f32 / 2.0);
+    let mut grid = Vec::with_capacity(width * height);
+    for row in 0..height {
+        for column in 0..width {
+            // The pixel's ray after the turn, in the robot's axes then: x ahead, y to the left, z up.
+            let right = (column as f32 + 0.5 - middle_column) * pixel_size;
+            let down = (row as f32 + 0.5 - middle_row) * pixel_size;
+            let ahead = tilt_cos - down * tilt_sin;
+            let left = -right;
+            let up = -tilt_sin - down * tilt_cos;
+            // The same ray in the robot's axes before the turn, seen by the camera as it looked then.
+            let ahead_before = yaw_cos * ahead - yaw_sin * left;
+            let left_before = yaw_sin * ahead + yaw_cos * left;
+            let depth = (tilt_cos * ahead_before - tilt_sin * up).max(MIN_DEPTH);
+            let down_before = -(tilt_sin * ahead_before + tilt_cos * up);
+            grid.push([
+                middle_column - left_before / (depth * pixel_size),
+                middle_row + down_before / (depth * pixel_size),
+            ]);
+        }
+    }
+    grid
+}
+
+/// Which points of a grid lie inside a frame of that size.
+#[must_use]
+pub fn inside(width: usize, height: usize, grid: &[[f32; 2]]) -> Vec<bool> {
+    let (width, height) = (width as f32, height as f32);
+    grid.iter()
+        .map(|&[column, row]| (0.0..=width).contains(&column) && (0.0..=height).contains(&row))
+        .collect()
+}
+
+/// A frame's values (row by row, width · height of them) at the points of a grid, bilinear; outside the frame the nearest
+/// edge counts. Beside them, which points lie inside.
+#[must_use]
+pub fn sample(values: &[f32], width: usize, height: usize, grid: &[[f32; 2]]) -> (Vec<f32>, Vec<bool>) {
+    debug_assert_eq!(values.len(), width * height);
+    let last_column = width.saturating_sub(1);
+    let last_row = height.saturating_sub(1);
+    let sampled = grid
+        .iter()
+        .map(|&[column, row]| {
+            let x = (column - 0.5).clamp(0.0, last_column as f32);
+            let y = (row - 0.5).clamp(0.0, last_row as f32);
+            // The casts cut off.
+            let (left, top) = (x as usize, y as usize);
+            let (right, bottom) = ((left + 1).min(last_column), (top + 1).min(last_row));
+            let (to_right, to_bottom) = (x - left as f32, y - top as f32);
+            let upper = mix(values[top * width + left], values[top * width + right], to_right);
+            let lower = mix(values[bottom * width + left], values[bottom * width + right], to_right);
+            mix(upper, lower, to_bottom)
+        })
+        .collect();
+    (sampled, inside(width, height, grid))
+}
+
+fn mix(from: f32, to: f32, share: f32) -> f32 {
+    from + share * (to - from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAMERA: CameraModel = CameraModel {
+        horizontal_fov_rad: 1.0,
+        tilt_down_rad: 0.2,
+    };
+
+    #[test]
+    fn without_a_turn_every_pixel_stays() {
+        let values: Vec<f32> = (0..48).map(|value| value as f32).collect();
+        let grid = rotation_grid(CAMERA, 8, 6, 0.0);
+        let (sampled, inside) = sample(&values, 8, 6, &grid);
+        for (sampled, value) in sampled.iter().zip(&values) {
+            assert!((sampled - value).abs() < 1e-4, "{sampled} {value}");
+        }
+        assert!(inside.iter().all(|&inside| inside));
+    }
+
+    #[test]
+    fn a_turn_to_the_left_shows_what_was_further_left() {
+        let grid = rotation_grid(CAMERA, 8, 6, 0.3);
+        let (columns, inside) = (grid.iter().map(|point| point[0]), inside(8, 6, &grid));
+        assert!(
+            columns
+                .zip(0..)
+                .all(|(column, index)| column < (index % 8) as f32 + 0.5)
+        );
+        assert!(!inside[0] && inside[7]);
+    }
+
+    #[test]
+    fn beyond_the_edge_the_edge_pixel_counts() {
+        let (sampled, inside) = sample(&[1.0, 2.0, 3.0, 4.0], 2, 2, &[[-9.0, 0.5], [1.0, 1.0], [99.0, 99.0]]);
+        assert_eq!((sampled, inside), (vec![1.0, 2.5, 4.0], vec![false, true, false]));
+    }
+
+    #[test]
+    fn what_was_behind_the_camera_is_outside() {
+        let grid = rotation_grid(CAMERA, 8, 6, std::f32::consts::PI);
+        assert!(inside(8, 6, &grid).iter().all(|&inside| !inside));
+    }
+
+    #[test]
+    fn an_impossible_camera_is_refused_in_one_sentence() {
+        for (fov, tilt) in [
+            (0.0, 0.2),
+            (3.2, 0.2),
+            (f32::NAN, 0.2),
+            (1.0, -1.6),
+            (1.0, f32::INFINITY),
+        ] {
+            assert!(CameraModel::new(fov, tilt).is_err(), "{fov} {tilt}");
+        }
+        let error =
+            serde_json::from_str::<CameraModel>(r#"{"horizontal_fov_rad": 4, "tilt_down_rad": 0.2}"#).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the camera model has a field of view of 4 rad and a tilt of 0.2 rad; the field of view must be above 0 and \
+             below π, the tilt above -π/2 and below π/2"
+        );
+    }
+}

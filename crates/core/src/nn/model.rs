@@ -1,0 +1,240 @@
+//! The one type that the rest of the program predicts with, whatever the architecture.
+
+use candle_core::Tensor;
+
+use super::autoencoder::{DenseModel, Feedback};
+use super::conditioned::ConditioningTensors;
+use super::flow::{FlowModel, FlowPrediction, Layers};
+use super::long_futures;
+use super::spec::in_range;
+use super::{Architecture, ModelSpec, NnError, Parameters};
+
+/// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
+/// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
+#[derive(Clone, Debug)]
+pub struct Model {
+    spec: ModelSpec,
+    network: Network,
+}
+
+#[derive(Clone, Debug)]
+enum Network {
+    Dense(Box<DenseModel>),
+    Flow(Box<FlowModel>),
+}
+
+/// The flow network's tensors by name, some of them without gradients.
+struct NamedTensors<'a> {
+    spec: &'a ModelSpec,
+    parameters: &'a Parameters,
+    frozen: &'a [&'a str],
+}
+
+impl Layers for NamedTensors<'_> {
+    fn tensor(&self, name: &str) -> Result<Tensor, NnError> {
+        let expected = self.spec.tensor_shapes().remove(name).unwrap_or_default();
+        match self.parameters.get(name) {
+            None => Err(NnError::TensorMissing {
+                name: name.to_owned(),
+                expected,
+            }),
+            Some(var) if var.dims() != expected => Err(NnError::TensorShape {
+                name: name.to_owned(),
+                found: var.dims().to_vec(),
+                expected,
+            }),
+            Some(var) if self.frozen.iter().any(|prefix| name.starts_with(prefix)) => Ok(var.as_detached_tensor()),
+            Some(var) => Ok(var.as_tensor().clone()),
+        }
+    }
+}
+
+impl Model {
+    /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor.
+    /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
+    pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
+        Self::with_frozen(spec, parameters, &[])
+    }
+
+    /// As [`Model::new`], without any gradients: for prediction.
+    pub fn detached(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
+        Self::with_frozen(spec, parameters, &[""])
+    }
+
+    /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
+    pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+        let network = match spec.architecture {
+            Architecture::Dense => Network::Dense(Box::new(DenseModel::with_frozen(spec.clone(), parameters, frozen)?)),
+            Architecture::Flow => {
+                spec.validate()?;
+                let tensors = NamedTensors {
+                    spec: &spec,
+                    parameters,
+                    frozen,
+                };
+                Network::Flow(Box::new(FlowModel::new(&spec, &tensors)?))
+            }
+        };
+        Ok(Self { spec, network })
+    }
+
+    /// The same network with a description that may not fit it, to test failures.
+    #[cfg(test)]
+    pub fn with_spec(self, spec: ModelSpec) -> Self {
+        Self { spec, ..self }
+    }
+
+    /// The model's dimensions and meaning.
+    #[must_use]
+    pub fn spec(&self) -> &ModelSpec {
+        &self.spec
+    }
+
+    /// Codes `[N, code_len]` of frames `[N, P]` in the model's space. Errors: `Shape`.
+    pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
+        self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
+        match &self.network {
+            Network::Dense(dense) => dense.encode_frames(frames),
+            Network::Flow(_) => Ok(frames.clone()),
+        }
+    }
+
+    /// Frames `[N, P]` in the model's space, not clamped, of codes `[N, code_len]`. Errors: `Shape`.
+    pub fn decode_frames(&self, codes: &Tensor) -> Result<Tensor, NnError> {
+        self.check("features", codes, &[None, Some(self.spec.code_len())])?;
+        match &self.network {
+            Network::Dense(dense) => dense.decode_frames(codes),
+            Network::Flow(_) => Ok(codes.clone()),
+        }
+    }
+
+    /// Codes `[B, horizon, code_len]` of the frames that follow those with `codes` [B, context, `code_len`]. The feedback is
+    /// the dense network's; the flow network reads no prediction of its own. Errors: `Shape`, `Missing`.
+    pub fn predict(
+        &self,
+        codes: &Tensor,
+        conditioning: &ConditioningTensors,
+        feedback: Feedback,
+    ) -> Result<Tensor, NnError> {
+        let batch = self.check_windows(codes)?;
+        if let Feedback::TeacherForcing(truth) = feedback {
+            let shape = [Some(batch), Some(self.spec.horizon), Some(self.spec.code_len())];
+            self.check("true features", truth, &shape)?;
+        }
+        match &self.network {
+            Network::Dense(dense) => dense.predict(codes, conditioning, feedback),
+            Network::Flow(flow) => Ok(flow.predict(&self.spec, codes, &each_once(batch), conditioning)?.frames),
+        }
+    }
+
+    /// Codes `[N, horizon, code_len]` of N futures of B windows with `codes` [B, context, `code_len`]: future n follows the
+    /// window `windows[n]` under the conditioning's row n. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    pub fn predict_futures(
+        &self,
+        codes: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+    ) -> Result<Tensor, NnError> {
+        self.check_windows(codes)?;
+        match &self.network {
+            Network::Dense(dense) => dense.predict_futures(codes, windows, conditioning),
+            Network::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
+        }
+    }
+
+    /// As [`Model::predict_futures`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
+    /// horizon the frames are those of [`Model::predict_futures`] with the last action held. Beyond it, which no training saw,
+    /// the dense network goes on step by step; the flow network starts again from the frames that it predicted.
+    /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    pub fn predict_steps(
+        &self,
+        codes: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<Tensor, NnError> {
+        if steps == self.spec.horizon {
+            return self.predict_futures(codes, windows, conditioning);
+        }
+        self.check_windows(codes)?;
+        match &self.network {
+            Network::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
+            Network::Flow(flow) => long_futures::predict(flow, &self.spec, (codes, windows, conditioning), steps),
+        }
+    }
+
+    /// All that the flow network gives for frames `[B, context, P]`, with the frames of the first `steps` (1 to the horizon) only;
+    /// `None` of another architecture. Errors: `Shape`, `Missing`, `OutOfRange`.
+    pub fn predict_flow(
+        &self,
+        frames: &Tensor,
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<Option<FlowPrediction>, NnError> {
+        let batch = self.check_windows(frames)?;
+        in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
+        match &self.network {
+            Network::Dense(_) => Ok(None),
+            Network::Flow(flow) => flow
+                .predict_first(&self.spec, (frames, &each_once(batch)), conditioning, steps)
+                .map(Some),
+        }
+    }
+
+    /// The codes [B, context, `code_len`] again, from what the dense network's encoder kept of them; `None` for the flow
+    /// network, which does not reconstruct. Errors: `Shape`.
+    pub fn reconstruct(&self, codes: &Tensor) -> Result<Option<Tensor>, NnError> {
+        self.check_windows(codes)?;
+        match &self.network {
+            Network::Dense(dense) => dense.reconstruct(codes).map(Some),
+            Network::Flow(_) => Ok(None),
+        }
+    }
+
+    /// Frames `[B, horizon, P]` that follow `frames` [B, context, P], both in the model's space. Errors: `Shape`, `Missing`.
+    pub fn predict_frames(&self, frames: &Tensor, conditioning: &ConditioningTensors) -> Result<Tensor, NnError> {
+        let (context, pixels, code) = (self.spec.context, self.spec.pixels(), self.spec.code_len());
+        let batch = self.check("frames", frames, &[None, Some(context), Some(pixels)])?;
+        let codes = self.encode_frames(&frames.reshape((batch * context, pixels))?)?;
+        let predicted = self.predict(
+            &codes.reshape((batch, context, code))?,
+            conditioning,
+            Feedback::Prediction,
+        )?;
+        let frames = self.decode_frames(&predicted.flatten(0, 1)?)?;
+        Ok(frames.reshape((batch, self.spec.horizon, pixels))?)
+    }
+
+    fn check_windows(&self, codes: &Tensor) -> Result<usize, NnError> {
+        let shape = [None, Some(self.spec.context), Some(self.spec.code_len())];
+        self.check("features", codes, &shape)
+    }
+
+    /// Checks a shape, `None` for any size but 0; gives the first side.
+    fn check(&self, what: &'static str, tensor: &Tensor, shape: &[Option<usize>]) -> Result<usize, NnError> {
+        let fits = |(&side, &wanted): (&usize, &Option<usize>)| wanted.map_or(side > 0, |wanted| side == wanted);
+        if tensor.rank() == shape.len() && tensor.dims().iter().zip(shape).all(fits) {
+            return Ok(tensor.dims()[0]);
+        }
+        let sides: Vec<String> = shape
+            .iter()
+            .map(|side| side.map_or("any".to_owned(), |side| side.to_string()))
+            .collect();
+        let spec = &self.spec;
+        let expected = format!(
+            "[{}] ({}×{} px frames, {} in, {} out, {} features)",
+            sides.join(", "),
+            spec.frame_width_px,
+            spec.frame_height_px,
+            spec.context,
+            spec.horizon,
+            spec.code_len()
+        );
+        Err(NnError::shape(what, tensor, expected))
+    }
+}
+
+/// One future for each window.
+fn each_once(windows: usize) -> Vec<u32> {
+    (0..windows as u32).collect()
+}

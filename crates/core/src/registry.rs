@@ -1,0 +1,306 @@
+//! Trained models on disk. Each model has a directory with `model.safetensors` (weights, f16) and `manifest.json`
+//! (description and origin). In a directory of models, the name of a model's directory is its name, whatever the manifest
+//! says. [`manifest`] describes a model, [`loader`] verifies and builds it. This module lists, finds and publishes models.
+
+pub mod calibration;
+mod embedded;
+pub mod loader;
+pub mod manifest;
+
+use std::path::{Path, PathBuf};
+
+pub use self::calibration::Calibration;
+pub use self::embedded::{EmbeddedModel, embed};
+pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
+pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
+use crate::error_text::existing;
+use crate::files::{sha256_hex, write_atomically};
+use crate::nn::Parameters;
+
+/// Name of the weights file in a model's directory.
+pub const WEIGHTS_FILE: &str = "model.safetensors";
+/// Name of the manifest file in a model's directory.
+pub const MANIFEST_FILE: &str = "manifest.json";
+
+/// Why a model could not be listed, loaded or published.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RegistryError {
+    /// No model has this name.
+    #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]
+    Unknown {
+        /// The name asked for.
+        name: String,
+        /// The directory that was searched.
+        dir: PathBuf,
+        /// The names of the existing models.
+        known: Vec<String>,
+    },
+    /// The name is not safe as a directory name or in a URL.
+    #[error("{0:?} is not a valid model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
+    Name(String),
+    /// The directory contains no model.
+    #[error("{} holds no model ({MANIFEST_FILE} is missing); give a directory that `foreframe train` wrote", .0.display())]
+    NotAModel(PathBuf),
+    /// A file could not be read or written.
+    #[error("could not {action} {}: {source}", path.display())]
+    Io {
+        /// `read`, `write` or `list`.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The manifest cannot be parsed.
+    #[error("{} is not a valid model manifest: {source}", path.display())]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// The parser's error.
+        source: serde_json::Error,
+    },
+    /// A value in the manifest is out of range.
+    #[error("{} is not a valid model manifest: {reason}", path.display())]
+    ManifestValue {
+        /// The file.
+        path: PathBuf,
+        /// Which value, and what it must be.
+        reason: String,
+    },
+    /// The weights file has another hash than the manifest states.
+    #[error("{} has SHA-256 {found}, but its manifest states {expected}; download the model or train it again", path.display())]
+    Hash {
+        /// The weights file.
+        path: PathBuf,
+        /// Hash of the file.
+        found: String,
+        /// Hash in the manifest.
+        expected: String,
+    },
+    /// The weights do not match the model specification in the manifest.
+    #[error(
+        "the weights of {} do not match their manifest: {source}; use the version of Foreframe that trained the model, or train it again",
+        path.display()
+    )]
+    Weights {
+        /// The weights file.
+        path: PathBuf,
+        /// What does not match.
+        source: crate::nn::NnError,
+    },
+    /// The weights file is damaged.
+    #[error("{} is not a valid safetensors file: {source}", path.display())]
+    Safetensors {
+        /// The weights file.
+        path: PathBuf,
+        /// The reader's error.
+        source: candle_core::Error,
+    },
+}
+
+/// Whether the name is safe as a directory name and in a URL: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
+#[must_use]
+pub fn is_valid_name(name: &str) -> bool {
+    let bytes = name.as_bytes();
+    (1..=64).contains(&bytes.len())
+        && bytes[0] != b'-'
+        && bytes.iter().all(|b| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'-'))
+}
+
+/// Names and directories of the models in a directory, sorted by name. A missing directory contains none; if it is the
+/// default one, the embedded model stands in for it. Errors: `Io` if the directory cannot be listed.
+pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
+    let named = directories(models_dir)?
+        .into_iter()
+        .map(|path| (directory_name(&path), path));
+    let mut models: Vec<_> = named
+        .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
+        .collect();
+    models.extend(embedded::in_place_of(models_dir));
+    models.sort();
+    Ok(models)
+}
+
+/// The directories that hold a model but have no valid name, sorted: [`list`] leaves them out. Errors: `Io`.
+pub fn misnamed(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    let mut paths = directories(models_dir)?;
+    paths.retain(|path| !is_valid_name(&directory_name(path)) && path.join(MANIFEST_FILE).is_file());
+    paths.sort();
+    Ok(paths)
+}
+
+/// Everything in a directory; an absent one holds nothing. Errors: `Io`.
+fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+    if !models_dir.exists() {
+        return Ok(Vec::new());
+    }
+    let entries = std::fs::read_dir(models_dir).and_then(|entries| {
+        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+        paths.collect::<Result<Vec<_>, _>>()
+    });
+    entries.map_err(|source| RegistryError::Io {
+        action: "list",
+        path: models_dir.to_owned(),
+        source,
+    })
+}
+
+fn directory_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The directory of the model with this name. Errors: `Name`, `Unknown` with the existing names.
+pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
+    if !is_valid_name(name) {
+        return Err(RegistryError::Name(name.to_owned()));
+    }
+    let path = models_dir.join(name);
+    if path.join(MANIFEST_FILE).is_file() {
+        return Ok(path);
+    }
+    if let Some((_, path)) = embedded::in_place_of(models_dir).filter(|(embedded, _)| embedded == name) {
+        return Ok(path);
+    }
+    let known = list(models_dir)?.into_iter().map(|(name, _)| name).collect();
+    Err(RegistryError::Unknown {
+        name: name.to_owned(),
+        dir: models_dir.to_owned(),
+        known,
+    })
+}
+
+/// The directory of a model that the user gave as a path; none if the text can only be a name. Errors: `NotAModel` for a
+/// path without a model.
+pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
+    let path = Path::new(model);
+    if path.join(MANIFEST_FILE).is_file() {
+        return Ok(Some(path.to_owned()));
+    }
+    if !is_valid_name(model) && (model.contains('/') || path.exists()) {
+        return Err(RegistryError::NotAModel(path.to_owned()));
+    }
+    Ok(None)
+}
+
+/// Writes the weights (as f16) and then the manifest into `model_dir`. Fills in the weights' hash and returns the manifest.
+/// Errors: `Weights`, `Manifest`, `Io`.
+pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -> Result<Manifest, RegistryError> {
+    let weights_path = model_dir.join(WEIGHTS_FILE);
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| RegistryError::Io {
+            action: "write",
+            path,
+            source,
+        }
+    };
+    std::fs::create_dir_all(model_dir).map_err(failed(model_dir))?;
+    let weights = loader::serialize_f16(parameters).map_err(|source| RegistryError::Weights {
+        path: weights_path.clone(),
+        source,
+    })?;
+    let manifest = Manifest {
+        weights_sha256: sha256_hex(&weights),
+        ..manifest.clone()
+    };
+    write_atomically(&weights_path, &weights).map_err(failed(&weights_path))?;
+    write_manifest(model_dir, &manifest)?;
+    Ok(manifest)
+}
+
+/// Writes metrics into a model's manifest, for example the results of an evaluation. Other metrics stay; a metric given as
+/// null is removed (JSON merge patch, RFC 7396). Errors: `Manifest`, `Io`.
+pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
+    let mut manifest = manifest::read(model_dir)?;
+    merge(&mut manifest.metrics, metrics);
+    write_manifest(model_dir, &manifest)
+}
+
+/// Writes a calibration into a model's manifest, in place of an earlier one. Errors: `Manifest`, `Io`.
+pub fn record_calibration(model_dir: &Path, calibration: Calibration) -> Result<(), RegistryError> {
+    let mut manifest = manifest::read(model_dir)?;
+    manifest.calibration = Some(calibration);
+    write_manifest(model_dir, &manifest)
+}
+
+fn merge(target: &mut serde_json::Value, patch: serde_json::Value) {
+    let serde_json::Value::Object(patch) = patch else {
+        *target = patch;
+        return;
+    };
+    if !target.is_object() {
+        *target = serde_json::json!({});
+    }
+    let Some(target) = target.as_object_mut() else { return };
+    for (key, value) in patch {
+        if value.is_null() {
+            target.remove(&key);
+        } else {
+            merge(target.entry(key).or_insert(serde_json::Value::Null), value);
+        }
+    }
+}
+
+/// Writes the manifest into a model's directory. Errors: `Manifest`, `Io`.
+pub fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), RegistryError> {
+    let path = model_dir.join(MANIFEST_FILE);
+    let mut text = serde_json::to_string_pretty(manifest).map_err(|source| RegistryError::Manifest {
+        path: path.clone(),
+        source,
+    })?;
+    text.push('\n');
+    write_atomically(&path, text.as_bytes()).map_err(|source| RegistryError::Io {
+        action: "write",
+        path,
+        source,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn recording_test_scores_keeps_the_validation_score() {
+        let mut metrics = serde_json::json!({"validation": {"mse": 1, "step": 7}, "test": {"mse": 2}, "old": 3});
+        merge(
+            &mut metrics,
+            serde_json::json!({"test": {"mse": 4}, "validation": {"mse": 5}, "old": null}),
+        );
+        let expected = serde_json::json!({"validation": {"mse": 5, "step": 7}, "test": {"mse": 4}});
+        assert_eq!(metrics, expected);
+    }
+
+    #[test]
+    fn a_name_that_leaves_the_directory_is_refused() {
+        for name in ["../paper", "", "-x", "Paper", "a/b", "a b", "ä"] {
+            assert!(!is_valid_name(name), "{name:?} was accepted");
+        }
+        assert!(is_valid_name("moving-2"));
+    }
+
+    #[test]
+    fn a_directory_with_an_invalid_name_is_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["my_model", "paper"] {
+            std::fs::create_dir(dir.path().join(name)).unwrap();
+            std::fs::write(dir.path().join(name).join(MANIFEST_FILE), "{}").unwrap();
+        }
+        std::fs::create_dir(dir.path().join("Pictures")).unwrap();
+        assert_eq!(misnamed(dir.path()).unwrap(), [dir.path().join("my_model")]);
+        assert_eq!(list(dir.path()).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn the_error_for_an_unknown_model_lists_the_existing_ones() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("paper")).unwrap();
+        std::fs::write(dir.path().join("paper").join(MANIFEST_FILE), "{}").unwrap();
+        let error = find(dir.path(), "papper").unwrap_err().to_string();
+        assert!(
+            error.contains("no model \"papper\"") && error.ends_with("there are: paper"),
+            "{error}"
+        );
+    }
+}

@@ -1,0 +1,359 @@
+//! How far a model's predictions can be trusted: the error to expect at each step, how unlike the training data a context
+//! is, and the ranges of actions and states in training. All of it is stored in the manifest and is computed from numbers
+//! that are known when a prediction is made. `evaluation::calibrate` fits it on the validation split.
+
+mod context;
+
+use serde::{Deserialize, Serialize};
+
+pub use self::context::{APPEARANCE, ContextStatistics};
+use crate::frame::Frame;
+use crate::frame::preprocess::scale;
+use crate::nn::ModelSpec;
+
+/// Numbers from which the error of a predicted frame is estimated, see [`PredictedFuture::error_inputs`].
+pub const ERROR_INPUTS: usize = 8;
+/// Added to mean squared differences before their logarithm.
+const FLOOR: f64 = 1e-6;
+
+/// What a model's validation says about its predictions.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// SHA-256 of the content of the data set.
+    pub dataset_content_hash: String,
+    /// Validation windows that it was fitted on.
+    pub windows: usize,
+    /// The error of each predicted step.
+    pub steps: Vec<StepErrors>,
+    /// How unlike the training data a context is.
+    pub novelty: NoveltyScale,
+    /// Smallest and largest value of each action channel in training; empty if the model takes no actions.
+    pub actions: Vec<ValueRange>,
+    /// The same of each state channel.
+    pub states: Vec<ValueRange>,
+}
+
+impl Calibration {
+    /// Whether it fits the model: lengths, and factors, scales and ranges that make sense. Errors: which value does not, and
+    /// what it must be.
+    pub fn check(&self, spec: &ModelSpec) -> Result<(), String> {
+        let novelty = &self.novelty;
+        let square =
+            novelty.whitening.iter().all(|row| row.len() <= APPEARANCE) && novelty.whitening.len() == APPEARANCE;
+        let lengths = [
+            ("steps", self.steps.len(), spec.horizon),
+            ("novelty.mean", novelty.mean.len(), APPEARANCE),
+            ("actions", self.actions.len(), spec.action_inputs().unwrap_or(0)),
+            ("states", self.states.len(), spec.state_inputs().unwrap_or(0)),
+        ];
+        for (what, found, wanted) in lengths {
+            if found != wanted {
+                return Err(format!("calibration.{what} has {found} entries; it must have {wanted}"));
+            }
+        }
+        let factors = |step: &StepErrors| {
+            let StepErrors {
+                mean_factor,
+                low_factor,
+                high_factor,
+                ..
+            } = *step;
+            step.weights.len() == ERROR_INPUTS && mean_factor > 0.0 && 0.0 <= low_factor && low_factor <= high_factor
+        };
+        let mut ranges = self.actions.iter().chain(&self.states);
+        let checks = [
+            (
+                "steps",
+                self.steps.iter().all(factors),
+                "each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
+            ),
+            ("novelty.whitening", square, "it must have a row for each statistic"),
+            (
+                "novelty",
+                novelty.appearance_scale > 0.0 && novelty.still_scale > 0.0,
+                "appearance_scale and still_scale must be above 0",
+            ),
+            (
+                "novelty.quantiles",
+                !novelty.quantiles.is_empty() && novelty.quantiles.is_sorted(),
+                "they must be there, in rising order",
+            ),
+            (
+                "actions and states",
+                ranges.all(|range| range.min <= range.max),
+                "min must be at most max",
+            ),
+        ];
+        let failed = checks.iter().find(|(_, holds, _)| !holds);
+        failed.map_or(Ok(()), |(what, _, right)| Err(format!("calibration.{what}: {right}")))
+    }
+}
+
+/// The smallest and the largest value in training.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValueRange {
+    /// Smallest.
+    pub min: f32,
+    /// Largest.
+    pub max: f32,
+}
+
+/// The error of one step: median = exp(intercept + Σ weights · inputs), times a factor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StepErrors {
+    /// Of the logarithm.
+    pub intercept: f32,
+    /// One for each of the [`ERROR_INPUTS`].
+    pub weights: Vec<f32>,
+    /// The mean of the error over the median.
+    pub mean_factor: f32,
+    /// 5 % of the errors over the median are below it.
+    pub low_factor: f32,
+    /// 5 % of the errors over the median are above it.
+    pub high_factor: f32,
+}
+
+impl StepErrors {
+    /// The error to expect for these inputs. An MSE is at most 1.
+    #[must_use]
+    pub fn expected(&self, inputs: &[f64; ERROR_INPUTS]) -> ExpectedError {
+        let weighted: f64 = self.weights.iter().zip(inputs).map(|(w, x)| f64::from(*w) * x).sum();
+        let median = (f64::from(self.intercept) + weighted).exp().min(1.0);
+        let times = |factor: f32| (median * f64::from(factor)).min(1.0) as f32;
+        ExpectedError {
+            mse: times(self.mean_factor),
+            low: times(self.low_factor),
+            high: times(self.high_factor),
+        }
+    }
+}
+
+/// The mean squared error to expect of a predicted frame, intensities 0…1, and its 90 % band.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ExpectedError {
+    /// The expected error.
+    pub mse: f32,
+    /// The error is below it in 5 % of the cases.
+    pub low: f32,
+    /// The error is above it in 5 % of the cases.
+    pub high: f32,
+}
+
+/// Measures how unlike the training data a context is: by the look of its last frame, and by how much of the picture stands
+/// still. The distance is the larger of both, each over its 95 % quantile in training.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoveltyScale {
+    /// Mean of the [`APPEARANCE`] statistics in training.
+    pub mean: Vec<f32>,
+    /// Rows of the lower triangular matrix that makes them uncorrelated, with variance 1.
+    pub whitening: Vec<Vec<f32>>,
+    /// 95 % quantile of the length of the whitened statistics.
+    pub appearance_scale: f32,
+    /// Median of the still share, as a log-odds ratio.
+    pub still_median: f32,
+    /// 95 % quantile of the distance from that median.
+    pub still_scale: f32,
+    /// Evenly spaced quantiles, 0 % to 100 %, of the distance on the validation split.
+    pub quantiles: Vec<f32>,
+}
+
+impl NoveltyScale {
+    /// Length of the whitened appearance over its scale.
+    #[must_use]
+    pub fn appearance_distance(&self, context: &ContextStatistics) -> f64 {
+        let centred: Vec<f64> = context
+            .appearance
+            .iter()
+            .zip(&self.mean)
+            .map(|(x, m)| x - f64::from(*m))
+            .collect();
+        let squared: f64 = self
+            .whitening
+            .iter()
+            .map(|row| {
+                row.iter()
+                    .zip(&centred)
+                    .map(|(w, x)| f64::from(*w) * x)
+                    .sum::<f64>()
+                    .powi(2)
+            })
+            .sum();
+        squared.sqrt() / f64::from(self.appearance_scale)
+    }
+
+    /// How far a context is from the training data; 5 % of the training contexts have about 1 or more.
+    #[must_use]
+    pub fn distance(&self, context: &ContextStatistics) -> f64 {
+        let still = (context.still - f64::from(self.still_median)).abs() / f64::from(self.still_scale);
+        self.appearance_distance(context).max(still)
+    }
+
+    /// The share of the validation contexts that are nearer to the training data, 0…1. Frames unlike those of the training
+    /// have nearly 1.
+    #[must_use]
+    pub fn novelty(&self, context: &ContextStatistics) -> f32 {
+        let distance = self.distance(context) as f32;
+        let above = self.quantiles.partition_point(|&quantile| quantile < distance);
+        let last = self.quantiles.len().saturating_sub(1).max(1);
+        match (
+            above.checked_sub(1).and_then(|below| self.quantiles.get(below)),
+            self.quantiles.get(above),
+        ) {
+            (None, _) => 0.0,
+            (_, None) => 1.0,
+            (Some(low), Some(high)) => {
+                let part = (distance - low) / (high - low).max(f32::MIN_POSITIVE);
+                ((above - 1) as f32 + part.clamp(0.0, 1.0)) / last as f32
+            }
+        }
+    }
+}
+
+/// A predicted future and what it follows, for the estimate of its errors.
+#[derive(Clone, Copy, Debug)]
+pub struct PredictedFuture<'a> {
+    /// The model's.
+    pub spec: &'a ModelSpec,
+    /// The last two frames seen.
+    pub context: &'a ContextStatistics,
+    /// Codes of the last frame seen and of the one before it.
+    pub seen: [&'a [f32]; 2],
+    /// Codes of the predicted frames, one after another.
+    pub codes: &'a [f32],
+    /// The predicted frames.
+    pub frames: &'a [Frame],
+    /// The actions, step by step, in their own units; empty if the model takes none.
+    pub actions: &'a [f32],
+}
+
+impl PredictedFuture<'_> {
+    /// What is known of each predicted frame before its error is known: logarithms of the mean squared difference of its code
+    /// to the last frame's and to the frame's before it, of that between the last two frames seen, and of its edges; edges and
+    /// still share of the context; its distance from the training data; the size of the actions up to it.
+    #[must_use]
+    pub fn error_inputs(&self, novelty: &NoveltyScale) -> Vec<[f64; ERROR_INPUTS]> {
+        let length = self.spec.code_len();
+        let [last, before] = self.seen;
+        let seen_change = log_difference(last, before);
+        let distance = (novelty.appearance_distance(self.context) + FLOOR).ln();
+        let mut previous = last;
+        let mut inputs = Vec::with_capacity(self.frames.len());
+        for (step, (code, frame)) in self.codes.chunks_exact(length).zip(self.frames).enumerate() {
+            inputs.push([
+                log_difference(code, last),
+                log_difference(code, previous),
+                seen_change,
+                context::log_edges(&scale(frame.pixels()), frame.width() as usize),
+                self.context.edges,
+                self.context.still,
+                distance,
+                self.action_size(step),
+            ]);
+            previous = code;
+        }
+        inputs
+    }
+
+    /// The errors to expect of the steps that the calibration covers.
+    #[must_use]
+    pub fn expected_errors(&self, calibration: &Calibration) -> Vec<ExpectedError> {
+        let inputs = self.error_inputs(&calibration.novelty);
+        calibration
+            .steps
+            .iter()
+            .zip(&inputs)
+            .map(|(step, inputs)| step.expected(inputs))
+            .collect()
+    }
+
+    /// Root mean square of the scaled actions up to a step; 0 without actions.
+    fn action_size(&self, step: usize) -> f64 {
+        let scales = &self.spec.actions;
+        let taken = (step + 1) * scales.len();
+        let scaled = self.actions.iter().zip(scales.iter().cycle()).take(taken);
+        let squares: Vec<f64> = scaled
+            .map(|(value, scale)| f64::from(scale.scaled(*value)).powi(2))
+            .collect();
+        (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+    }
+}
+
+/// ln(mean squared difference + [`FLOOR`]).
+fn log_difference(a: &[f32], b: &[f32]) -> f64 {
+    let sum: f32 = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum();
+    (f64::from(sum) / a.len().max(1) as f64 + FLOOR).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scale_of(quantiles: &[f32]) -> NoveltyScale {
+        NoveltyScale {
+            mean: vec![0.0; APPEARANCE],
+            whitening: vec![vec![1.0]],
+            appearance_scale: 1.0,
+            still_median: 0.0,
+            still_scale: 1e9,
+            quantiles: quantiles.to_vec(),
+        }
+    }
+
+    fn brightness(mean: f32) -> ContextStatistics {
+        ContextStatistics::of(&[mean; 64], &[mean; 64], 8)
+    }
+
+    #[test]
+    fn a_calibration_that_cannot_be_right_is_refused() {
+        type Change = fn(&mut Calibration);
+        let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/moving");
+        let manifest = crate::registry::manifest::read(&directory).unwrap();
+        let right = manifest.calibration.clone().unwrap();
+        assert_eq!(right.check(&manifest.spec), Ok(()));
+        let changes: [(Change, &str); 6] = [
+            (|c| c.steps.clear(), "steps"),
+            (|c| c.steps[0].mean_factor = -5.0, "steps"),
+            (|c| c.steps[0].weights.clear(), "steps"),
+            (|c| c.novelty.quantiles.clear(), "novelty.quantiles"),
+            (|c| c.novelty.appearance_scale = 0.0, "novelty"),
+            (|c| c.actions[0].min = f32::MAX, "actions"),
+        ];
+        for (change, field) in changes {
+            let mut wrong = right.clone();
+            change(&mut wrong);
+            let reason = wrong.check(&manifest.spec).unwrap_err();
+            assert!(reason.starts_with(&format!("calibration.{field}")), "{reason}");
+        }
+    }
+
+    #[test]
+    fn novelty_is_the_share_of_nearer_contexts() {
+        let scale = scale_of(&[0.1, 0.2, 0.4]);
+        for (mean, novelty) in [(0.05, 0.0), (0.15, 0.25), (0.2, 0.5), (0.3, 0.75), (0.5, 1.0)] {
+            assert!((scale.novelty(&brightness(mean)) - novelty).abs() < 1e-5, "{mean}");
+        }
+        assert_eq!(scale_of(&[]).novelty(&brightness(0.5)), 0.0);
+    }
+
+    #[test]
+    fn expected_errors_grow_with_their_inputs_and_stay_below_one() {
+        let step = StepErrors {
+            intercept: -2.0,
+            weights: vec![1.0],
+            mean_factor: 1.2,
+            low_factor: 0.5,
+            high_factor: 2.0,
+        };
+        let mut inputs = [0.0; ERROR_INPUTS];
+        let near = step.expected(&inputs);
+        assert!(near.low < near.mse && near.mse < near.high);
+        inputs[0] = 1.0;
+        assert!(step.expected(&inputs).mse > near.mse);
+        inputs[0] = 1000.0;
+        assert_eq!(step.expected(&inputs).high, 1.0);
+    }
+}

@@ -1,0 +1,52 @@
+//! The model inside the program: it stands in for the default models directory where that does not exist, so that a copied
+//! program predicts and serves without any other file. A robot's own program brings its own models and has none.
+
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+/// The default models directory, which the embedded model stands in for.
+const STANDS_IN_FOR: &str = "models";
+
+static EMBEDDED: OnceLock<EmbeddedModel> = OnceLock::new();
+
+/// The files of a model that a program carries.
+#[derive(Debug)]
+pub struct EmbeddedModel {
+    /// The model's name.
+    pub name: &'static str,
+    /// The bytes of its manifest.
+    pub manifest: &'static [u8],
+    /// The bytes of its weights.
+    pub weights: &'static [u8],
+}
+
+/// Lets this model stand in for the directory `models` from now on, where that does not exist. The first call counts.
+pub fn embed(model: EmbeddedModel) {
+    let _ = EMBEDDED.set(model);
+}
+
+/// Name and directory of the embedded model, if it stands in for this directory of models.
+pub(super) fn in_place_of(models_dir: &Path) -> Option<(String, PathBuf)> {
+    standing_in_for(models_dir).map(|model| (model.name.to_owned(), models_dir.join(model.name)))
+}
+
+/// The manifest of the model in this directory, if that is the embedded model.
+pub(super) fn manifest(model_dir: &Path) -> Option<&'static [u8]> {
+    model_at(model_dir).map(|model| model.manifest)
+}
+
+/// The weights of the model in this directory, if that is the embedded model.
+pub(super) fn weights(model_dir: &Path) -> Option<&'static [u8]> {
+    model_at(model_dir).map(|model| model.weights)
+}
+
+fn standing_in_for(models_dir: &Path) -> Option<&'static EmbeddedModel> {
+    EMBEDDED
+        .get()
+        .filter(|_| models_dir == Path::new(STANDS_IN_FOR) && !models_dir.exists())
+}
+
+fn model_at(model_dir: &Path) -> Option<&'static EmbeddedModel> {
+    let models_dir = model_dir.parent()?;
+    standing_in_for(models_dir).filter(|model| model_dir == models_dir.join(model.name))
+}

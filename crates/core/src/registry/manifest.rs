@@ -1,0 +1,116 @@
+//! The manifest: the description of a trained model.
+
+use std::path::Path;
+use std::sync::OnceLock;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Calibration, MANIFEST_FILE, RegistryError, embedded};
+use crate::nn::ModelSpec;
+use crate::types::Seed;
+
+/// The largest manifest that is accepted, in bytes.
+const MAX_MANIFEST_BYTES: u64 = 1 << 20;
+
+static GIT_COMMIT: OnceLock<&'static str> = OnceLock::new();
+
+/// A model's description: its inputs and outputs, its origin and its scores.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// The model's name.
+    pub name: String,
+    /// The version of this model name, counted from 1.
+    pub version: u32,
+    /// Dimensions, channels and preprocessing.
+    pub spec: ModelSpec,
+    /// SHA-256 of the weights file in hexadecimal; filled in when the model is published.
+    pub weights_sha256: String,
+    /// The data set of the training.
+    pub dataset: DatasetStamp,
+    /// The seed of the training.
+    pub seed: Seed,
+    /// The command line of the training.
+    pub command: String,
+    /// The complete training configuration.
+    pub training: serde_json::Value,
+    /// Scores by name: of the validation split after training, of the test splits after an evaluation.
+    pub metrics: serde_json::Value,
+    /// What the validation split says about the errors of its predictions; absent if the model was never calibrated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<Calibration>,
+    /// Number of trained parameters.
+    pub parameters: u64,
+    /// Multiply–add operations per predicted frame. The cost of encoding the context is divided by the horizon.
+    pub multiply_adds_per_frame: u64,
+    /// The program that trained it.
+    pub program: ProgramStamp,
+}
+
+/// The data set on which a model was trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetStamp {
+    /// Its name.
+    pub name: String,
+    /// SHA-256 of its content.
+    pub content_hash: String,
+    /// The simulated scenario; none for recordings.
+    pub scenario: Option<String>,
+    /// Number of training windows.
+    pub windows: usize,
+    /// The seed of the split into training, validation and test parts.
+    pub split_seed: Seed,
+}
+
+/// Version of the program that wrote a file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProgramStamp {
+    /// Its version.
+    pub version: String,
+    /// The Git commit from which it was built, if known.
+    pub git_commit: Option<String>,
+}
+
+impl ProgramStamp {
+    /// The version of this program.
+    #[must_use]
+    pub fn current() -> Self {
+        Self {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            git_commit: GIT_COMMIT.get().map(|&commit| commit.to_owned()),
+        }
+    }
+}
+
+/// Sets the commit that [`ProgramStamp::current`] tells from now on. The first call counts.
+pub fn set_git_commit(commit: &'static str) {
+    let _ = GIT_COMMIT.set(commit);
+}
+
+/// Reads the manifest in a model's directory. Errors: `Io`, `Manifest`.
+pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
+    let path = model_dir.join(MANIFEST_FILE);
+    if let Some(text) = embedded::manifest(model_dir) {
+        return serde_json::from_slice(text).map_err(|source| RegistryError::Manifest { path, source });
+    }
+    let failed = |source| RegistryError::Io {
+        action: "read",
+        path: path.clone(),
+        source,
+    };
+    let size = std::fs::metadata(&path).map_err(failed)?.len();
+    if size > MAX_MANIFEST_BYTES {
+        let source = std::io::Error::other(format!(
+            "the file has {size} bytes; at most {MAX_MANIFEST_BYTES} are allowed"
+        ));
+        return Err(RegistryError::Io {
+            action: "read",
+            path,
+            source,
+        });
+    }
+    let text = std::fs::read(&path).map_err(failed)?;
+    serde_json::from_slice(&text).map_err(|source| RegistryError::Manifest { path, source })
+}

@@ -1,0 +1,335 @@
+//! The state of a session: the features of the last frames, so that no frame is encoded twice, and the last conditioning
+//! input. Pure: it has no clock, socket or weights.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+use super::compute::Features;
+use super::input::InputError;
+use super::task::{ConditioningInput, FieldNames, RawConditioning, Task};
+use crate::frame::Frame;
+use crate::nn::ModelSpec;
+use crate::types::{Action, RobotState};
+
+/// Why an imported session state does not fit the model.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MemoryError {
+    /// More frames than the context.
+    #[error("memory.features holds {found} frames; the model keeps at most {most}")]
+    FrameCount {
+        /// Frames given.
+        found: usize,
+        /// The model's context.
+        most: usize,
+    },
+    /// A frame has the wrong number of features.
+    #[error("memory.features[{index}] holds {found} numbers; the model's frames have {expected} features")]
+    FeatureCount {
+        /// Which frame.
+        index: usize,
+        /// Numbers given.
+        found: usize,
+        /// The model's features.
+        expected: usize,
+    },
+    /// A value that no frame can produce.
+    #[error("memory.features[{index}][{place}] is {value}; a feature is -1 to 1")]
+    Feature {
+        /// Which frame.
+        index: usize,
+        /// Which feature.
+        place: usize,
+        /// Its value.
+        value: f32,
+    },
+    /// `next_seq` contradicts the number of frames.
+    #[error("memory.next_seq is {next_seq}; that contradicts the {frames} frames in memory.features")]
+    Count {
+        /// As given.
+        next_seq: u64,
+        /// Frames given.
+        frames: usize,
+    },
+    /// The actions or the state do not fit the model.
+    #[error("memory: {0}")]
+    ConditioningInput(#[from] InputError),
+}
+
+/// The exported state of a session: what another server needs to continue it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct SessionMemory {
+    /// The expected sequence number of the next frame.
+    pub next_seq: u64,
+    /// The features of the last frames, oldest first, -1 to 1; at most as many frames as the model's context.
+    pub features: Vec<Vec<f32>>,
+    /// The actions of the last conditioning input; empty if the model takes none.
+    #[cfg_attr(feature = "schema", schema(value_type = Vec<Vec<f32>>))]
+    pub actions: Vec<Action>,
+    /// The robot's state at the last frame; absent if the model takes none.
+    #[cfg_attr(feature = "schema", schema(value_type = Option<Vec<f32>>))]
+    pub state: Option<RobotState>,
+    /// How many frames the last prediction had; absent: the model's horizon.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
+}
+
+/// The state of a session with one model.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SessionState {
+    next_seq: u64,
+    features: VecDeque<Features>,
+    conditioning: ConditioningInput,
+}
+
+impl SessionState {
+    /// Restores an exported state for the model named `model`. Errors name the field that does not fit.
+    pub fn restore(memory: SessionMemory, model: &str, spec: &ModelSpec) -> Result<Self, MemoryError> {
+        let frames = memory.features.len();
+        if frames > spec.context {
+            return Err(MemoryError::FrameCount {
+                found: frames,
+                most: spec.context,
+            });
+        }
+        if (frames == 0) != (memory.next_seq == 0) || memory.next_seq < frames as u64 {
+            return Err(MemoryError::Count {
+                next_seq: memory.next_seq,
+                frames,
+            });
+        }
+        for (index, features) in memory.features.iter().enumerate() {
+            check_features(index, features, spec)?;
+        }
+        let conditioning = match frames {
+            0 => ConditioningInput::default(),
+            _ => ConditioningInput::new(
+                RawConditioning {
+                    past: &[],
+                    future: Some(&memory.actions),
+                    state: memory.state.as_ref(),
+                    steps: memory.steps,
+                },
+                &MEMORY_FIELDS,
+                model,
+                spec,
+            )?,
+        };
+        Ok(Self {
+            next_seq: memory.next_seq,
+            features: memory.features.into_iter().map(Features::from).collect(),
+            conditioning,
+        })
+    }
+
+    /// Exports the state, so that another server can continue the session.
+    #[must_use]
+    pub fn memory(&self) -> SessionMemory {
+        SessionMemory {
+            next_seq: self.next_seq,
+            features: self.features.iter().map(|features| features.to_vec()).collect(),
+            actions: self.conditioning.actions.clone(),
+            state: self.conditioning.state.clone(),
+            steps: self.conditioning.steps,
+        }
+    }
+
+    /// The expected sequence number of the next frame.
+    #[must_use]
+    pub fn next_seq(&self) -> u64 {
+        self.next_seq
+    }
+
+    /// How many frames the context holds now, at most the model's context.
+    #[must_use]
+    pub fn frame_count(&self) -> usize {
+        self.features.len()
+    }
+
+    /// The robot's state at the last frame, if the model takes it.
+    #[must_use]
+    pub fn robot_state(&self) -> Option<&RobotState> {
+        self.conditioning.state.as_ref()
+    }
+
+    /// The task for the next frame: encode it and, if it fills the context, predict under the conditioning input.
+    #[must_use]
+    pub fn step(&self, frame: Frame, conditioning: Option<ConditioningInput>, spec: &ModelSpec) -> Task {
+        let spare = (self.features.len() + 1).saturating_sub(spec.context);
+        let past_features: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
+        let is_full = past_features.len() + 1 == spec.context;
+        Task {
+            past_features,
+            frames: vec![frame],
+            conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
+        }
+    }
+
+    /// Stores the result of the step of frame `seq`.
+    pub fn advance(&mut self, seq: u64, features: Features, conditioning: ConditioningInput, spec: &ModelSpec) {
+        self.features.push_back(features);
+        while self.features.len() > spec.context {
+            self.features.pop_front();
+        }
+        self.conditioning = conditioning;
+        self.next_seq = seq.saturating_add(1);
+    }
+
+    /// The task that repeats the last prediction; `None` while the context is not full.
+    #[must_use]
+    pub fn repeat_task(&self, spec: &ModelSpec) -> Option<Task> {
+        (self.features.len() == spec.context).then(|| self.rollout_task(vec![self.conditioning.clone()]))
+    }
+
+    /// The task that predicts one rollout for each conditioning input from the last frame. The context must be full.
+    #[must_use]
+    pub fn rollout_task(&self, conditioning_inputs: Vec<ConditioningInput>) -> Task {
+        Task {
+            past_features: self.features.iter().cloned().collect(),
+            frames: Vec::new(),
+            conditioning_inputs,
+        }
+    }
+}
+
+const MEMORY_FIELDS: FieldNames = FieldNames {
+    past: |_| "actions".to_owned(),
+    future: "actions",
+    missing: "actions",
+};
+
+fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), MemoryError> {
+    if features.len() != spec.code_len() {
+        return Err(MemoryError::FeatureCount {
+            index,
+            found: features.len(),
+            expected: spec.code_len(),
+        });
+    }
+    // Features are outputs of tanh, or pixels for the flow network; NaN is in no range.
+    match features
+        .iter()
+        .enumerate()
+        .find(|(_, value)| !(-1.0..=1.0).contains(*value))
+    {
+        Some((place, &value)) => Err(MemoryError::Feature { index, place, value }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::serving::compute;
+    use crate::serving::{PredictionInput, predict, test_flow_model, test_model};
+
+    fn frame(seed: u8, width: u32) -> Frame {
+        Frame::new(width, 4, (0..4 * width as u8).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
+    }
+
+    fn action(value: f32) -> Action {
+        Action::try_from(vec![value]).unwrap()
+    }
+
+    fn conditioning(value: f32) -> ConditioningInput {
+        ConditioningInput {
+            actions: vec![action(value); 2],
+            state: RobotState::try_from(vec![value]).ok(),
+            steps: None,
+        }
+    }
+
+    #[test]
+    fn steps_predict_the_same_as_whole_windows() {
+        for model in [test_model(), test_flow_model()] {
+            check_steps(&model);
+        }
+    }
+
+    fn check_steps(model: &crate::registry::LoadedModel) {
+        let width = model.model.spec().frame_width_px;
+        let spec = model.model.spec();
+        let (mut state, mut seen) = (SessionState::default(), Vec::new());
+        for seq in 0..8u8 {
+            let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
+            let computed = compute::run(model, &[&task]).unwrap().remove(0);
+            state.advance(
+                u64::from(seq),
+                computed.features[0].clone(),
+                conditioning(f32::from(seq)),
+                spec,
+            );
+            seen.push(frame(seq, width));
+            let Some(start) = seen.len().checked_sub(3) else {
+                assert!(computed.predictions.is_empty());
+                continue;
+            };
+            let input = PredictionInput {
+                frames: seen[start..].to_vec(),
+                actions: vec![action(f32::from(seq))],
+                state: RobotState::try_from(vec![f32::from(seq)]).ok(),
+                future_actions: None,
+                steps: None,
+            };
+            assert_eq!(computed.predictions, predict(model, &[&input]).unwrap());
+            let repeated = state.repeat_task(spec).unwrap();
+            assert_eq!(
+                compute::run(model, &[&repeated]).unwrap()[0].predictions,
+                computed.predictions
+            );
+        }
+        assert_eq!((state.next_seq(), state.frame_count()), (8, 3));
+    }
+
+    proptest! {
+        #[test]
+        fn an_exported_state_is_restored_whole_or_refused(
+            next_seq in 0u64..6,
+            features in proptest::collection::vec(proptest::collection::vec(-1.2f32..1.2, 4..6), 0..5),
+            actions in proptest::collection::vec(-2.0f32..2.0, 0..4),
+            state in proptest::option::of(-2.0f32..2.0),
+        ) {
+            let spec = test_model().model.spec().clone();
+            let memory = SessionMemory {
+                next_seq,
+                features,
+                actions: actions.into_iter().map(action).collect(),
+                state: state.and_then(|value| RobotState::try_from(vec![value]).ok()),
+                steps: None,
+            };
+            let is_sound = memory.features.len() <= 3
+                && memory.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
+                && (memory.features.is_empty() == (next_seq == 0) && next_seq >= memory.features.len() as u64)
+                && (memory.features.is_empty() || (memory.actions.len() == 2 && memory.state.is_some()));
+            match SessionState::restore(memory.clone(), "test", &spec) {
+                Ok(restored) => {
+                    prop_assert!(is_sound);
+                    if next_seq > 0 {
+                        prop_assert_eq!(restored.memory(), memory);
+                    }
+                }
+                Err(_) => prop_assert!(!is_sound),
+            }
+        }
+    }
+
+    #[test]
+    fn a_feature_out_of_range_is_refused_with_its_position() {
+        let spec = test_model().model.spec().clone();
+        let mut memory = SessionMemory {
+            next_seq: 1,
+            features: vec![vec![0.0; 5]],
+            actions: vec![action(0.0); 2],
+            state: RobotState::try_from(vec![0.0]).ok(),
+            steps: None,
+        };
+        memory.features[0][3] = f32::NAN;
+        let error = SessionState::restore(memory, "test", &spec).unwrap_err();
+        assert_eq!(error.to_string(), "memory.features[0][3] is NaN; a feature is -1 to 1");
+    }
+}

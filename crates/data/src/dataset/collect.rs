@@ -1,0 +1,252 @@
+//! Simulates trials on several threads and writes them as a data set. Finished shards stay on disk if it is stopped.
+//!
+//! Each thread simulates a complete shard of consecutive trials; the calling thread writes the shards in order, each
+//! atomically. If the collection is stopped, the finished trials of the other shards are saved beside them. The finished
+//! data set depends only on seed and trial numbers, not on threads or interruptions.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+
+use super::collection::{Collection, CollectionStatus};
+use super::shard::EncodedEpisode;
+use super::{DatasetError, DatasetInfo, EpisodeData};
+use foreframe_core::types::Seed;
+use foreframe_sim::{Observation, Scenario, SimError, World, WorldConfig, action_channels};
+
+/// Default number of trials in a shard.
+pub const DEFAULT_TRIALS_PER_SHARD: u64 = 50;
+
+/// Settings of a collection.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CollectConfig {
+    /// The scenario.
+    pub scenario: Scenario,
+    /// Number of trials. Trials are numbered from 0.
+    pub trials: u64,
+    /// The seed from which the seed of every trial is derived.
+    pub seed: Seed,
+    /// The data set's directory.
+    pub out: PathBuf,
+    /// Settings of the simulated world.
+    pub world: WorldConfig,
+    /// Number of simulation threads; 0 for the number of cores.
+    pub threads: usize,
+    /// Number of trials in a shard.
+    pub trials_per_shard: u64,
+}
+
+impl CollectConfig {
+    /// A collection of this many trials of a scenario, with default values for all other settings.
+    #[must_use]
+    pub fn new(scenario: Scenario, trials: u64, seed: Seed, out: &Path) -> Self {
+        Self {
+            scenario,
+            trials,
+            seed,
+            out: out.to_owned(),
+            world: WorldConfig::default(),
+            threads: 0,
+            trials_per_shard: DEFAULT_TRIALS_PER_SHARD,
+        }
+    }
+
+    /// Checks the settings. Errors: `Zero`, `World`.
+    pub fn validate(&self) -> Result<(), DatasetError> {
+        for (what, value) in [
+            ("the number of trials", self.trials),
+            ("the number of trials in a shard", self.trials_per_shard),
+        ] {
+            if value == 0 {
+                return Err(DatasetError::Zero { what });
+            }
+        }
+        self.world.validate().map_err(DatasetError::World)
+    }
+
+    /// Number of shards.
+    pub(super) fn shard_count(&self) -> usize {
+        self.trials.div_ceil(self.trials_per_shard) as usize
+    }
+
+    /// The trials of a shard.
+    pub(super) fn shard_trials(&self, shard: usize) -> Range<u64> {
+        let first = shard as u64 * self.trials_per_shard;
+        first..(first + self.trials_per_shard).min(self.trials)
+    }
+
+    fn thread_count(&self) -> usize {
+        match self.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        }
+    }
+}
+
+/// How far a collection is, in trials.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CollectProgress {
+    /// Simulated trials, including those found on disk when the collection was resumed.
+    pub done: u64,
+    /// Requested trials.
+    pub total: u64,
+}
+
+/// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished
+/// ([`CollectionStatus::of`] tells). Several threads call `on_progress`.
+/// Errors: `Zero`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
+pub fn collect(
+    config: &CollectConfig,
+    on_progress: &(dyn Fn(CollectProgress) + Sync),
+    cancelled: &AtomicBool,
+) -> Result<DatasetInfo, DatasetError> {
+    config.validate()?;
+    if let CollectionStatus::Finished(info) = CollectionStatus::of(config)? {
+        return Ok(*info);
+    }
+    let mut collection = Collection::open(config)?;
+    let workers = CollectWorkers {
+        config,
+        info: collection.info().clone(),
+        next_shard: AtomicUsize::new(collection.shard_count()),
+        done: AtomicU64::new(collection.trial_count()),
+        on_progress,
+        cancelled,
+        failed: AtomicBool::new(false),
+    };
+    workers.report(0);
+    let written = std::thread::scope(|scope| {
+        let threads = config.thread_count();
+        let (sender, receiver) = sync_channel(threads);
+        for _ in 0..threads {
+            let (workers, sender) = (&workers, sender.clone());
+            scope.spawn(move || workers.work(&sender));
+        }
+        drop(sender);
+        let written = write_in_order(&mut collection, receiver);
+        workers.failed.store(written.is_err(), Ordering::Relaxed);
+        written
+    });
+    let unwritten = written?;
+    if collection.shard_count() < config.shard_count() {
+        for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
+            collection.save_unfinished(*shard, episodes)?;
+        }
+        return Err(DatasetError::Cancelled {
+            done: collection.trial_count(),
+            total: config.trials,
+        });
+    }
+    collection.complete()
+}
+
+/// A shard's number and its finished episodes (all of them, unless the collection was stopped), or the error.
+type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
+
+/// Writes complete shards in order. A shard that arrives early waits for the shards before it. Returns the episodes that
+/// could not be written: those of incomplete shards, and of shards after an incomplete one.
+fn write_in_order(
+    collection: &mut Collection<'_>,
+    results: Receiver<ShardResult>,
+) -> Result<BTreeMap<usize, Vec<EncodedEpisode>>, DatasetError> {
+    let mut waiting = BTreeMap::new();
+    for (shard, episodes) in results {
+        waiting.insert(shard, episodes?);
+        while let Some(entry) = waiting.first_entry()
+            && *entry.key() == collection.shard_count()
+            && collection.is_complete(*entry.key(), entry.get())
+        {
+            collection.write(&entry.remove())?;
+        }
+    }
+    Ok(waiting)
+}
+
+/// State shared by the simulation threads.
+struct CollectWorkers<'a> {
+    config: &'a CollectConfig,
+    info: DatasetInfo,
+    next_shard: AtomicUsize,
+    done: AtomicU64,
+    on_progress: &'a (dyn Fn(CollectProgress) + Sync),
+    cancelled: &'a AtomicBool,
+    failed: AtomicBool,
+}
+
+impl CollectWorkers<'_> {
+    fn report(&self, trials: u64) {
+        (self.on_progress)(CollectProgress {
+            done: self.done.fetch_add(trials, Ordering::Relaxed) + trials,
+            total: self.config.trials,
+        });
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.cancelled.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
+    }
+
+    /// Simulates shards until none is left, the collection is stopped, or the receiver is gone.
+    fn work(&self, sender: &SyncSender<ShardResult>) {
+        loop {
+            let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
+            if shard >= self.config.shard_count() {
+                return;
+            }
+            if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
+                return;
+            }
+        }
+    }
+
+    /// Simulates the trials of a shard that are not saved yet; stops early if the collection was stopped.
+    fn simulate_shard(&self, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
+        let mut episodes = Collection::saved_episodes(self.config, &self.info, shard);
+        for trial in self.config.shard_trials(shard).skip(episodes.len()) {
+            let simulated = self.simulate(trial);
+            let Some(data) = simulated.map_err(|source| DatasetError::Simulation { trial, source })? else {
+                break;
+            };
+            episodes.push(EncodedEpisode::new(&self.info, trial as usize, data)?);
+            self.report(1);
+        }
+        Ok(episodes)
+    }
+
+    /// Simulates a trial; none if the collection was stopped.
+    fn simulate(&self, trial: u64) -> Result<Option<EpisodeData>, SimError> {
+        let config = self.config;
+        let mut world = World::new(config.scenario, &config.world, config.seed, trial)?;
+        let mut data = EpisodeData {
+            masks: Some(Vec::new()),
+            trial: Some(world.parameters().clone()),
+            ..EpisodeData::default()
+        };
+        let mut observation = world.observe();
+        loop {
+            if self.is_stopped() {
+                return Ok(None);
+            }
+            let action = world.policy_action();
+            let step = world.step(&action)?;
+            record(&mut data, &observation, action.as_slice());
+            observation = step.observation;
+            if step.terminated || step.truncated {
+                // There is no action after the last frame.
+                record(&mut data, &observation, &vec![0.0; action_channels().len()]);
+                return Ok(Some(data));
+            }
+        }
+    }
+}
+
+fn record(data: &mut EpisodeData, observation: &Observation, action: &[f32]) {
+    data.timestamps_s.push(observation.time_s);
+    data.pixels.extend_from_slice(observation.frame.pixels());
+    if let Some(masks) = &mut data.masks {
+        masks.extend_from_slice(&observation.mask);
+    }
+    data.actions.extend_from_slice(action);
+    data.states.extend_from_slice(observation.state.as_slice());
+}

@@ -1,0 +1,239 @@
+//! Writes episodes as a bag of ROS 2: images, and actions and states as messages with the times of their images.
+
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::ops::Range;
+use std::path::Path;
+
+use super::super::{Dataset, DatasetError};
+use super::cdr::CdrWriter;
+use super::mcap::McapWriter;
+use foreframe_core::types::Channel;
+
+/// The topic of the images.
+pub const IMAGE_TOPIC: &str = "/camera/image_raw";
+/// Beside the images, if the data set has a camera model.
+const CAMERA_TOPIC: &str = "/camera/camera_info";
+/// The topic of the actions, if there are any.
+pub const ACTION_TOPIC: &str = "/action";
+/// The topic of the states, if there are any.
+pub const STATE_TOPIC: &str = "/state";
+
+/// The first frame's time. 0 would stand for no time.
+const START_NS: u64 = 1_000_000_000;
+/// The least time from one episode to the next; readers split the frames there.
+const MIN_GAP_NS: u64 = 10_000_000_000;
+/// The same in frames.
+const GAP_FRAMES: u64 = 10;
+
+const SEPARATOR: &str = "================================================================================\n";
+const HEADER: &str = "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
+const TIME: &str = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+const TWIST: &str = "MSG: geometry_msgs/Twist\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n";
+const VECTOR: &str = "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n";
+const REGION: &str = "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\n\
+                      bool do_rectify\n";
+
+/// Writes episodes, as ranges of frames counted over the whole data set, as one MCAP file, which `foreframe import` and ROS 2
+/// read. Frame k of an episode is at k times the frame period. Errors: `Io`.
+pub fn to_mcap(dataset: &Dataset, episodes: &[Range<usize>], path: &Path) -> Result<(), DatasetError> {
+    let directory = path.parent().unwrap_or(Path::new("."));
+    std::fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
+    // The file appears when it is whole.
+    let partial = path.with_extension("partial.mcap");
+    let failed = |error| DatasetError::io("write", path)(error);
+    let written = File::create(&partial).map_err(failed).and_then(|file| {
+        let mut out = BufWriter::new(file);
+        write(dataset, episodes, McapWriter::new(&mut out).map_err(failed)?, &failed)?;
+        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
+        file.sync_all()
+            .and_then(|()| std::fs::rename(&partial, path))
+            .map_err(failed)
+    });
+    if written.is_err() {
+        // A later run overwrites it if it stays.
+        let _ = std::fs::remove_file(&partial);
+    }
+    written
+}
+
+/// `failed` says what a failed write of the file means.
+fn write<W: io::Write>(
+    dataset: &Dataset,
+    episodes: &[Range<usize>],
+    mut bag: McapWriter<W>,
+    failed: &dyn Fn(io::Error) -> DatasetError,
+) -> Result<(), DatasetError> {
+    let info = dataset.info();
+    let image = bag.topic(IMAGE_TOPIC, "sensor_msgs/msg/Image", &image_definition());
+    let camera = info.camera.map(|camera| {
+        let topic = bag.topic(CAMERA_TOPIC, "sensor_msgs/msg/CameraInfo", &camera_definition());
+        (topic, camera.horizontal_fov_rad)
+    });
+    let frames = || episodes.iter().cloned().flatten();
+    let mut values = |name, channels: &[Channel], row: &dyn Fn(usize) -> Vec<f64>| {
+        let kind = (!channels.is_empty()).then(|| ValueMessage::of(channels, || frames().map(row)));
+        kind.map(|kind| (bag.topic(name, kind.type_name(), &kind.definition()), kind))
+    };
+    let numbers = |values: &[f32]| values.iter().copied().map(f64::from).collect::<Vec<_>>();
+    let action_of = |frame| numbers(dataset.action(frame));
+    let state_of = |frame| numbers(dataset.state(frame));
+    let action = values(ACTION_TOPIC, &info.action_channels, &action_of);
+    let state = values(STATE_TOPIC, &info.state_channels, &state_of);
+    let size = (info.frame_width_px, info.frame_height_px);
+    let period_ns = info.frame_period_s * 1e9;
+    let mut start_ns = START_NS;
+    for episode in episodes {
+        for (place, frame) in episode.clone().enumerate() {
+            let time_ns = start_ns + (place as f64 * period_ns).round() as u64;
+            if let Some((topic, kind)) = &action {
+                bag.message(*topic, time_ns, &kind.message(time_ns, &action_of(frame)))
+                    .map_err(failed)?;
+            }
+            if let Some((topic, kind)) = &state {
+                bag.message(*topic, time_ns, &kind.message(time_ns, &state_of(frame)))
+                    .map_err(failed)?;
+            }
+            if let Some((topic, fov_rad)) = camera {
+                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))
+                    .map_err(failed)?;
+            }
+            let pixels = dataset.pixels(frame)?;
+            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))
+                .map_err(failed)?;
+        }
+        let duration_ns = (episode.len() as f64 * period_ns) as u64;
+        let gap_ns = MIN_GAP_NS.max((period_ns as u64).saturating_mul(GAP_FRAMES));
+        start_ns = (start_ns + duration_ns + gap_ns).next_multiple_of(1_000_000_000);
+    }
+    bag.finish().map_err(failed)
+}
+
+/// The message that holds an action or a state.
+enum ValueMessage {
+    /// A `TwistStamped`; for each channel, which of its six numbers it is.
+    Twist(Vec<usize>),
+    /// A `JointState` with these names; their values are its positions.
+    Joints(Vec<String>),
+}
+
+impl ValueMessage {
+    /// A `TwistStamped` where an import gives the same channels again: all are its numbers, in its order and units, those of a
+    /// robot on wheels among them, and every other one is used.
+    fn of<I: Iterator<Item = Vec<f64>>>(channels: &[Channel], rows: impl Fn() -> I) -> Self {
+        let place = |channel: &Channel| {
+            let names = [
+                "linear.x",
+                "linear.y",
+                "linear.z",
+                "angular.x",
+                "angular.y",
+                "angular.z",
+            ];
+            let place = match channel.name.as_str() {
+                "linear" => 0,
+                "angular" => 5,
+                name => names.iter().position(|known| *known == name)?,
+            };
+            let unit = if place < 3 { "m/s" } else { "rad/s" };
+            (channel.unit.is_empty() || channel.unit == unit).then_some(place)
+        };
+        let places: Option<Vec<usize>> = channels.iter().map(place).collect();
+        let fits = |places: &Vec<usize>| {
+            let is_used = |(column, &place): (usize, &usize)| {
+                matches!(place, 0 | 5) || rows().any(|row| row.get(column).is_some_and(|value| *value != 0.0))
+            };
+            places.is_sorted_by(|a, b| a < b)
+                && [0, 5].iter().all(|place| places.contains(place))
+                && places.iter().enumerate().all(is_used)
+        };
+        match places.filter(fits) {
+            Some(places) => Self::Twist(places),
+            None => Self::Joints(channels.iter().map(|channel| channel.name.clone()).collect()),
+        }
+    }
+
+    fn type_name(&self) -> &'static str {
+        match self {
+            Self::Twist(_) => "geometry_msgs/msg/TwistStamped",
+            Self::Joints(_) => "sensor_msgs/msg/JointState",
+        }
+    }
+
+    fn definition(&self) -> String {
+        match self {
+            Self::Twist(_) => definition(
+                "std_msgs/Header header\ngeometry_msgs/Twist twist\n",
+                &[HEADER, TIME, TWIST, VECTOR],
+            ),
+            Self::Joints(_) => definition(
+                "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
+                &[HEADER, TIME],
+            ),
+        }
+    }
+
+    fn message(&self, time_ns: u64, values: &[f64]) -> Vec<u8> {
+        let cdr = CdrWriter::new().header(time_ns);
+        match self {
+            Self::Twist(places) => {
+                let mut numbers = [0.0; 6];
+                for (&place, &value) in places.iter().zip(values) {
+                    numbers[place] = value;
+                }
+                cdr.f64s(&numbers).end()
+            }
+            Self::Joints(names) => {
+                let named = names
+                    .iter()
+                    .fold(cdr.u32(names.len() as u32), |cdr, name| cdr.text(name));
+                named.f64_sequence(values).u32(0).u32(0).end()
+            }
+        }
+    }
+}
+
+/// A message definition with those of its parts.
+fn definition(own: &str, parts: &[&str]) -> String {
+    parts.iter().fold(own.to_owned(), |text, part| text + SEPARATOR + part)
+}
+
+fn image_definition() -> String {
+    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+               uint8[] data\n";
+    definition(own, &[HEADER, TIME])
+}
+
+fn gray_image(time_ns: u64, (width, height): (u32, u32), pixels: &[u8]) -> Vec<u8> {
+    let size = CdrWriter::new().header(time_ns).u32(height).u32(width);
+    size.text("mono8").u8(0).u32(width).bytes(pixels).end()
+}
+
+fn camera_definition() -> String {
+    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
+               float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n";
+    definition(own, &[HEADER, TIME, REGION])
+}
+
+/// A camera without distortion, whose axis goes through the middle of the image.
+fn camera_info(time_ns: u64, (width, height): (u32, u32), horizontal_fov_rad: f32) -> Vec<u8> {
+    let focal_px = f64::from(width) / 2.0 / (f64::from(horizontal_fov_rad) / 2.0).tan();
+    let (middle_x, middle_y) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
+    let size = CdrWriter::new().header(time_ns).u32(height).u32(width);
+    size.text("plumb_bob")
+        .f64_sequence(&[0.0; 5])
+        .f64s(&[focal_px, 0.0, middle_x, 0.0, focal_px, middle_y, 0.0, 0.0, 1.0])
+        .f64s(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+        .f64s(&[
+            focal_px, 0.0, middle_x, 0.0, 0.0, focal_px, middle_y, 0.0, 0.0, 0.0, 1.0, 0.0,
+        ])
+        .u32(0)
+        .u32(0)
+        // The region of interest: the whole image.
+        .u32(0)
+        .u32(0)
+        .u32(0)
+        .u32(0)
+        .u8(0)
+        .end()
+}

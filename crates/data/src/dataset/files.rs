@@ -1,0 +1,65 @@
+//! Writes and verifies the files of a data set.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+
+use super::DatasetError;
+use foreframe_core::files::{self, hex, is_partial_of};
+
+/// Writes a file atomically. Creates its directory if it is missing. Errors: `Io`.
+pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
+    let directory = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(directory)
+        .and_then(|()| files::write_atomically(path, bytes))
+        .map_err(DatasetError::io("write", path))
+}
+
+/// Whether a directory is missing, empty, or contains only what was left by a program that was killed while it wrote the first
+/// file, `meta/…`. Errors: `Io`.
+pub(super) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
+    if !out.exists() {
+        return Ok(true);
+    }
+    if !out.is_dir() {
+        return Ok(false);
+    }
+    let names = |path: &Path| -> Result<Vec<PathBuf>, DatasetError> {
+        fs::read_dir(path)
+            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+            .map(|entries| entries.iter().map(fs::DirEntry::path).collect())
+            .map_err(DatasetError::io("read", path))
+    };
+    for path in names(out)? {
+        let is_meta = path == out.join("meta") && path.is_dir();
+        let only_half = is_meta && names(&path)?.iter().all(|inner| is_partial_of(&out.join(first), inner));
+        if !only_half {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// The SHA-256 of a file in hexadecimal. Errors: `Io`.
+pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
+    let mut hasher = Sha256::new();
+    File::open(path)
+        .and_then(|mut file| io::copy(&mut file, &mut hasher))
+        .map_err(DatasetError::io("read", path))?;
+    Ok(hex(&hasher.finalize()))
+}
+
+/// Errors: `HashDiffers` unless the file has this SHA-256 (hexadecimal).
+pub(super) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
+    let found = sha256_of_file(path)?;
+    if found == expected {
+        return Ok(());
+    }
+    Err(DatasetError::HashDiffers {
+        path: path.to_owned(),
+        expected: expected.to_owned(),
+        found,
+    })
+}

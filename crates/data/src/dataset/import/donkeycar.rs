@@ -1,0 +1,229 @@
+//! Donkeycar tubs, version 2: `manifest.json`, `catalog_*.catalog` and `images/`.
+
+use std::collections::BTreeSet;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+
+use serde_json::{Map, Value};
+
+use super::images::inside;
+use super::recording::{Images, Record, Recording};
+use super::{ImportError, ImportOptions, SkippedList, listed, open_file, read_text, shortened};
+use foreframe_core::types::Channel;
+
+const MANIFEST: &str = "manifest.json";
+/// Lines of the manifest: input names, input types, metadata, times, catalogs.
+const MANIFEST_LINES: usize = 5;
+
+/// The longest line of a catalog, in bytes.
+const MAX_LINE_BYTES: u64 = 1 << 20;
+/// How much of a wrong value a message quotes, in bytes.
+const QUOTED_BYTES: usize = 60;
+
+/// Whether a directory is a tub.
+pub(super) fn is_tub(source: &Path) -> bool {
+    source.join(MANIFEST).is_file()
+}
+
+/// What the manifest says.
+struct TubManifest {
+    inputs: Vec<(String, String)>,
+    catalogs: Vec<String>,
+    deleted: BTreeSet<u64>,
+}
+
+impl TubManifest {
+    fn read(tub: &Path) -> Result<Self, ImportError> {
+        let path = tub.join(MANIFEST);
+        let text = read_text(&path)?;
+        let wrong = |line: usize, reason: &str| ImportError::Record {
+            place: format!("{} line {line}", path.display()),
+            reason: reason.to_owned(),
+        };
+        let lines: Vec<Value> = text
+            .lines()
+            .enumerate()
+            .map(|(index, line)| serde_json::from_str(line).map_err(|error| wrong(index + 1, &error.to_string())))
+            .collect::<Result<_, _>>()?;
+        let [names, types, _, _, catalogs, ..] = lines.as_slice() else {
+            return Err(wrong(
+                lines.len(),
+                &format!("the file has {} lines of {MANIFEST_LINES}", lines.len()),
+            ));
+        };
+        let inputs = texts(names)
+            .zip(texts(types))
+            .map(|(names, types)| names.into_iter().zip(types).collect());
+        let inputs: Option<Vec<(String, String)>> = inputs;
+        let paths =
+            texts(&catalogs["paths"]).ok_or_else(|| wrong(MANIFEST_LINES, "\"paths\" is not a list of file names"))?;
+        let deleted = catalogs["deleted_indexes"].as_array();
+        Ok(Self {
+            inputs: inputs.ok_or_else(|| wrong(1, "the names and types of the inputs are not lists of texts"))?,
+            catalogs: paths,
+            deleted: deleted.into_iter().flatten().filter_map(Value::as_u64).collect(),
+        })
+    }
+
+    /// The input that holds the image.
+    fn image(&self, options: &ImportOptions) -> Result<String, ImportError> {
+        let found = match &options.image {
+            Some(name) => self.inputs.iter().find(|(input, _)| input == name),
+            None => self.inputs.iter().find(|(_, kind)| kind == "image_array"),
+        };
+        found
+            .map(|(name, _)| name.clone())
+            .ok_or_else(|| self.missing("an image input", "--image"))
+    }
+
+    fn missing(&self, what: &str, option: &str) -> ImportError {
+        let known = self.inputs.iter().map(|(name, kind)| format!("{name} ({kind})"));
+        ImportError::Option(format!(
+            "the tub has no {what} ({option}); its inputs are: {}",
+            listed(known)
+        ))
+    }
+
+    /// The named inputs, which must exist.
+    fn named(&self, names: &[String], option: &str) -> Result<Vec<String>, ImportError> {
+        let is_known = |name: &String| self.inputs.iter().any(|(input, _)| input == name);
+        match names.iter().find(|name| !is_known(name)) {
+            Some(name) => Err(self.missing(&format!("input \"{name}\""), option)),
+            None => Ok(names.to_vec()),
+        }
+    }
+
+    /// The inputs of the action: those named, else every number that the driver gives (`user/…`).
+    fn actions(&self, options: &ImportOptions) -> Result<Vec<String>, ImportError> {
+        if !options.actions.is_empty() {
+            return self.named(&options.actions, "--action");
+        }
+        let numbers = self
+            .inputs
+            .iter()
+            .filter(|(name, kind)| kind == "float" && name.starts_with("user/"));
+        Ok(numbers.map(|(name, _)| name.clone()).collect())
+    }
+}
+
+/// A list of texts.
+fn texts(value: &Value) -> Option<Vec<String>> {
+    let items = value.as_array()?.iter();
+    items.map(|item| item.as_str().map(str::to_owned)).collect()
+}
+
+/// Reads the records of a tub. Errors: `Option`, `Io`, `Record`.
+pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+    let manifest = TubManifest::read(tub)?;
+    let reader = Reader {
+        tub,
+        image: manifest.image(options)?,
+        actions: manifest.actions(options)?,
+        states: manifest.named(&options.states, "--state")?,
+    };
+    // `user/angle` becomes `angle`.
+    let channel = |name: &String| Channel::new(name.rsplit('/').next().unwrap_or(name), &options.unit(name));
+    let mut recording = Recording {
+        name: tub
+            .canonicalize()
+            .ok()
+            .and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()))
+            .unwrap_or_else(|| "tub".to_owned()),
+        action_channels: reader.actions.iter().map(channel).collect(),
+        state_channels: reader.states.iter().map(channel).collect(),
+        camera: None,
+        records: Vec::new(),
+        images: Images::Files(Vec::new()),
+        skipped: SkippedList::default(),
+    };
+    let mut paths = Vec::new();
+    for catalog in &manifest.catalogs {
+        let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
+        let file = open_file(&path)?;
+        let (mut lines, mut row) = (BufReader::new(file), 0);
+        while let Some(line) = next_line(&mut lines).map_err(ImportError::io("read", &path))? {
+            row += 1;
+            let place = format!("{} line {row}", path.display());
+            let parsed = line
+                .map_err(|reason| ImportError::record(&place, reason))
+                .and_then(|line| reader.record(&line, &place));
+            match parsed {
+                Ok((index, _, _)) if manifest.deleted.contains(&index) => {}
+                Ok((_, image, record)) => {
+                    recording.records.push(Record {
+                        image: paths.len(),
+                        ..record
+                    });
+                    paths.push(image);
+                }
+                Err(error) => match error.skippable().filter(|_| options.skip_bad) {
+                    Some(item) => recording.skipped.push(item),
+                    None => return Err(error),
+                },
+            }
+        }
+    }
+    recording.images = Images::Files(paths);
+    Ok(recording)
+}
+
+/// The next line, or why it cannot be read; `None` at the end.
+fn next_line(lines: &mut impl BufRead) -> std::io::Result<Option<Result<String, String>>> {
+    let mut line = Vec::new();
+    if std::io::Read::take(&mut *lines, MAX_LINE_BYTES + 1).read_until(b'\n', &mut line)? == 0 {
+        return Ok(None);
+    }
+    if line.pop_if(|last| *last == b'\n').is_none() && line.len() as u64 > MAX_LINE_BYTES {
+        lines.skip_until(b'\n')?;
+        return Ok(Some(Err(format!("the line has more than {MAX_LINE_BYTES} bytes"))));
+    }
+    Ok(Some(String::from_utf8(line).map_err(|error| error.to_string())))
+}
+
+struct Reader<'a> {
+    tub: &'a Path,
+    image: String,
+    actions: Vec<String>,
+    states: Vec<String>,
+}
+
+impl Reader<'_> {
+    /// Index, image and record of a catalog's line.
+    fn record(&self, line: &str, place: &str) -> Result<(u64, PathBuf, Record), ImportError> {
+        let fields: Map<String, Value> = serde_json::from_str(line)
+            .map_err(|error| ImportError::record(place, format!("not a JSON object: {error}")))?;
+        let wrong = |field: &str, right: &str| {
+            let found = fields.get(field).map_or_else(|| "missing".to_owned(), Value::to_string);
+            let found = shortened(&found, QUOTED_BYTES);
+            ImportError::record(place, format!("{field:?} is {found}; it must be {right}"))
+        };
+        let index = fields.get("_index").and_then(Value::as_u64);
+        let index = index.ok_or_else(|| wrong("_index", "a whole number"))?;
+        let time_ms = fields.get("_timestamp_ms").and_then(Value::as_f64);
+        let time_ms = time_ms.ok_or_else(|| wrong("_timestamp_ms", "a number of milliseconds"))?;
+        let image = fields.get(&self.image).and_then(Value::as_str);
+        let image = image.ok_or_else(|| wrong(&self.image, "a file's name"))?;
+        let numbers = |names: &[String]| -> Result<Vec<f32>, ImportError> {
+            let number = |name: &String| {
+                let value = fields.get(name).and_then(Value::as_f64).map(|value| value as f32);
+                value
+                    .filter(|value| value.is_finite())
+                    .ok_or_else(|| wrong(name, "a finite number"))
+            };
+            names.iter().map(number).collect()
+        };
+        let record = Record {
+            timestamp_s: time_ms / 1000.0,
+            session: fields
+                .get("_session_id")
+                .and_then(Value::as_str)
+                .unwrap_or_default()
+                .to_owned(),
+            action: numbers(&self.actions)?,
+            state: numbers(&self.states)?,
+            image: 0,
+            place: place.to_owned(),
+        };
+        Ok((index, inside(&self.tub.join("images"), image, place)?, record))
+    }
+}

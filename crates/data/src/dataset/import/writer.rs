@@ -1,0 +1,350 @@
+//! Writes the planned episodes as shards. What is on disk depends on the source and the options alone, so an import that was
+//! killed continues after its last whole shard.
+
+use std::fs::{self, File};
+use std::io::ErrorKind;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde::Serialize;
+
+use super::super::collection::lock_file;
+use super::super::files::{is_unused, write_atomically};
+use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
+use super::super::shard::{EncodedEpisode, ShardStart, build};
+use super::super::store::{FinishedShard, complete};
+use super::super::{DatasetInfo, EpisodeData};
+use super::recording::{Record, Recording, WantedImage};
+use super::skipped::MAX_ITEMS;
+use super::timing::{ImportPlan, PlannedFrame};
+use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem};
+use foreframe_core::files::remove_partials;
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::fit::fit;
+
+/// A shard is closed once it has so many frames. It holds whole episodes.
+const SHARD_FRAMES: usize = 2000;
+/// Images that are decoded in parallel.
+const CHUNK_FRAMES: usize = 256;
+/// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
+const SKIPPED: &str = "meta/skipped.json";
+
+/// What decides the bytes of the data set.
+#[derive(Serialize)]
+struct ImportArguments<'a> {
+    program_version: &'static str,
+    source: &'a Path,
+    options: &'a ImportOptions,
+}
+
+/// The directory of an import, locked by this process.
+pub(super) struct Directory<'a> {
+    config: &'a ImportConfig,
+    _lock: File,
+}
+
+impl<'a> Directory<'a> {
+    /// Takes an unused directory, or one with the same import. Errors: `OutExists`, `Io`, `Dataset` (busy).
+    pub(super) fn claim(config: &'a ImportConfig) -> Result<Self, ImportError> {
+        let out = &config.out;
+        let path = out.join(IMPORT_ARGUMENTS);
+        // The file may be replaced, so the old one is locked first: another import may still use it.
+        let old = if path.is_file() {
+            Some(lock_file(&path, out)?)
+        } else {
+            None
+        };
+        let lock = match (Self::check(config)?, old) {
+            (None, Some(lock)) => lock,
+            (text, _) => {
+                if let Some(text) = text {
+                    write_atomically(&path, text.as_bytes())?;
+                }
+                lock_file(&path, out)?
+            }
+        };
+        remove_partials(out);
+        Ok(Self { config, _lock: lock })
+    }
+
+    /// Whether the directory can be taken. Returns the arguments that must be written to it; `None` if it has them already.
+    /// Errors: `OutExists`, `Io`.
+    pub(super) fn check(config: &ImportConfig) -> Result<Option<String>, ImportError> {
+        let out = &config.out;
+        let path = out.join(IMPORT_ARGUMENTS);
+        let arguments = ImportArguments {
+            program_version: env!("CARGO_PKG_VERSION"),
+            source: &config
+                .source
+                .canonicalize()
+                .map_err(ImportError::io("read", &config.source))?,
+            options: &config.options,
+        };
+        let text = serde_json::to_string_pretty(&arguments)
+            .map_err(|error| ImportError::Option(format!("the options cannot be written: {error}")))?;
+        let occupied = |what: &str| ImportError::OutExists {
+            path: out.clone(),
+            what: what.to_owned(),
+        };
+        match fs::read_to_string(&path) {
+            Ok(found) if found == text => Ok(None),
+            // An import that failed before its first shard leaves nothing that is worth keeping.
+            Ok(_) if !out.join("data").exists() => Ok(Some(text)),
+            Ok(_) => Err(occupied(
+                "an import with another source or other options; delete it to import again",
+            )),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                if is_unused(out, IMPORT_ARGUMENTS)? {
+                    Ok(Some(text))
+                } else {
+                    Err(occupied("other files"))
+                }
+            }
+            Err(error) => Err(ImportError::io("read", &path)(error)),
+        }
+    }
+
+    /// The data set, if it is complete. Errors: `Dataset`, `Io`.
+    pub(super) fn finished(&self) -> Result<Option<Imported>, ImportError> {
+        if !self.config.out.join(INFO).exists() {
+            return Ok(None);
+        }
+        Ok(Some(Imported {
+            info: DatasetMetadata::read(&self.config.out)?.info_in(&self.config.out)?,
+            skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
+        }))
+    }
+
+    fn skipped_path(&self) -> PathBuf {
+        self.config.out.join(SKIPPED)
+    }
+
+    fn read_skipped(&self) -> Result<Vec<(Option<usize>, SkippedItem)>, ImportError> {
+        let path = self.skipped_path();
+        match fs::read(&path) {
+            Ok(text) => serde_json::from_slice(&text)
+                .map_err(|error| ImportError::record(path.display().to_string(), error.to_string())),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Err(error) => Err(ImportError::io("read", &path)(error)),
+        }
+    }
+
+    /// Writes the shards that are missing, then the tables. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
+    pub(super) fn write(
+        &self,
+        plan: &ImportPlan,
+        on_progress: &(dyn Fn(ImportProgress) + Sync),
+        cancelled: &AtomicBool,
+    ) -> Result<Imported, ImportError> {
+        let shards = shards(&plan.episodes);
+        let info = description(self.config, plan);
+        let mut writer = ShardWriter {
+            out: &self.config.out,
+            plan,
+            options: &self.config.options,
+            info: &info,
+            written: Vec::new(),
+            start: ShardStart { episode: 0, frame: 0 },
+        };
+        let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
+        let mut done = 0;
+        // Those that the source's lists have are found again by every run.
+        let mut skipped = self.read_skipped()?;
+        skipped.retain(|(of, _)| of.is_some());
+        for episodes in shards {
+            let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
+            if cancelled.load(Ordering::Relaxed) {
+                return Err(ImportError::Cancelled { done, total });
+            }
+            if !writer.resume() {
+                let shard = writer.written.len();
+                skipped.retain(|(of, _)| *of != Some(shard));
+                let (encoded, bad) = writer.encode(episodes, cancelled, &|frames| {
+                    on_progress(ImportProgress {
+                        done: done + frames as u64,
+                        total,
+                    });
+                })?;
+                let Some(encoded) = encoded else {
+                    return Err(ImportError::Cancelled { done, total });
+                };
+                let room = MAX_ITEMS.saturating_sub(skipped.len());
+                let not_listed = bad.len().saturating_sub(room) as u64;
+                skipped.extend(bad.into_iter().take(room).map(|item| (Some(shard), item)));
+                if not_listed > 0 {
+                    skipped.push((Some(shard), SkippedItem::not_listed(not_listed)));
+                }
+                self.write_skipped(&skipped)?;
+                writer.write(&encoded)?;
+            }
+            done += frames as u64;
+            on_progress(ImportProgress { done, total });
+        }
+        let ShardWriter { written, .. } = writer;
+        if written.iter().all(|shard| shard.records.is_empty()) {
+            return Err(ImportError::Empty(self.config.source.clone()));
+        }
+        let listed = plan.recording.skipped.items().into_iter();
+        let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
+        all.sort_by_key(|(of, _)| *of);
+        self.write_skipped(&all)?;
+        remove_partials(&self.config.out);
+        let info = complete(&self.config.out, info, &written)?;
+        Ok(Imported {
+            info,
+            skipped: all.into_iter().map(|(_, item)| item).collect(),
+        })
+    }
+
+    fn write_skipped(&self, skipped: &[(Option<usize>, SkippedItem)]) -> Result<(), ImportError> {
+        let text = serde_json::to_vec_pretty(skipped)
+            .map_err(|error| ImportError::Option(format!("the list of skipped items cannot be written: {error}")))?;
+        Ok(write_atomically(&self.skipped_path(), &text)?)
+    }
+}
+
+/// How many shards an unfinished import has written.
+pub(super) fn saved_shards(out: &Path) -> usize {
+    let mut shards = 0;
+    while out.join(shard_path(shards)).is_file() {
+        shards += 1;
+    }
+    shards
+}
+
+fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
+    DatasetInfo {
+        name: plan.recording.name.clone(),
+        frame_width_px: config.options.frame_width_px,
+        frame_height_px: config.options.frame_height_px,
+        frame_period_s: plan.frame_period_s,
+        action_channels: plan.recording.action_channels.clone(),
+        state_channels: plan.recording.state_channels.clone(),
+        camera: plan.recording.camera,
+        ..DatasetInfo::default()
+    }
+}
+
+/// Ranges of episodes, each one shard.
+fn shards(episodes: &[Vec<PlannedFrame>]) -> Vec<Range<usize>> {
+    let (mut shards, mut start, mut frames) = (Vec::new(), 0, 0);
+    for (index, episode) in episodes.iter().enumerate() {
+        frames += episode.len();
+        if frames >= SHARD_FRAMES || index + 1 == episodes.len() {
+            shards.push(start..index + 1);
+            (start, frames) = (index + 1, 0);
+        }
+    }
+    shards
+}
+
+struct ShardWriter<'a> {
+    out: &'a Path,
+    plan: &'a ImportPlan,
+    options: &'a ImportOptions,
+    info: &'a DatasetInfo,
+    written: Vec<FinishedShard>,
+    start: ShardStart,
+}
+
+impl ShardWriter<'_> {
+    /// Takes the next shard from disk if an earlier run wrote it.
+    fn resume(&mut self) -> bool {
+        let found = FinishedShard::read(&self.out.join(shard_path(self.written.len())));
+        found.is_some_and(|shard| {
+            self.push(shard);
+            true
+        })
+    }
+
+    fn push(&mut self, shard: FinishedShard) {
+        self.start = ShardStart {
+            episode: self.start.episode + shard.records.len(),
+            frame: self.start.frame + shard.frames(),
+        };
+        self.written.push(shard);
+    }
+
+    fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), ImportError> {
+        let path = self.out.join(shard_path(self.written.len()));
+        self.push(FinishedShard::write(&path, &build(self.info, self.start, episodes)?)?);
+        Ok(())
+    }
+
+    /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
+    /// are returned if the import was cancelled.
+    fn encode(
+        &self,
+        episodes: Range<usize>,
+        cancelled: &AtomicBool,
+        on_frames: &dyn Fn(usize),
+    ) -> Result<(Option<Vec<EncodedEpisode>>, Vec<SkippedItem>), ImportError> {
+        let Recording { records, images, .. } = &self.plan.recording;
+        let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
+        let resize = |image: &Frame, place: &str| {
+            let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
+            fit(image, width, height, self.options.fit).map_err(|source| ImportError::Image {
+                place: place.to_owned(),
+                path: place.into(),
+                source,
+            })
+        };
+        for episode in &self.plan.episodes[episodes] {
+            let mut data = EpisodeData::default();
+            for chunk in episode.chunks(CHUNK_FRAMES) {
+                if cancelled.load(Ordering::Relaxed) {
+                    return Ok((None, bad));
+                }
+                let wanted = chunk.iter().map(|frame| WantedImage {
+                    image: records[frame.record].image,
+                    place: &records[frame.record].place,
+                });
+                let frames = images.read_all(&wanted.collect::<Vec<_>>(), &resize, cancelled);
+                if cancelled.load(Ordering::Relaxed) {
+                    return Ok((None, bad));
+                }
+                for (planned, frame) in chunk.iter().zip(frames) {
+                    match frame {
+                        Ok(frame) => push(&mut data, planned, &records[planned.record], frame.pixels()),
+                        Err(error) => match error.skippable().filter(|_| self.options.skip_bad) {
+                            Some(item) => {
+                                bad.push(item);
+                                self.close(&mut data, &mut encoded)?;
+                            }
+                            None => return Err(error),
+                        },
+                    }
+                }
+                count += chunk.len();
+                on_frames(count);
+            }
+            self.close(&mut data, &mut encoded)?;
+        }
+        Ok((Some(encoded), bad))
+    }
+
+    /// Ends an episode; one of a single frame is of no use and left out.
+    fn close(&self, data: &mut EpisodeData, encoded: &mut Vec<EncodedEpisode>) -> Result<(), ImportError> {
+        let data = std::mem::take(data);
+        if data.timestamps_s.len() > 1 {
+            let episode = self.start.episode + encoded.len();
+            encoded.push(EncodedEpisode::new(self.info, episode, relative(data))?);
+        }
+        Ok(())
+    }
+}
+
+fn push(data: &mut EpisodeData, planned: &PlannedFrame, record: &Record, pixels: &[u8]) {
+    data.timestamps_s.push(record.timestamp_s);
+    data.pixels.extend_from_slice(pixels);
+    data.actions.extend_from_slice(&planned.action);
+    data.states.extend_from_slice(&record.state);
+}
+
+/// The same with times from the episode's start.
+fn relative(mut data: EpisodeData) -> EpisodeData {
+    let start_s = data.timestamps_s[0];
+    data.timestamps_s.iter_mut().for_each(|time_s| *time_s -= start_s);
+    data
+}

@@ -1,0 +1,191 @@
+//! Makes a data set of moving digits, as Moving MNIST, from files of digits. What is on disk depends only on the digits, the
+//! seed and the numbers of trials and frames; if it is stopped, the same call continues after the last whole shard.
+//!
+//! Such a data set is split by whole trials in their order (see [`sampler`](super::sampler)), so the last tenth of the trials
+//! gets the digits for test, the tenth before it those for validation.
+
+use std::fs::File;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rand::seq::IndexedRandom;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::collect::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
+use super::collection::{arguments_text, finished_shard, has_arguments, lock};
+use super::digits::DigitPools;
+use super::layout::{DatasetMetadata, INFO, shard_path};
+use super::shard::{EncodedEpisode, ShardStart, build};
+use super::store::{FinishedShard, complete};
+use super::{DatasetError, DatasetInfo, EpisodeData, Split};
+use foreframe_core::types::Seed;
+use foreframe_sim::moving_digits::{DIGITS_FRAME_SIDE_PX, moving_digits};
+
+/// The scenario's name, on the command line and on disk.
+pub const MOVING_MNIST: &str = "moving-mnist";
+/// Frames of a trial of the published test set.
+pub const DEFAULT_FRAMES: usize = 20;
+/// Seconds from one frame to the next. The benchmark knows none; with it, 20 frames last two seconds.
+pub const DIGITS_FRAME_PERIOD_S: f64 = 0.1;
+/// Digits of a trial.
+const DIGITS: usize = 2;
+/// A data set of fewer trials would be split within its trials.
+const MIN_TRIALS: u64 = 10;
+/// Longest trial, in frames.
+pub const MAX_FRAMES: usize = 1000;
+
+/// What to make.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MovingMnistConfig {
+    /// An IDX file of digits, or a folder with IDX files or PNG images.
+    pub digits: PathBuf,
+    /// Number of trials, at least 10.
+    pub trials: u64,
+    /// Frames of a trial, 2 to [`MAX_FRAMES`].
+    pub frames: usize,
+    /// The seed from which the seed of every trial is derived.
+    pub seed: Seed,
+    /// The data set's directory.
+    pub out: PathBuf,
+}
+
+impl MovingMnistConfig {
+    fn validate(&self) -> Result<(), DatasetError> {
+        if self.trials < MIN_TRIALS {
+            return Err(DatasetError::Description(format!(
+                "{} trials are too few; moving digits need at least {MIN_TRIALS}, a tenth of them for testing",
+                self.trials
+            )));
+        }
+        if !(2..=MAX_FRAMES).contains(&self.frames) {
+            return Err(DatasetError::Description(format!(
+                "a trial of {} frames is out of range; it must have 2 to {MAX_FRAMES}",
+                self.frames
+            )));
+        }
+        Ok(())
+    }
+
+    /// The split to which a trial will belong.
+    fn split_of(&self, trial: u64) -> Split {
+        let tenth = self.trials.div_ceil(10);
+        match self.trials - trial {
+            left if left <= tenth => Split::Test,
+            left if left <= 2 * tenth => Split::Validation,
+            _ => Split::Train,
+        }
+    }
+
+    fn shards(&self) -> Range<usize> {
+        0..self.trials.div_ceil(DEFAULT_TRIALS_PER_SHARD) as usize
+    }
+
+    fn shard_trials(&self, shard: usize) -> Range<u64> {
+        let first = shard as u64 * DEFAULT_TRIALS_PER_SHARD;
+        first..(first + DEFAULT_TRIALS_PER_SHARD).min(self.trials)
+    }
+
+    fn info(&self) -> DatasetInfo {
+        DatasetInfo {
+            name: format!("{MOVING_MNIST}-{}-seed-{}", self.trials, self.seed.0),
+            frame_width_px: DIGITS_FRAME_SIDE_PX as u32,
+            frame_height_px: DIGITS_FRAME_SIDE_PX as u32,
+            frame_period_s: DIGITS_FRAME_PERIOD_S,
+            scenario: Some(MOVING_MNIST.to_owned()),
+            seed: Some(self.seed),
+            ..DatasetInfo::default()
+        }
+    }
+
+    fn trial(&self, pools: &DigitPools, trial: u64) -> EpisodeData {
+        let mut random = self.seed.derive(MOVING_MNIST, trial).rng();
+        let pool = pools.of(self.split_of(trial));
+        let digits: Vec<_> = (0..DIGITS).filter_map(|_| pool.choose(&mut random)).collect();
+        EpisodeData {
+            timestamps_s: (0..self.frames)
+                .map(|frame| frame as f64 * DIGITS_FRAME_PERIOD_S)
+                .collect(),
+            pixels: moving_digits(&digits, self.frames, &mut random),
+            ..EpisodeData::default()
+        }
+    }
+}
+
+/// The arguments that determine the bytes. They are written first.
+#[derive(Serialize)]
+struct MovingMnistArguments<'a> {
+    program_version: &'static str,
+    scenario: &'static str,
+    digits_sha256: &'a str,
+    trials: u64,
+    frames: usize,
+    seed: Seed,
+}
+
+/// Makes the data set, or continues. Returns at once if it is complete.
+/// Errors: `Digits`, `Description`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Io`.
+pub fn collect_digits(
+    config: &MovingMnistConfig,
+    on_progress: &(dyn Fn(CollectProgress) + Sync),
+    cancelled: &AtomicBool,
+) -> Result<DatasetInfo, DatasetError> {
+    config.validate()?;
+    let pools = DigitPools::read(&config.digits)?;
+    let _lock = claim(config, &pools.hash())?;
+    if config.out.join(INFO).exists() {
+        return DatasetMetadata::read(&config.out)?.info_in(&config.out);
+    }
+    let info = config.info();
+    let mut finished: Vec<FinishedShard> = Vec::new();
+    let mut start = ShardStart { episode: 0, frame: 0 };
+    for shard in config.shards() {
+        on_progress(CollectProgress {
+            done: start.episode as u64,
+            total: config.trials,
+        });
+        if cancelled.load(Ordering::Relaxed) {
+            return Err(DatasetError::Cancelled {
+                done: start.episode as u64,
+                total: config.trials,
+            });
+        }
+        let written = match finished_shard(&config.out, shard, config.shard_trials(shard).count()) {
+            Some(written) => written,
+            None => write_shard(config, &info, &pools, (shard, start))?,
+        };
+        start.episode += written.records.len();
+        start.frame += written.frames();
+        finished.push(written);
+    }
+    complete(&config.out, info, &finished)
+}
+
+/// Takes an unused directory, or one with the same arguments, and locks it.
+fn claim(config: &MovingMnistConfig, digits_sha256: &str) -> Result<File, DatasetError> {
+    let arguments = arguments_text(&MovingMnistArguments {
+        program_version: env!("CARGO_PKG_VERSION"),
+        scenario: MOVING_MNIST,
+        digits_sha256,
+        trials: config.trials,
+        frames: config.frames,
+        seed: config.seed,
+    })?;
+    has_arguments(&config.out, &arguments)?;
+    lock(&config.out, &arguments)
+}
+
+fn write_shard(
+    config: &MovingMnistConfig,
+    info: &DatasetInfo,
+    pools: &DigitPools,
+    (shard, start): (usize, ShardStart),
+) -> Result<FinishedShard, DatasetError> {
+    let trials: Vec<u64> = config.shard_trials(shard).collect();
+    let episodes: Vec<EncodedEpisode> = trials
+        .into_par_iter()
+        .map(|trial| EncodedEpisode::new(info, trial as usize, config.trial(pools, trial)))
+        .collect::<Result<_, _>>()?;
+    FinishedShard::write(&config.out.join(shard_path(shard)), &build(info, start, &episodes)?)
+}

@@ -1,0 +1,7 @@
+//! Data sets of Foreframe: collection in the simulator, import, export and inspection. Use it through the crate `foreframe`.
+
+pub mod motion;
+
+pub mod dataset;
+
+pub mod inspection;

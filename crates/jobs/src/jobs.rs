@@ -1,0 +1,173 @@
+//! Collection, import, training and evaluation in the background. [`state`] defines the legal transitions, [`spec`] checks
+//! submitted jobs, [`queue`] is the handle for callers, `runner` claims jobs one after another and writes their reports,
+//! `progress` buffers the reports, [`pipeline`] does the work. The store holds the jobs, so that they survive the process
+//! and several processes can share them.
+
+mod checkpoints;
+pub mod child;
+pub mod datasets;
+mod instance;
+pub mod job;
+pub mod memory;
+mod patience;
+pub mod pipeline;
+pub mod priority;
+mod progress;
+pub mod queue;
+mod report;
+mod runner;
+pub mod spec;
+pub mod state;
+
+use crate::store::{StoreError, unix_s};
+use crate::versions::VersionError;
+use foreframe_data::dataset::DatasetError;
+
+pub use job::{Job, JobFilter};
+pub use progress::{JobProgress, Losses};
+pub use queue::{JobLimits, Jobs};
+pub use report::JobReporter;
+pub use runner::{JobExecutor, JobFailure, JobResult};
+pub use spec::{CollectSpec, EvaluateSpec, ImportSpec, JobSpec, TrainSpec};
+pub use state::{JobState, JobTransition};
+
+/// Why a job was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum JobError {
+    /// No job has that id.
+    #[error("there is no job \"{id}\"; only the latest ended jobs are kept")]
+    Unknown {
+        /// The requested id.
+        id: String,
+    },
+    /// The job's state does not allow the transition.
+    #[error("job {id} is {state}; only a {} job can {event}", event.allowed_states())]
+    IllegalTransition {
+        /// The job.
+        id: String,
+        /// Its state.
+        state: JobState,
+        /// The requested transition.
+        event: JobTransition,
+    },
+    /// The queue is full.
+    #[error("the job queue is full ({limit} jobs are waiting); cancel one or try again later")]
+    QueueFull {
+        /// How many jobs can wait.
+        limit: usize,
+    },
+    /// The submitter's share of the queue is full.
+    #[error(
+        "{limit} jobs of this API key are waiting, which is its share of the job queue; cancel one or try again later"
+    )]
+    ShareFull {
+        /// How many jobs of one key can wait.
+        limit: i64,
+    },
+    /// A field of the job is not valid.
+    #[error("{field}: {reason}")]
+    Invalid {
+        /// The field's name.
+        field: &'static str,
+        /// What is wrong with it, and what would be right.
+        reason: String,
+    },
+    /// An input of the job does not exist.
+    #[error("{field}: there is no {kind} \"{name}\"; there are: {}", list(.available))]
+    NotFound {
+        /// The field's name.
+        field: &'static str,
+        /// `data set`, …
+        kind: &'static str,
+        /// The requested name.
+        name: String,
+        /// The existing names.
+        available: Vec<String>,
+    },
+    /// The job's output exists already, or another job is making it.
+    #[error("name: {kind} \"{name}\" {why}; choose another name")]
+    Taken {
+        /// `data set`, …
+        kind: &'static str,
+        /// The requested name.
+        name: String,
+        /// Why it is not free.
+        why: &'static str,
+    },
+    /// The output directory holds files that this job cannot continue.
+    #[error("name: data set \"{name}\" {why}, or choose another name")]
+    Occupied {
+        /// The requested name.
+        name: String,
+        /// What is in the directory, and how to free it.
+        why: String,
+    },
+    /// A queued or running job needs it.
+    #[error("{kind} \"{name}\" is in use by {job}; wait until that job has ended, or cancel it")]
+    InUse {
+        /// `data set`, …
+        kind: &'static str,
+        /// Its name.
+        name: String,
+        /// The job's id.
+        job: String,
+    },
+    /// The server is stopping.
+    #[error("the server is stopping and accepts no more jobs")]
+    Stopping,
+    /// This program cannot read the job's row in the store.
+    #[error("the store's record of job {id} cannot be read: {reason}")]
+    Record {
+        /// The job.
+        id: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The process could not get a runner's id in the data directory.
+    #[error("could not register as a runner in the data directory: {0}")]
+    Instance(#[source] std::io::Error),
+    /// The threads for jobs could not be started.
+    #[error("could not start the threads for jobs: {0}")]
+    Threads(#[source] rayon::ThreadPoolBuildError),
+    /// The data sets could not be read.
+    #[error(transparent)]
+    Dataset(Box<DatasetError>),
+    /// The models could not be read.
+    #[error(transparent)]
+    Versions(Box<VersionError>),
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+impl JobError {
+    /// Whether a store cannot be reached or written now, but may be later.
+    #[must_use]
+    pub fn is_unavailable(&self) -> bool {
+        match self {
+            Self::Store(error) => error.is_unavailable(),
+            Self::Versions(error) => matches!(&**error, VersionError::Store(error) if error.is_unavailable()),
+            _ => false,
+        }
+    }
+}
+
+impl From<DatasetError> for JobError {
+    fn from(error: DatasetError) -> Self {
+        Self::Dataset(Box::new(error))
+    }
+}
+
+impl From<VersionError> for JobError {
+    fn from(error: VersionError) -> Self {
+        Self::Versions(Box::new(error))
+    }
+}
+
+fn list(names: &[String]) -> String {
+    if names.is_empty() {
+        "none yet".to_owned()
+    } else {
+        names.join(", ")
+    }
+}

@@ -1,0 +1,151 @@
+//! The data sets that jobs make and use: directories below `datasets`, in the data directory and in the object store.
+
+use std::path::{Path, PathBuf};
+
+use futures_util::{StreamExt as _, TryStreamExt as _, stream};
+use tracing::warn;
+
+use super::JobError;
+use crate::store::{Author, Objects, Store};
+use foreframe_core::registry::is_valid_name;
+use foreframe_data::dataset::import::{ImportConfig, ImportError, check_out};
+use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
+
+/// The file that is written last: it marks a complete data set.
+pub(super) const LAST_FILE: &str = "info.json";
+/// Concurrent requests to the object store.
+const LOOKUPS: usize = 16;
+
+/// The key of a data set's directory.
+#[must_use]
+pub(super) fn key(name: &str) -> String {
+    format!("datasets/{name}")
+}
+
+/// The names of the finished data sets. With a shared object store, only that store counts. Errors: `Store`, `Dataset`.
+pub async fn names(objects: &Objects) -> Result<Vec<String>, JobError> {
+    let mut names = if objects.are_shared() {
+        list_shared(objects).await?
+    } else {
+        dataset::list(&objects.data_dir().join("datasets"))?
+    };
+    names.retain(|name| is_valid_name(name));
+    names.sort();
+    Ok(names)
+}
+
+/// The finished data sets in the object store.
+async fn list_shared(objects: &Objects) -> Result<Vec<String>, JobError> {
+    let dirs = objects.directories("datasets").await?.into_iter();
+    let finished = stream::iter(dirs.filter(|name| is_valid_name(name)))
+        .map(async |name| Ok::<_, JobError>(is_finished(objects, &name).await?.then_some(name)))
+        .buffered(LOOKUPS)
+        .try_collect::<Vec<_>>();
+    Ok(finished.await?.into_iter().flatten().collect())
+}
+
+/// The local directory of a data set. With a shared object store, it is fetched from there unless the local copy is the
+/// same. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
+pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
+    if is_valid_name(name) && is_finished(objects, name).await? {
+        let dir = objects.data_dir().join(key(name));
+        if objects.are_shared() && !(dataset::is_finished(&dir) && is_current(objects, name).await?) {
+            objects.pull_same(&key(name), dataset::METADATA, LAST_FILE).await?;
+        }
+        if dataset::is_finished(&dir) {
+            return Ok(dir);
+        }
+    }
+    Err(not_found(objects, name).await?)
+}
+
+/// Whether the local data set is the same as the one in the object store.
+async fn is_current(objects: &Objects, name: &str) -> Result<bool, JobError> {
+    Ok(objects.is_same(&format!("{}/{}", key(name), dataset::METADATA)).await?)
+}
+
+/// Prepares the local directory of a data set that is to be collected. With a shared object store, a local data set that
+/// was deleted there, or was started with other arguments, is deleted. Errors: `Store`, `Dataset`.
+pub(super) async fn clear_stale(objects: &Objects, name: &str, config: &CollectConfig) -> Result<(), JobError> {
+    if !objects.are_shared() {
+        return Ok(());
+    }
+    if is_finished(objects, name).await? {
+        return fetch(objects, name).await.map(drop);
+    }
+    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
+    match CollectionStatus::of(config) {
+        Err(DatasetError::OutExists { .. }) if is_of_a_deleted_set => Ok(objects.delete(&key(name)).await?),
+        Err(DatasetError::OtherArguments { .. }) => Ok(objects.delete(&key(name)).await?),
+        // The collection reports everything else.
+        _ => Ok(()),
+    }
+}
+
+/// The same for a data set that is to be imported. Errors: `Store`, `Dataset`.
+pub(super) async fn clear_stale_import(objects: &Objects, name: &str, config: &ImportConfig) -> Result<(), JobError> {
+    if !objects.are_shared() {
+        return Ok(());
+    }
+    if is_finished(objects, name).await? {
+        return fetch(objects, name).await.map(drop);
+    }
+    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
+    let is_of_another_import = config.out.join(dataset::IMPORT_ARGUMENTS).is_file();
+    match check_out(config) {
+        Err(ImportError::OutExists { .. }) if is_of_a_deleted_set || is_of_another_import => {
+            Ok(objects.delete(&key(name)).await?)
+        }
+        // The import reports everything else.
+        _ => Ok(()),
+    }
+}
+
+/// Describes a finished data set without fetching it. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
+pub async fn describe(objects: &Objects, name: &str) -> Result<DatasetInfo, JobError> {
+    if is_valid_name(name) && is_finished(objects, name).await? {
+        let path = format!("{}/{}", key(name), dataset::METADATA);
+        if let Some(text) = objects.read(&path).await? {
+            return Ok(dataset::describe_metadata(Path::new(&path), &text)?);
+        }
+    }
+    Err(not_found(objects, name).await?)
+}
+
+/// Whether the data set is complete in the object store.
+async fn is_finished(objects: &Objects, name: &str) -> Result<bool, JobError> {
+    Ok(objects.has(&format!("{}/{}", key(name), dataset::INFO)).await?)
+}
+
+async fn not_found(objects: &Objects, name: &str) -> Result<JobError, JobError> {
+    Ok(JobError::NotFound {
+        field: "dataset",
+        kind: "data set",
+        name: name.to_owned(),
+        available: names(objects).await?,
+    })
+}
+
+/// Deletes a data set, finished or not, and records it in the audit trail. Errors: `NotFound` with the existing names, `Store`,
+/// `Dataset`.
+pub async fn delete(store: &Store, name: &str, by: &Author) -> Result<(), JobError> {
+    let objects = store.objects();
+    if !(is_valid_name(name) && exists(objects, name).await?) {
+        return Err(not_found(objects, name).await?);
+    }
+    // Files are not part of a transaction, so the entry comes first.
+    store.record_dataset_deletion(name, by).await?;
+    let deleted = objects.delete(&key(name)).await;
+    if deleted.is_err()
+        && let Err(error) = store.record_failed_deletion(name, by).await
+    {
+        warn!(dataset = name, %error, "could not record that a deletion failed");
+    }
+    Ok(deleted?)
+}
+
+/// Whether any part of the data set exists, locally or in the object store.
+async fn exists(objects: &Objects, name: &str) -> Result<bool, JobError> {
+    let is_local = objects.data_dir().join(key(name)).is_dir();
+    Ok(is_local || objects.directories("datasets").await?.iter().any(|known| known == name))
+}

@@ -1,0 +1,205 @@
+//! The memory of jobs: the default limits, and an estimate of what a training needs.
+
+use serde::{Deserialize, Serialize};
+
+use super::JobError;
+use foreframe_core::nn::Architecture;
+use foreframe_data::dataset::DatasetInfo;
+use foreframe_train::training::TrainConfig;
+use foreframe_train::training::config::CodecStart;
+
+const MIB: u64 = 1 << 20;
+/// Bytes of an f32.
+const VALUE: u64 = 4;
+/// Copies of the weights: weights, best weights, gradients, two moments, and a checkpoint of four of these.
+const WEIGHT_COPIES: u64 = 9;
+/// Values for each pixel and frame of a batch: input, target and prediction.
+const PIXEL_VALUES: u64 = 3;
+/// Values for each hidden unit and frame of a batch that the backward pass needs: gates, cell and hidden state.
+const HIDDEN_VALUES: u64 = 10;
+/// How many frames the principal components are computed from at most, and how many copies of them are made.
+const PRINCIPAL_FRAMES: u64 = 8192;
+const PRINCIPAL_COPIES: u64 = 4;
+
+/// Bytes that a training keeps of each frame besides its pixels: its time, its window, and its places in the order of draws.
+const FRAME_BYTES: u64 = 8 + 16 + 16;
+/// The default of `dataset_memory_mb` where the memory of the machine is unknown.
+const DEFAULT_DATASET_MB: u64 = 1024;
+
+/// The memory of one job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobMemory {
+    /// What it can use, in MiB; 0 for no limit.
+    pub limit_mb: u64,
+    /// What the frames of a data set can use, in MiB; those of a larger data set stay in a file.
+    pub dataset_mb: u64,
+}
+
+impl JobMemory {
+    /// What the frames of a data set can use in a job, in MiB: never more than a third of the job's limit.
+    #[must_use]
+    pub fn held_mb(self) -> u64 {
+        match self.limit_mb {
+            0 => self.dataset_mb,
+            limit => self.dataset_mb.min(limit / 3),
+        }
+    }
+
+    /// Errors: `Invalid` if a training certainly needs more memory than a job can use.
+    pub(super) fn check(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
+        let (allowed, needed) = (self.limit_mb, training_mb(config, dataset, self.held_mb()));
+        if allowed == 0 || needed <= allowed {
+            return Ok(());
+        }
+        Err(JobError::Invalid {
+            field: "settings",
+            reason: format!(
+                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mb); \
+                 use a smaller model or batch"
+            ),
+        })
+    }
+}
+
+impl Default for JobMemory {
+    fn default() -> Self {
+        Self {
+            limit_mb: 0,
+            dataset_mb: default_dataset_mb(),
+        }
+    }
+}
+
+/// A quarter of the memory that this process can use, in MiB.
+#[must_use]
+pub fn default_dataset_mb() -> u64 {
+    match default_limit_mb() {
+        0 => DEFAULT_DATASET_MB,
+        limit => limit / 3,
+    }
+}
+
+/// Three quarters of the memory that this process can use, in MiB; 0 if that is unknown.
+#[must_use]
+pub fn default_limit_mb() -> u64 {
+    let limits = [machine_bytes(), cgroup_bytes()];
+    limits
+        .into_iter()
+        .flatten()
+        .min()
+        .map_or(0, |bytes| bytes / MIB * 3 / 4)
+}
+
+fn machine_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib << 10)
+}
+
+/// The memory limit of this process's control group, or of the group that its container shows as the root.
+fn cgroup_bytes() -> Option<u64> {
+    let group = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let path = group.lines().find_map(|line| line.strip_prefix("0::")).unwrap_or("/");
+    let files = [
+        format!("/sys/fs/cgroup{path}/memory.max"),
+        "/sys/fs/cgroup/memory.max".to_owned(),
+        "/sys/fs/cgroup/memory/memory.limit_in_bytes".to_owned(),
+    ];
+    let limits = files
+        .iter()
+        .filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok());
+    limits.min()
+}
+
+/// Values that the flow network keeps for each pixel of a window's frames until the gradients are computed.
+const FLOW_PIXEL_VALUES: u64 = 60;
+
+/// The least memory that a training on a data set needs, in MiB, if it holds at most `held_mb` MiB of frames. It leaves out
+/// what is hard to know, so a training that passes this check can still reach its limit.
+#[must_use]
+fn training_mb(config: &TrainConfig, dataset: &DatasetInfo, held_mb: u64) -> u64 {
+    let count = |value: usize| value as u64;
+    let (features, hidden) = (count(config.model.features), count(config.model.hidden));
+    let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
+    let frames = dataset.frame_count as u64;
+    let (codec, network) = match config.model.architecture {
+        Architecture::Dense => (
+            2 * pixels * features,
+            2 * 4 * hidden * (features + hidden) + hidden * features,
+        ),
+        // Its weights are few beside its activations.
+        Architecture::Flow => (0, 0),
+    };
+    let weights = VALUE * WEIGHT_COPIES * (codec + network);
+    let window = count(config.model.context + config.model.horizon);
+    let fit_frames = count(config.fit.batch_size) * window;
+    let fit_values = match config.model.architecture {
+        Architecture::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
+        Architecture::Flow => FLOW_PIXEL_VALUES * pixels,
+    };
+    let fit = VALUE * fit_frames * fit_values;
+    let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
+    let principal = match config.pretrain.start {
+        CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,
+        CodecStart::Random => 0,
+    };
+    let work = [fit, pretrain, principal].into_iter().max().unwrap_or(0);
+    let decoded = dataset.decoded_bytes();
+    let held = if decoded <= held_mb * MIB { decoded } else { 0 };
+    let channels = count(dataset.action_channels.len() + dataset.state_channels.len());
+    let numbers = frames * (FRAME_BYTES + VALUE * channels);
+    (held + numbers + weights + work).div_ceil(MIB)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_limit_is_below_the_memory_of_the_machine() {
+        if let Some(bytes) = machine_bytes() {
+            assert!((1..bytes / MIB).contains(&default_limit_mb()));
+        }
+    }
+
+    fn frames(count: usize) -> DatasetInfo {
+        DatasetInfo {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            frame_count: count,
+            ..DatasetInfo::default()
+        }
+    }
+
+    #[test]
+    fn frames_in_a_file_need_no_memory() {
+        let config = TrainConfig::layered("paper", None, &[]).unwrap();
+        let needed = |count| training_mb(&config, &frames(count), 1024);
+        let (small, held, large) = (needed(10_000), needed(262_144), needed(300_000));
+        assert!((small + 900..small + 1024).contains(&held), "{small} {held}");
+        assert!(
+            large < small,
+            "39 MiB of frames in memory, none in the file: {small} {large}"
+        );
+    }
+
+    #[test]
+    fn a_job_holds_at_most_a_third_of_its_limit() {
+        let held = |limit_mb| JobMemory {
+            limit_mb,
+            dataset_mb: 1000,
+        };
+        assert_eq!([0, 600, 9000].map(|limit| held(limit).held_mb()), [1000, 200, 1000]);
+    }
+
+    #[test]
+    fn a_huge_training_needs_more_than_a_usual_one() {
+        let dataset = frames(1000);
+        let usual = TrainConfig::layered("paper", None, &[]).unwrap();
+        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[fit]\nbatch_size = 4096\n";
+        let huge = TrainConfig::layered("paper", Some(huge), &[]).unwrap();
+        let (usual, huge) = (training_mb(&usual, &dataset, 1024), training_mb(&huge, &dataset, 1024));
+        assert!(usual < 2048 && huge > 4096, "{usual} {huge}");
+    }
+}

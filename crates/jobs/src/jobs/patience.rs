@@ -1,0 +1,186 @@
+//! Waits for a store that is away: a database that is being restarted, an object store that answers with errors, a file
+//! system that is full or read-only.
+
+use std::error::Error;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use tokio::runtime::Handle;
+use tracing::warn;
+
+use super::JobError;
+use super::report::JobReporter;
+use super::runner::JobFailure;
+use crate::store::StoreError;
+use crate::versions::VersionError;
+use foreframe_core::error_text;
+use foreframe_core::files::may_pass;
+use foreframe_data::dataset::DatasetError;
+use foreframe_data::dataset::import::ImportError;
+use foreframe_train::evaluation::EvaluationError;
+use foreframe_train::training::TrainError;
+
+/// How long a job waits for a store before it fails. It can be resumed.
+const LIMIT: Duration = Duration::from_hours(1);
+/// The pause between two tries.
+const PAUSE: Duration = Duration::from_secs(1);
+/// How often the job is asked during a pause whether it was cancelled.
+const POLL: Duration = Duration::from_millis(50);
+
+/// How long a job waits for another process, whose lease has expired, to unlock the directory.
+const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
+/// How often it tries.
+const BUSY_POLL: Duration = Duration::from_millis(200);
+
+/// An error that may come from a store that is away.
+pub(super) trait MayBeAway: Error {
+    /// Whether the store cannot be reached or written now, but may be later.
+    fn is_away(&self) -> bool;
+}
+
+impl MayBeAway for StoreError {
+    fn is_away(&self) -> bool {
+        self.is_unavailable()
+    }
+}
+
+impl MayBeAway for VersionError {
+    fn is_away(&self) -> bool {
+        matches!(self, Self::Store(error) if error.is_unavailable()) || may_pass(self)
+    }
+}
+
+impl MayBeAway for DatasetError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for ImportError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for TrainError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for EvaluationError {
+    fn is_away(&self) -> bool {
+        may_pass(self)
+    }
+}
+
+impl MayBeAway for JobError {
+    fn is_away(&self) -> bool {
+        self.is_unavailable()
+    }
+}
+
+/// How a running job asks the stores.
+pub(super) struct Patience<'a> {
+    pub(super) runtime: &'a Handle,
+    pub(super) report: &'a JobReporter,
+    pub(super) cancelled: &'a AtomicBool,
+}
+
+impl Patience<'_> {
+    /// Does the work again and again while the store is away. Errors: `Failed` after an hour or for any other reason, `Cancelled`.
+    pub(super) fn run<T, E: MayBeAway>(&self, mut work: impl AsyncFnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+        self.repeat(|| self.runtime.block_on(work()))
+    }
+
+    /// The same for work that blocks.
+    pub(super) fn repeat<T, E: MayBeAway>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+        let (began, mut is_told) = (Instant::now(), false);
+        loop {
+            let error = match work() {
+                Ok(done) => return Ok(done),
+                Err(error) => error,
+            };
+            let reason = error_text::with_causes(&error);
+            if !error.is_away() || began.elapsed() >= LIMIT {
+                return Err(JobFailure::Failed(reason));
+            }
+            if !is_told {
+                warn!(reason, "a job waits for the store");
+                self.report.line(format!("waiting for the store: {reason}"));
+                is_told = true;
+            }
+            let paused = Instant::now();
+            while paused.elapsed() < PAUSE {
+                if self.cancelled.load(Ordering::Acquire) {
+                    return Err(JobFailure::Cancelled);
+                }
+                std::thread::sleep(POLL);
+            }
+        }
+    }
+}
+
+/// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
+pub(super) fn retry_while_busy<T, E>(
+    mut work: impl FnMut() -> Result<T, E>,
+    is_busy: impl Fn(&E) -> bool,
+    cancelled: &AtomicBool,
+) -> Result<T, E> {
+    let began = Instant::now();
+    loop {
+        let done = work();
+        let may_wait = began.elapsed() < BUSY_TIMEOUT && !cancelled.load(Ordering::Acquire);
+        match done {
+            Err(error) if is_busy(&error) && may_wait => std::thread::sleep(BUSY_POLL),
+            done => return done,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::Lease;
+
+    fn away() -> StoreError {
+        StoreError::Io {
+            action: "write",
+            path: "x".into(),
+            source: std::io::ErrorKind::StorageFull.into(),
+        }
+    }
+
+    /// Does work that finds the store away `times` times.
+    fn tried(times: u32, other: Option<StoreError>, cancelled: bool) -> (Result<u32, JobFailure>, u32) {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let lease = Lease { number: 1, token: 1 };
+        let patience = Patience {
+            runtime: runtime.handle(),
+            report: &JobReporter::to_writer(lease, |_, _| Ok(())),
+            cancelled: &AtomicBool::new(cancelled),
+        };
+        let (mut tries, mut other) = (0, other);
+        let done = patience.run(async || {
+            tries += 1;
+            match other.take() {
+                Some(error) => Err(error),
+                None if tries <= times => Err(away()),
+                None => Ok(7),
+            }
+        });
+        (done, tries)
+    }
+
+    #[test]
+    fn a_job_waits_while_the_store_is_away_unless_cancelled() {
+        assert_eq!(tried(1, None, false), (Ok(7), 2));
+        assert_eq!(tried(9, None, true), (Err(JobFailure::Cancelled), 1));
+    }
+
+    #[test]
+    fn a_job_does_not_wait_after_other_errors() {
+        let (done, tries) = tried(0, Some(StoreError::NoTls), false);
+        assert!(matches!(done, Err(JobFailure::Failed(_))) && tries == 1);
+    }
+}

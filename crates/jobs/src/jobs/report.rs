@@ -1,0 +1,136 @@
+//! Receives the report of a running job: into a buffer, from which the runner writes it to the store, or as events to the
+//! parent process.
+
+use std::io::Write;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use metrics::gauge;
+use serde::{Deserialize, Serialize};
+
+use super::progress::ReportBuffer;
+use super::{Losses, unix_s};
+use crate::store::{Lease, LossRow, job_id};
+use foreframe_core::metric_names;
+
+/// A part of a job's report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum ReportEvent {
+    /// Units done, their total, and what the job is doing.
+    Progress(u64, u64, String),
+    /// A stage with units of another duration starts.
+    Stage,
+    /// The latest losses.
+    Losses(Losses),
+    /// A line for the log.
+    Line(String),
+    /// A point of the loss curves.
+    Point(LossRow),
+    /// Units that are saved.
+    Checkpoint(u64),
+}
+
+type WriteEvent = fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>;
+
+#[derive(Clone)]
+enum ReportTarget {
+    Buffer(Arc<Mutex<ReportBuffer>>),
+    Stdout(WriteEvent),
+}
+
+/// Receives the report of a running job.
+#[derive(Clone)]
+pub struct JobReporter {
+    target: ReportTarget,
+    lease: Lease,
+}
+
+impl JobReporter {
+    /// A reporter into a buffer.
+    pub(super) fn to_buffer(lease: Lease, buffer: ReportBuffer) -> Self {
+        let target = ReportTarget::Buffer(Arc::new(Mutex::new(buffer)));
+        Self { target, lease }
+    }
+
+    /// A reporter that writes each event to standard output.
+    pub(super) fn to_writer(lease: Lease, write: WriteEvent) -> Self {
+        let target = ReportTarget::Stdout(write);
+        Self { target, lease }
+    }
+
+    /// The buffer, if the report goes to one.
+    pub(super) fn buffer(&self) -> Option<MutexGuard<'_, ReportBuffer>> {
+        match &self.target {
+            ReportTarget::Buffer(buffer) => Some(buffer.lock().unwrap_or_else(PoisonError::into_inner)),
+            ReportTarget::Stdout(_) => None,
+        }
+    }
+
+    /// Adds an event to the report.
+    pub(super) fn apply(&self, event: ReportEvent) {
+        let Some(mut buffer) = self.buffer() else {
+            if let ReportTarget::Stdout(write) = &self.target {
+                // The parent has ended if this fails, and this process with it.
+                let _ = write(event, &mut std::io::stdout().lock());
+            }
+            return;
+        };
+        match event {
+            ReportEvent::Progress(done, total, message) => buffer.progress((done, total), &message, unix_s()),
+            ReportEvent::Stage => buffer.stage(),
+            ReportEvent::Losses(losses) => {
+                for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
+                    if let Some(loss) = loss {
+                        gauge!(metric_names::TRAINING_LOSS, "split" => split).set(loss);
+                    }
+                }
+                buffer.losses(losses);
+            }
+            ReportEvent::Line(line) => buffer.line(line, unix_s()),
+            ReportEvent::Point(point) => buffer.point(point),
+            ReportEvent::Checkpoint(units) => buffer.checkpoint(units),
+        }
+    }
+
+    /// The job's id.
+    #[must_use]
+    pub fn id(&self) -> String {
+        job_id(self.lease.number)
+    }
+
+    /// The lease of this attempt.
+    #[must_use]
+    pub fn lease(&self) -> Lease {
+        self.lease
+    }
+
+    /// Sets the units done, their total, and what the job is doing.
+    pub fn progress(&self, done: u64, total: u64, message: &str) {
+        self.apply(ReportEvent::Progress(done, total, message.to_owned()));
+    }
+
+    /// Restarts the rate measurement, because the units of a new stage take a different time.
+    pub fn stage(&self) {
+        self.apply(ReportEvent::Stage);
+    }
+
+    /// Sets the latest losses.
+    pub fn losses(&self, losses: Losses) {
+        self.apply(ReportEvent::Losses(losses));
+    }
+
+    /// Adds a line to the job's log.
+    pub fn line(&self, line: String) {
+        self.apply(ReportEvent::Line(line));
+    }
+
+    /// Adds a point to the loss curves.
+    pub fn point(&self, point: LossRow) {
+        self.apply(ReportEvent::Point(point));
+    }
+
+    /// Sets how many units are saved, so that a later attempt does not repeat them.
+    pub fn checkpoint(&self, units: u64) {
+        self.apply(ReportEvent::Checkpoint(units));
+    }
+}

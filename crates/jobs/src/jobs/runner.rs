@@ -1,0 +1,396 @@
+//! Claims jobs one after another. Runs each on its own threads, renews its lease, writes its reports, and records its
+//! outcome.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use futures_util::future::BoxFuture;
+use metrics::counter;
+use rayon::ThreadPool;
+use serde::{Deserialize, Serialize};
+use tokio::sync::{oneshot, watch};
+use tracing::{info, warn};
+
+use super::instance::Instance;
+use super::progress::{ReportBuffer, StoredProgress};
+use super::queue::JobsInner;
+use super::report::JobReporter;
+use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
+use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics, StoreError};
+use foreframe_core::metric_names;
+
+/// How often a job's report is written, unless the lease needs it more often.
+const WRITE_EVERY: Duration = Duration::from_millis(500);
+/// How often the store is asked for jobs that other processes submitted.
+const POLL_EVERY: Duration = Duration::from_secs(1);
+/// How often a runner that is asked to stop tries to write a job's outcome.
+const END_ATTEMPTS: u32 = 5;
+
+/// Why a job's work ended without a result.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JobFailure {
+    /// It was asked to stop, or its lease was lost.
+    Cancelled,
+    /// The work failed. One sentence says why.
+    Failed(String),
+    /// The job's process ended abnormally, so another attempt can succeed. One sentence says how.
+    Crashed(String),
+}
+
+/// The result of a job that succeeded.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct JobResult {
+    /// The result in the API.
+    pub result: serde_json::Value,
+    /// The name and version of a published model, and whether it becomes active if no version is.
+    pub published: Option<(String, u32, bool)>,
+    /// What an evaluation measured.
+    pub measured: Option<ModelMetrics>,
+}
+
+/// Does the work of jobs.
+pub trait JobExecutor: Send + Sync + 'static {
+    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading
+    /// data sets and models.
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
+
+    /// Does the work, or resumes it. Returns `Cancelled` soon after `cancelled` becomes true. Blocks.
+    fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
+}
+
+/// The threads for jobs, separate from those for predictions and with lower priority. Errors: `Threads`.
+pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .thread_name(|index| format!("jobs-{index}"))
+        .start_handler(|_| priority::lower())
+        .build()
+        .map_err(JobError::Threads)
+}
+
+pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: ThreadPool) {
+    let pool = Arc::new(pool);
+    let mut stop = shared.stop.subscribe();
+    // This process holds the lock of the id, so all leases under the id are of an earlier process that has ended.
+    if let Err(error) = shared.store.release_leases(&instance.id).await {
+        warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
+    }
+    while !*stop.borrow() {
+        match shared
+            .store
+            .claim(&instance.id, shared.limits.lease.as_secs_f64())
+            .await
+        {
+            Ok(Some((row, lease))) => Box::pin(JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone())).await,
+            Ok(None) => pause(&shared, &mut stop).await,
+            Err(error) => {
+                warn!(%error, "could not claim a job");
+                pause(&shared, &mut stop).await;
+            }
+        }
+    }
+}
+
+async fn pause(shared: &JobsInner, stop: &mut watch::Receiver<bool>) {
+    tokio::select! {
+        () = shared.wake.notified() => {}
+        () = tokio::time::sleep(POLL_EVERY) => {}
+        () = stop_requested(stop) => {}
+    }
+}
+
+async fn stop_requested(stop: &mut watch::Receiver<bool>) {
+    // The sender lives as long as the jobs' handle does.
+    let _ = stop.wait_for(|stop| *stop).await;
+}
+
+/// One attempt of a job.
+struct JobRun<'a> {
+    shared: &'a JobsInner,
+    report: JobReporter,
+    cancelled: Arc<AtomicBool>,
+    /// Whether the job was cancelled by request.
+    cancel_requested: bool,
+    lease_lost: bool,
+    /// How many attempts before this one ended abnormally without progress.
+    stalled_attempts: i64,
+    /// The units that were saved when this attempt started.
+    claimed_checkpoint: i64,
+    /// When the time limit is reached.
+    deadline: Option<Instant>,
+    /// The latest number of changes of the report, and when it was first seen.
+    latest_change: (u64, Instant),
+    /// Whether the work was stopped because it reported no progress.
+    has_stalled: bool,
+}
+
+/// Stops the work when its supervision ends, for whatever reason.
+impl Drop for JobRun<'_> {
+    fn drop(&mut self) {
+        self.cancelled.store(true, Ordering::Release);
+    }
+}
+
+impl<'a> JobRun<'a> {
+    fn new(shared: &'a JobsInner, row: &JobRow, lease: Lease) -> Self {
+        let stored: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
+        Self {
+            shared,
+            report: JobReporter::to_buffer(lease, ReportBuffer::new(stored)),
+            stalled_attempts: row.stalled_attempts,
+            claimed_checkpoint: row.checkpoint,
+            deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
+            latest_change: (0, Instant::now()),
+            has_stalled: false,
+            cancelled: Arc::new(AtomicBool::new(false)),
+            cancel_requested: row.cancelling,
+            lease_lost: false,
+        }
+    }
+
+    async fn run(mut self, row: &JobRow, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
+        let (id, stopping) = (self.report.id(), stop.clone());
+        info!(job.id = %id, job.attempt = row.token, "job started");
+        self.report.line(match row.token {
+            1 => "started".to_owned(),
+            attempt => format!("attempt {attempt}: resuming from the last checkpoint"),
+        });
+        let result = match Job::of(row) {
+            Ok(_) if self.cancel_requested => Err(JobFailure::Cancelled),
+            Ok(_) if self.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
+            Ok(job) => self.supervise(job.spec, pool, stop).await,
+            Err(error) => Err(JobFailure::Failed(error.to_string())),
+        };
+        if result == Err(JobFailure::Cancelled) && !self.cancel_requested {
+            // The job may have been cancelled since the last renewal.
+            self.renew().await;
+        }
+        if self.lease_lost {
+            warn!(job.id = %id, "the job's lease was lost; another worker continues it");
+            return;
+        }
+        let is_stopping = *stopping.borrow();
+        let result = match result {
+            Err(JobFailure::Cancelled) if !self.cancel_requested && self.is_over_time() && !is_stopping => {
+                let limit_s = self.shared.limits.time_limit.unwrap_or_default().as_secs();
+                Err(JobFailure::Failed(format!(
+                    "the attempt reached the time limit of {limit_s} s (setting job_time_limit_s); a resumed job continues \
+                     from its last checkpoint"
+                )))
+            }
+            Err(JobFailure::Cancelled) if !self.cancel_requested && self.has_stalled && !is_stopping => {
+                let limit_s = self.shared.limits.stall_limit.unwrap_or_default().as_secs();
+                self.check_attempts(Err(JobFailure::Crashed(format!(
+                    "the job reported no progress for {limit_s} s (setting job_stall_limit_s)"
+                ))))
+            }
+            result => self.check_attempts(result),
+        };
+        Box::pin(self.end(&row.kind, result)).await;
+    }
+
+    /// Runs the work on its own thread, and writes its report until the work returns.
+    async fn supervise(
+        &mut self,
+        spec: JobSpec,
+        pool: &Arc<ThreadPool>,
+        mut stop: watch::Receiver<bool>,
+    ) -> Result<JobResult, JobFailure> {
+        let (sender, mut result) = oneshot::channel();
+        let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
+        let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
+        let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
+            priority::lower();
+            let result = pool.install(|| execute.execute(&spec, &report, &cancelled));
+            // The receiver is gone if the runner has stopped.
+            let _ = sender.send(result);
+        });
+        if let Err(error) = thread {
+            return Err(JobFailure::Failed(format!("could not start a thread: {error}")));
+        }
+        let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut is_stopping = false;
+        loop {
+            tokio::select! {
+                result = &mut result => {
+                    let panicked = || JobFailure::Failed("the job panicked; the server's log says why".to_owned());
+                    return result.unwrap_or_else(|_| Err(panicked()));
+                }
+                () = stop_requested(&mut stop), if !is_stopping => {
+                    is_stopping = true;
+                    self.cancelled.store(true, Ordering::Release);
+                    // If the process ends before the work has stopped, that is no failure of the job.
+                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                        warn!(%error, "could not mark an attempt as stopped");
+                    }
+                }
+                _ = ticks.tick() => {
+                    self.renew().await;
+                    self.check_deadline();
+                    self.check_stall();
+                }
+            }
+        }
+    }
+
+    /// Renews the lease and writes the report since the last call.
+    async fn renew(&mut self) {
+        let report = self.take_report();
+        let (lines, losses) = (report.lines.clone(), report.losses.clone());
+        let lease_s = self.shared.limits.lease.as_secs_f64();
+        match self.shared.store.renew(self.report.lease(), lease_s, report).await {
+            Ok(Some(cancelling)) => self.cancel_requested |= cancelling,
+            Ok(None) => self.lease_lost = true,
+            Err(error) => {
+                warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
+                if let Some(mut buffer) = self.report.buffer() {
+                    buffer.restore_unwritten(lines, losses);
+                }
+            }
+        }
+        if self.cancel_requested || self.lease_lost {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    fn take_report(&self) -> JobReport {
+        let max_lines = self.shared.limits.log_lines as i64;
+        let Some(mut buffer) = self.report.buffer() else {
+            return JobReport::default();
+        };
+        let (lines, losses) = buffer.drain();
+        JobReport {
+            // Two structs of numbers and strings always serialize.
+            progress: serde_json::to_string(buffer.stored()).unwrap_or_default(),
+            lines,
+            losses,
+            max_lines,
+            checkpoint: buffer.saved() as i64,
+        }
+    }
+
+    fn max_attempts(&self) -> i64 {
+        i64::from(self.shared.limits.max_attempts)
+    }
+
+    fn give_up(&self, how: &str) -> JobFailure {
+        JobFailure::Failed(format!(
+            "{} attempts in a row ended without progress (setting job_max_attempts); the last one: {how}",
+            self.max_attempts()
+        ))
+    }
+
+    /// Turns a crash into a failure if too many attempts in a row made no progress.
+    fn check_attempts(&self, result: Result<JobResult, JobFailure>) -> Result<JobResult, JobFailure> {
+        let Err(JobFailure::Crashed(reason)) = &result else {
+            return result;
+        };
+        let saved = self.report.buffer().map_or(0, |buffer| buffer.saved() as i64);
+        let is_stalled = saved <= self.claimed_checkpoint;
+        if is_stalled && self.stalled_attempts + 1 >= self.max_attempts() {
+            return Err(self.give_up(reason));
+        }
+        result
+    }
+
+    /// Stops the work when the time limit is reached.
+    fn check_deadline(&self) {
+        if self.is_over_time() {
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    /// Stops the work when it has reported no progress for too long.
+    fn check_stall(&mut self) {
+        let changes = self.report.buffer().map_or(0, |buffer| buffer.changes());
+        if changes != self.latest_change.0 {
+            self.latest_change = (changes, Instant::now());
+        }
+        let limit = self.shared.limits.stall_limit;
+        if limit.is_some_and(|limit| self.latest_change.1.elapsed() >= limit) {
+            self.has_stalled = true;
+            self.cancelled.store(true, Ordering::Release);
+        }
+    }
+
+    fn is_over_time(&self) -> bool {
+        self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
+    }
+
+    async fn end(&self, kind: &str, result: Result<JobResult, JobFailure>) {
+        let id = self.report.id();
+        let crash = match &result {
+            Err(JobFailure::Crashed(reason)) => Some(reason.clone()),
+            _ => None,
+        };
+        let (event, error, outcome) = match result {
+            Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
+            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) if self.cancel_requested => {
+                (JobTransition::Cancel, None, None)
+            }
+            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) => (JobTransition::Release, None, None),
+            Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
+        };
+        // All of these transitions are legal for a running job.
+        let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
+        let outcome_name = if state.is_final() { state.name() } else { "released" };
+        counter!(metric_names::JOBS_ENDED, "kind" => kind.to_owned(), "outcome" => outcome_name).increment(1);
+        match &error {
+            None => info!(job.id = %id, job.outcome = ?event, "job ended"),
+            Some(reason) => warn!(job.id = %id, reason, "job failed"),
+        }
+        if let Some(reason) = &crash {
+            warn!(job.id = %id, reason, "an attempt of a job crashed");
+        }
+        self.report.line(match &error {
+            None if state == JobState::Queued && crash.is_some() => {
+                format!("the attempt crashed: {}", crash.as_deref().unwrap_or_default())
+            }
+            None if state == JobState::Queued => "stopped with the server; the next attempt resumes it".to_owned(),
+            None => state.name().to_owned(),
+            Some(reason) => format!("failed: {reason}"),
+        });
+        let outcome = JobOutcome {
+            state: state.name(),
+            error,
+            outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
+            // Set when it is written, by the database's clock.
+            ended_s: state.is_final().then_some(0.0),
+            published: outcome.as_ref().and_then(|outcome| outcome.published.clone()),
+            measured: outcome.and_then(|outcome| outcome.measured),
+            crashed: crash.is_some(),
+        };
+        self.write_outcome(&id, outcome).await;
+        self.shared.ended.notify_one();
+    }
+
+    /// Writes the outcome. While the database is away, tries until it is back: nothing else can be claimed meanwhile.
+    async fn write_outcome(&self, id: &str, outcome: JobOutcome) {
+        let (report, stop) = (self.take_report(), self.shared.stop.subscribe());
+        let mut attempt = 0;
+        loop {
+            attempt += 1;
+            match self.try_to_end(outcome.clone(), report.clone()).await {
+                Ok(true) => return self.shared.forget_oldest().await,
+                Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),
+                Err(error) => warn!(job.id = %id, %error, attempt, "could not write a job's outcome"),
+            }
+            if *stop.borrow() && attempt >= END_ATTEMPTS {
+                return;
+            }
+            tokio::time::sleep(POLL_EVERY).await;
+        }
+    }
+
+    /// Returns false if the lease was lost.
+    async fn try_to_end(&self, mut outcome: JobOutcome, report: JobReport) -> Result<bool, StoreError> {
+        let store = &self.shared.store;
+        if let Some(ended_s) = &mut outcome.ended_s {
+            *ended_s = store.now_s().await?;
+        }
+        store.end(self.report.lease(), outcome, report).await
+    }
+}

@@ -1,0 +1,376 @@
+//! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
+
+mod import;
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+pub use self::import::ImportSpec;
+use super::JobError;
+use foreframe_core::error_text;
+use foreframe_core::registry;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
+use foreframe_sim::Scenario;
+use foreframe_train::evaluation::EvaluateConfig;
+use foreframe_train::training::{TrainConfig, TrainError};
+
+/// The maximum number of trials of one collection.
+pub const MAX_TRIALS: u64 = 1_000_000;
+
+/// The maximum number of windows of each test set of an evaluation.
+pub const MAX_WINDOWS: usize = 100_000;
+/// The maximum number of bootstrap resamples of an evaluation.
+pub const MAX_RESAMPLES: usize = 10_000;
+
+/// What a job does.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum JobSpec {
+    /// Collect a data set from the simulator.
+    Collect(CollectSpec),
+    /// Turn a recording on the server into a data set.
+    Import(ImportSpec),
+    /// Train a model on a data set.
+    Train(TrainSpec),
+    /// Measure a model on the held-out trials of a data set.
+    Evaluate(EvaluateSpec),
+}
+
+/// A collection: writes the data set `name`. A cancelled collection continues where it stopped when it is resumed, or when
+/// the same collection is submitted again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CollectSpec {
+    /// The data set's name: a to z, 0 to 9 and `-`, at most 64 characters.
+    #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: String,
+    /// `static-observer`, `moving-observer` or `crowded`.
+    pub scenario: String,
+    /// Trials, 1 to 1,000,000.
+    #[schema(minimum = 1, maximum = 1_000_000)]
+    pub trials: u64,
+    /// The random seed.
+    #[serde(default = "default_seed")]
+    #[schema(default = 1)]
+    pub seed: u64,
+}
+
+/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TrainSpec {
+    /// The model's name: a to z, 0 to 9 and `-`, at most 64 characters.
+    #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: String,
+    /// `paper`, `static` or `moving`.
+    pub preset: String,
+    /// Name of a data set in the data directory.
+    pub dataset: String,
+    /// Settings that replace those of the preset.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    #[schema(value_type = Object)]
+    pub settings: serde_json::Map<String, serde_json::Value>,
+}
+
+/// An evaluation: writes a report with figures, which the job's files contain.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluateSpec {
+    /// The model's name.
+    pub model: String,
+    /// Its version; the active one by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub version: Option<u32>,
+    /// Name of a data set in the data directory.
+    pub dataset: String,
+    /// A model of the same size without conditioning. The report then shows what the actions are worth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub twin: Option<String>,
+    /// The maximum number of windows of each test set, 1 to 100,000.
+    #[serde(default = "default_windows")]
+    #[schema(minimum = 1, maximum = 100_000)]
+    pub windows: usize,
+    /// Bootstrap resamples for the intervals, 100 to 10,000.
+    #[serde(default = "default_resamples")]
+    #[schema(minimum = 100, maximum = 10_000)]
+    pub resamples: usize,
+    /// The random seed of the resamples and of the shuffled actions.
+    #[serde(default)]
+    pub seed: u64,
+}
+
+fn default_seed() -> u64 {
+    1
+}
+
+fn default_windows() -> usize {
+    EvaluateConfig::default().max_windows
+}
+
+fn default_resamples() -> usize {
+    EvaluateConfig::default().bootstrap_samples
+}
+
+/// The data sets and models that jobs can use.
+#[derive(Clone, Copy, Debug)]
+pub struct AvailableInputs<'a> {
+    /// The data directory.
+    pub data_dir: &'a Path,
+    /// The directory that imports may read; without one, they are off.
+    pub import_dir: Option<&'a Path>,
+    /// The finished data sets.
+    pub datasets: &'a [String],
+    /// The versions of each model.
+    pub models: &'a BTreeMap<String, Vec<u32>>,
+}
+
+impl JobSpec {
+    /// All kinds.
+    pub const KINDS: [&'static str; 4] = ["collect", "import", "train", "evaluate"];
+
+    /// Its kind.
+    #[must_use]
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Collect(_) => "collect",
+            Self::Import(_) => "import",
+            Self::Train(_) => "train",
+            Self::Evaluate(_) => "evaluate",
+        }
+    }
+
+    /// Kind and name of the output, if only one job at a time can make it. Versions and reports have unique names.
+    #[must_use]
+    pub fn exclusive_output(&self) -> Option<(&'static str, &str)> {
+        match self {
+            Self::Collect(spec) => Some(("data set", &spec.name)),
+            Self::Import(spec) => Some(("data set", &spec.name)),
+            Self::Train(_) | Self::Evaluate(_) => None,
+        }
+    }
+
+    /// The data set that it writes or reads.
+    #[must_use]
+    pub fn dataset(&self) -> &str {
+        match self {
+            Self::Collect(spec) => &spec.name,
+            Self::Import(spec) => &spec.name,
+            Self::Train(spec) => &spec.dataset,
+            Self::Evaluate(spec) => &spec.dataset,
+        }
+    }
+
+    /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
+    /// `Taken`, `Occupied`, `Dataset`.
+    pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        match self {
+            Self::Collect(spec) => spec.check(available),
+            Self::Import(spec) => spec.check(available),
+            Self::Train(spec) => spec.check(available.datasets),
+            Self::Evaluate(spec) => spec.check(available),
+        }
+    }
+}
+
+impl EvaluateSpec {
+    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        check_dataset(&self.dataset, available.datasets)?;
+        check_model("model", &self.model, available.models)?;
+        if let Some(twin) = &self.twin {
+            check_model("twin", twin, available.models)?;
+        }
+        let versions = available.models.get(&self.model).map_or(&[][..], Vec::as_slice);
+        if let Some(version) = self.version.filter(|version| !versions.contains(version)) {
+            return Err(JobError::NotFound {
+                field: "version",
+                kind: "version",
+                name: version.to_string(),
+                available: versions.iter().map(u32::to_string).collect(),
+            });
+        }
+        check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
+        check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
+    }
+}
+
+impl CollectSpec {
+    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        check_name("name", &self.name)?;
+        if !(1..=MAX_TRIALS).contains(&self.trials) {
+            return Err(JobError::Invalid {
+                field: "trials",
+                reason: format!(
+                    "{} is out of range; 1 to {MAX_TRIALS} trials can be collected",
+                    self.trials
+                ),
+            });
+        }
+        let config = self.config(&available.data_dir.join("datasets"))?;
+        let is_there = available.datasets.contains(&self.name);
+        // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
+        if !is_there && dataset::is_finished(&config.out) {
+            return Ok(());
+        }
+        match CollectionStatus::of(&config) {
+            Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
+            Ok(_) => Err(JobError::Taken {
+                kind: "data set",
+                name: self.name.clone(),
+                why: "exists",
+            }),
+            Err(DatasetError::OutExists { .. }) => {
+                Err(self.occupied("cannot be written because other files are in its directory; move them".to_owned()))
+            }
+            Err(DatasetError::OtherArguments { differences, .. }) => Err(self.occupied(format!(
+                "was started with other arguments ({differences}); use those to continue it"
+            ))),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn occupied(&self, why: String) -> JobError {
+        let name = self.name.clone();
+        JobError::Occupied { name, why }
+    }
+
+    /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
+    pub(super) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
+        let out = datasets.join(&self.name);
+        Ok(CollectConfig::new(self.scenario()?, self.trials, Seed(self.seed), &out))
+    }
+
+    /// The scenario. Errors: `Invalid`, which names the scenarios.
+    fn scenario(&self) -> Result<Scenario, JobError> {
+        self.scenario
+            .parse()
+            .map_err(|error: <Scenario as std::str::FromStr>::Err| JobError::Invalid {
+                field: "scenario",
+                reason: error.to_string(),
+            })
+    }
+}
+
+impl TrainSpec {
+    fn check(&self, datasets: &[String]) -> Result<(), JobError> {
+        check_name("name", &self.name)?;
+        self.config()?;
+        check_dataset(&self.dataset, datasets)
+    }
+
+    /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
+    pub(super) fn config(&self) -> Result<TrainConfig, JobError> {
+        let settings = |reason: String| JobError::Invalid {
+            field: "settings",
+            reason,
+        };
+        let text = toml::to_string(&self.settings).map_err(|error| {
+            settings(format!(
+                "{error}; a setting is a number, a string, true or false, not null"
+            ))
+        })?;
+        let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
+        let config = layered.map_err(|error| match error {
+            TrainError::UnknownPreset(_) => JobError::Invalid {
+                field: "preset",
+                reason: error.to_string(),
+            },
+            other => settings(error_text::with_causes(&other)),
+        })?;
+        Ok(TrainConfig {
+            name: self.name.clone(),
+            ..config
+        })
+    }
+}
+
+/// Names become directories. Only small letters, digits and `-` are allowed, so no name can leave the data directory.
+fn check_name(field: &'static str, name: &str) -> Result<(), JobError> {
+    if registry::is_valid_name(name) {
+        return Ok(());
+    }
+    Err(JobError::Invalid {
+        field,
+        reason: format!(
+            "\"{}\" is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -",
+            name.escape_default()
+        ),
+    })
+}
+
+fn check_dataset(name: &str, available: &[String]) -> Result<(), JobError> {
+    check_name("dataset", name)?;
+    check_exists("dataset", "data set", name, available.iter())
+}
+
+fn check_model(field: &'static str, name: &str, available: &BTreeMap<String, Vec<u32>>) -> Result<(), JobError> {
+    check_name(field, name)?;
+    check_exists(field, "model", name, available.keys())
+}
+
+fn check_exists<'a>(
+    field: &'static str,
+    kind: &'static str,
+    name: &str,
+    mut available: impl Iterator<Item = &'a String> + Clone,
+) -> Result<(), JobError> {
+    let all = available.clone();
+    if available.any(|other| other == name) {
+        return Ok(());
+    }
+    Err(JobError::NotFound {
+        field,
+        kind,
+        name: name.to_owned(),
+        available: all.cloned().collect(),
+    })
+}
+
+fn check_range(field: &'static str, value: usize, range: RangeInclusive<usize>) -> Result<(), JobError> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    Err(JobError::Invalid {
+        field,
+        reason: format!(
+            "{value} is out of range; it must be {} to {}",
+            range.start(),
+            range.end()
+        ),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_name_can_leave_the_data_directory() {
+        for name in ["", "..", "../x", "a/b", "A", "-a", "a b", &"a".repeat(65), "ä"] {
+            assert!(check_name("name", name).is_err(), "{name}");
+        }
+        assert!(check_name("name", "a-1").is_ok());
+    }
+
+    #[test]
+    fn an_unknown_field_of_a_job_is_refused() {
+        let text = r#"{"kind":"collect","name":"a","scenario":"crowded","trials":1,"colour":"red"}"#;
+        let error = serde_json::from_str::<JobSpec>(text).unwrap_err().to_string();
+        assert!(error.contains("unknown field `colour`"), "{error}");
+    }
+
+    #[test]
+    fn an_unknown_preset_is_refused_with_the_available_ones() {
+        let spec = TrainSpec {
+            name: "a".to_owned(),
+            preset: "papr".to_owned(),
+            dataset: "d".to_owned(),
+            settings: serde_json::Map::new(),
+        };
+        let error = spec.check(&[]).unwrap_err().to_string();
+        assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
+    }
+}

@@ -1,0 +1,428 @@
+//! The versions of the models: shipped ones in the models' directory, and those that trainings published, in
+//! `models/NAME/VERSION` below the data directory. The store knows which versions are published and which are active.
+
+mod publish;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use metrics::counter;
+use tokio::sync::Mutex;
+use tracing::{info, warn};
+
+use crate::store::{Author, Lease, Store, StoreError, unix_s};
+use foreframe_core::error_text;
+use foreframe_core::files::write_atomically;
+use foreframe_core::metric_names;
+use foreframe_core::registry::{self, LoadedModel, Manifest, RegistryError};
+use foreframe_core::serving::{Predictor, ServingError};
+
+/// Why a version could not be loaded, published, activated or deleted.
+#[derive(Debug, thiserror::Error)]
+pub enum VersionError {
+    /// There is no such model or version.
+    #[error(
+        "there is no version {version} of model \"{model}\"; there are: {}",
+        numbers(available)
+    )]
+    Unknown {
+        /// The model's name.
+        model: String,
+        /// The requested version.
+        version: u32,
+        /// The existing versions.
+        available: Vec<u32>,
+    },
+    /// It is active.
+    #[error("version {version} of model \"{model}\" is active; activate another before deleting it")]
+    Active {
+        /// The model's name.
+        model: String,
+        /// The version.
+        version: u32,
+    },
+    /// It is a shipped version.
+    #[error(
+        "version {version} of model \"{model}\" was not published: it lies in the models directory; delete its directory there"
+    )]
+    Shipped {
+        /// The model's name.
+        model: String,
+        /// The version.
+        version: u32,
+    },
+    /// Its files are not valid. The active version stays active.
+    #[error("version {version} of model \"{model}\" is refused: {reason}")]
+    Refused {
+        /// The model's name.
+        model: String,
+        /// The version.
+        version: u32,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Its files could not be written.
+    #[error(transparent)]
+    Registry(#[from] RegistryError),
+    /// A file could not be read or written.
+    #[error("could not {action} {}: {source}", path.display())]
+    Io {
+        /// `read`, `write`, …
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The predictor has stopped.
+    #[error(transparent)]
+    Serving(ServingError),
+}
+
+impl VersionError {
+    /// Whether the store is away, so that the same request may succeed later.
+    #[must_use]
+    pub fn is_unavailable(&self) -> bool {
+        matches!(self, Self::Store(store) if store.is_unavailable())
+    }
+}
+
+fn numbers(available: &[u32]) -> String {
+    let available: Vec<String> = available.iter().map(u32::to_string).collect();
+    if available.is_empty() {
+        "none".to_owned()
+    } else {
+        available.join(", ")
+    }
+}
+
+/// All versions of all models. Clones share their state.
+#[derive(Clone)]
+pub struct Versions {
+    store: Store,
+    shipped_dir: PathBuf,
+    /// Held while the active version of a model changes.
+    switching: Arc<Mutex<()>>,
+}
+
+impl Versions {
+    /// The versions in the store and the models shipped in a directory.
+    #[must_use]
+    pub fn new(store: Store, shipped_dir: &Path) -> Self {
+        Self {
+            store,
+            shipped_dir: shipped_dir.to_owned(),
+            switching: Arc::default(),
+        }
+    }
+
+    /// The shipped version of a model, if there is one.
+    #[must_use]
+    pub fn shipped(&self, model: &str) -> Option<u32> {
+        let dir = registry::find(&self.shipped_dir, model).ok()?;
+        registry::manifest::read(&dir).ok().map(|manifest| manifest.version)
+    }
+
+    /// All versions by model, in rising order. Errors: `Registry`, `Store`.
+    pub async fn all(&self) -> Result<BTreeMap<String, Vec<u32>>, VersionError> {
+        let mut all = BTreeMap::<String, BTreeSet<u32>>::new();
+        for (model, _) in registry::list(&self.shipped_dir)? {
+            all.entry(model.clone()).or_default().extend(self.shipped(&model));
+        }
+        for row in self.store.published_versions().await? {
+            all.entry(row.model).or_default().insert(row.version);
+        }
+        let sorted = |(model, versions): (String, BTreeSet<u32>)| (model, versions.into_iter().collect());
+        Ok(all.into_iter().map(sorted).collect())
+    }
+
+    /// The versions of a model, in rising order. Errors: `Registry`, `Store`.
+    pub async fn of(&self, model: &str) -> Result<Vec<u32>, VersionError> {
+        Ok(self.all().await?.remove(model).unwrap_or_default())
+    }
+
+    /// The metrics of a model: the latest that an evaluation job measured with these weights, else those of the manifest.
+    /// Errors: `Store`.
+    pub async fn metrics(&self, manifest: &Manifest) -> Result<serde_json::Value, VersionError> {
+        let measured = self.store.model_metrics().await?.into_iter().find(|measured| {
+            (measured.model.as_str(), measured.version) == (manifest.name.as_str(), manifest.version)
+                && measured.weights_sha256 == manifest.weights_sha256
+        });
+        let parsed = measured.and_then(|measured| serde_json::from_str(&measured.metrics).ok());
+        Ok(parsed.unwrap_or_else(|| manifest.metrics.clone()))
+    }
+
+    /// Deletes what is left of versions whose deletion was interrupted, for example by `kill -9`. Failures are logged.
+    async fn sweep(&self) -> Result<(), StoreError> {
+        let mut deleted = BTreeMap::<String, Vec<String>>::new();
+        for (model, version) in self.store.deleted_versions().await? {
+            deleted.entry(model).or_default().push(version.to_string());
+        }
+        for (model, versions) in deleted {
+            if let Err(error) = self.store.objects().sweep(&format!("models/{model}"), &versions).await {
+                warn!(model, %error, "could not delete what is left of deleted versions");
+            }
+        }
+        Ok(())
+    }
+
+    /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions
+    /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
+    pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
+        self.sweep().await?;
+        let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
+        for path in registry::misnamed(&self.shipped_dir)? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            warn!(directory = %path.display(), error = %RegistryError::Name(name), "a model is not loaded");
+        }
+        let mut serving = Vec::new();
+        for (model, mut versions) in self.all().await? {
+            if versions.is_empty() {
+                warn!(model, "the model's manifest cannot be read");
+            }
+            // The active one, then the shipped one, then the newest.
+            versions.reverse();
+            let shipped = self.shipped(&model);
+            versions.sort_by_key(|&version| (active.get(&model) != Some(&version), shipped != Some(version)));
+            for version in versions {
+                match count_load(self.load(&model, version).await) {
+                    Ok(loaded) => {
+                        serving.push(loaded);
+                        break;
+                    }
+                    Err(error) => warn!(model, version, %error, "a version was not loaded"),
+                }
+            }
+        }
+        Ok(serving)
+    }
+
+    /// Loads the active version, else the shipped one, else the newest. Errors: `Unknown`, `Refused`, `Store`.
+    pub async fn load_active(&self, model: &str) -> Result<LoadedModel, VersionError> {
+        let version = self.active(model).await?.unwrap_or_default();
+        self.load(model, version).await
+    }
+
+    /// Loads a version after checking its hash and shapes. Fetches it into the data directory if necessary.
+    /// Errors: `Unknown`, `Refused`, `Store`.
+    pub async fn load(&self, model: &str, version: u32) -> Result<LoadedModel, VersionError> {
+        let dir = self.directory(model, version).await?;
+        let refused = |reason: String| VersionError::Refused {
+            model: model.to_owned(),
+            version,
+            reason,
+        };
+        let name = model.to_owned();
+        let is_shipped = self.shipped(model) == Some(version);
+        // The name of a shipped model is that of its directory.
+        let load = move || {
+            if is_shipped {
+                registry::load_as(&dir, &name)
+            } else {
+                registry::load(&dir)
+            }
+        };
+        let loaded = tokio::task::spawn_blocking(load).await;
+        let loaded = loaded
+            .map_err(|error| refused(error.to_string()))?
+            .map_err(|error| refused(error_text::with_causes(&error)))?;
+        let Manifest {
+            name, version: found, ..
+        } = &*loaded.manifest;
+        if (name.as_str(), *found) != (model, version) {
+            return Err(refused(format!("its manifest is of version {found} of \"{name}\"")));
+        }
+        Ok(loaded)
+    }
+
+    /// The directory of a version, fetched into the data directory if it is not there. Errors: `Unknown`, `Store`.
+    pub async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
+        let available = self.of(model).await?;
+        if !available.contains(&version) {
+            return Err(VersionError::Unknown {
+                model: model.to_owned(),
+                version,
+                available,
+            });
+        }
+        if self.shipped(model) == Some(version) {
+            return Ok(registry::find(&self.shipped_dir, model)?);
+        }
+        let objects = self.store.objects();
+        let dir = objects.data_dir().join(key(model, version));
+        if !dir.join(registry::MANIFEST_FILE).is_file() {
+            objects.pull(&key(model, version), registry::MANIFEST_FILE).await?;
+        }
+        Ok(dir)
+    }
+
+    /// Writes a trained model as its job's version. Returns the version and whether the model was not shipped. The version is
+    /// published when the job's outcome is written. `None` if the lease is lost. Errors: `Registry`, `Io`, `Store`.
+    pub async fn write(
+        &self,
+        lease: Lease,
+        model: &str,
+        trained_dir: &Path,
+    ) -> Result<Option<(u32, bool)>, VersionError> {
+        let shipped = self.shipped(model);
+        let reserved = self.store.reserve_version(lease, model, shipped.unwrap_or(0)).await?;
+        let Some(version) = reserved else { return Ok(None) };
+        self.write_files(model, version, trained_dir).await?;
+        Ok(Some((version, shipped.is_none())))
+    }
+
+    /// The version that serves, or else the one that would: the chosen one, the shipped one, the newest.
+    /// Errors: `Registry`, `Store`.
+    pub async fn active(&self, model: &str) -> Result<Option<u32>, VersionError> {
+        let active = self.store.active_versions().await?;
+        let chosen = active.into_iter().find(|(name, _)| name == model);
+        match chosen.map(|(_, version)| version).or_else(|| self.shipped(model)) {
+            Some(version) => Ok(Some(version)),
+            None => Ok(self.of(model).await?.last().copied()),
+        }
+    }
+
+    /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Io`, `Store`.
+    async fn write_files(&self, model: &str, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
+        let objects = self.store.objects();
+        let dir = objects.data_dir().join(key(model, version));
+        let failed = |action, path: &Path| {
+            let path = path.to_owned();
+            move |source| VersionError::Io { action, path, source }
+        };
+        std::fs::create_dir_all(&dir).map_err(failed("make", &dir))?;
+        let (from, to) = (
+            trained_dir.join(registry::WEIGHTS_FILE),
+            dir.join(registry::WEIGHTS_FILE),
+        );
+        let weights = std::fs::read(&from).map_err(failed("read", &from))?;
+        write_atomically(&to, &weights).map_err(failed("write", &to))?;
+        let manifest = Manifest {
+            name: model.to_owned(),
+            version,
+            ..registry::manifest::read(trained_dir)?
+        };
+        registry::write_manifest(&dir, &manifest)?;
+        registry::load(&dir)?;
+        Ok(objects.push(&key(model, version), registry::MANIFEST_FILE).await?)
+    }
+
+    /// Makes a version active: here at once, on other servers of the store soon, and after a restart. Open streams keep
+    /// their version. A refused version changes nothing. Errors: `Unknown`, `Refused`, `Serving`, `Store`.
+    pub async fn activate(
+        &self,
+        predictor: &Predictor,
+        model: &str,
+        version: u32,
+        by: &Author,
+    ) -> Result<(), VersionError> {
+        let _switching = self.switching.lock().await;
+        let before = predictor.model(model).map(|manifest| manifest.version);
+        count_load(self.load_model(predictor, model, version).await)?;
+        if let Err(error) = self.store.set_active(model, version, unix_s(), by).await {
+            if let Ok(before) = before {
+                self.load_model(predictor, model, before).await?;
+            }
+            return Err(error.into());
+        }
+        info!(model, version, "version activated");
+        Ok(())
+    }
+
+    /// Deletes a published version. Errors: `Unknown`, `Active`, `Shipped`, `Store`.
+    pub async fn delete(
+        &self,
+        predictor: &Predictor,
+        model: &str,
+        version: u32,
+        by: &Author,
+    ) -> Result<(), VersionError> {
+        let _switching = self.switching.lock().await;
+        let (model_name, available) = (model.to_owned(), self.of(model).await?);
+        let serves = predictor.model(model).is_ok_and(|manifest| manifest.version == version);
+        if !available.contains(&version) {
+            return Err(VersionError::Unknown {
+                model: model_name,
+                version,
+                available,
+            });
+        }
+        if self.shipped(model) == Some(version) {
+            return Err(VersionError::Shipped {
+                model: model_name,
+                version,
+            });
+        }
+        if serves || !self.store.delete_version(model, version, unix_s(), by).await? {
+            return Err(VersionError::Active {
+                model: model_name,
+                version,
+            });
+        }
+        self.store.objects().delete(&key(model, version)).await?;
+        Ok(())
+    }
+
+    /// Loads versions that other servers activated. A refused version is logged and added to `refused`, so that it is not
+    /// tried again; a version that could not be read is tried again at the next call. Errors: `Registry`, `Store`.
+    pub async fn load_activated(
+        &self,
+        predictor: &Predictor,
+        refused: &mut BTreeSet<(String, u32)>,
+    ) -> Result<(), VersionError> {
+        let _switching = self.switching.lock().await;
+        for (model, version) in self.store.active_versions().await? {
+            let serves = predictor
+                .model(&model)
+                .is_ok_and(|manifest| manifest.version == version);
+            if serves || refused.contains(&(model.clone(), version)) {
+                continue;
+            }
+            match count_load(self.load_model(predictor, &model, version).await) {
+                Ok(()) => info!(model, version, "version loaded"),
+                Err(error) => {
+                    warn!(model, version, %error, "a version was not loaded");
+                    if let VersionError::Refused { .. } = error {
+                        refused.insert((model, version));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Loads a version into the predictor.
+    async fn load_model(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+        let loaded = self.load(model, version).await?;
+        let predictor = predictor.clone();
+        let result = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
+        match result.unwrap_or(Err(ServingError::Stopped)) {
+            Ok(()) => Ok(()),
+            Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
+            Err(error) => Err(VersionError::Refused {
+                model: model.to_owned(),
+                version,
+                reason: error_text::with_causes(&error),
+            }),
+        }
+    }
+}
+
+fn key(model: &str, version: u32) -> String {
+    format!("models/{model}/{version}")
+}
+
+/// Counts the load of a version, unless it failed for a reason outside the version.
+fn count_load<T>(loaded: Result<T, VersionError>) -> Result<T, VersionError> {
+    let outcome = match &loaded {
+        Ok(_) => "ok",
+        Err(VersionError::Refused { .. }) => "refused",
+        Err(_) => return loaded,
+    };
+    counter!(metric_names::MODEL_LOADS, "outcome" => outcome).increment(1);
+    loaded
+}

@@ -1,0 +1,256 @@
+//! Tb1's pinhole camera. It casts rays with parry's `RayCast`, shades the points that they hit (Lambert and distance), casts
+//! more rays at edges, and makes the segmentation mask.
+
+use std::sync::LazyLock;
+
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use rapier3d::parry::query::{Ray, RayCast};
+use rapier3d::parry::shape::Cuboid;
+use rapier3d::prelude::Vector;
+
+use super::ray_cast::UprightCylinder;
+use super::rendered_robot::{NearestHit, RenderedRobot, RobotView, face};
+use super::{Look, PlanarPose, SimError, WorldConfig, arena};
+use foreframe_core::frame::Frame;
+
+/// A pixel at an edge is the mean of a square grid of rays with this many rays on each side.
+const EDGE_RAYS: usize = 3;
+/// Neighbouring pixels whose gray values differ by more than this are an edge, also if they show the same surface.
+const EDGE_STEP: f32 = 0.06;
+/// Share of ambient light.
+const AMBIENT: f32 = 0.6;
+/// Direction to the light source.
+static LIGHT: LazyLock<Vector> = LazyLock::new(|| Vector::new(-0.45, 0.35, 0.82).normalize());
+
+/// The result of one ray.
+#[derive(Clone, Copy)]
+struct RaySample {
+    gray: f32,
+    /// Identifies one face of one solid.
+    surface: u16,
+    /// Id in the segmentation mask.
+    robot_id: u8,
+}
+
+/// A pinhole camera at a fixed pose.
+#[derive(Clone, Debug)]
+pub struct Camera {
+    position: Vector,
+    forward: Vector,
+    left: Vector,
+    up: Vector,
+    /// Size of a pixel at a depth of one metre.
+    pixel_m: f32,
+    width: usize,
+    height: usize,
+    noise_std: f32,
+    look: Look,
+}
+
+impl Camera {
+    /// The camera of a robot with this pose. Pixels are square, which determines the vertical field of view.
+    #[must_use]
+    pub fn new(config: &WorldConfig, pose: PlanarPose) -> Self {
+        let (sin, cos) = pose.heading_rad.sin_cos();
+        let (down, level) = (config.camera.tilt_down_rad as f32).sin_cos();
+        Self {
+            position: Vector::new(pose.x_m, pose.y_m, config.camera.height_m as f32),
+            forward: Vector::new(cos * level, sin * level, -down),
+            left: Vector::new(-sin, cos, 0.0),
+            up: Vector::new(cos * down, sin * down, level),
+            pixel_m: 2.0 * (config.camera.horizontal_fov_rad as f32 / 2.0).tan() / config.frame_width_px as f32,
+            width: config.frame_width_px as usize,
+            height: config.frame_height_px as usize,
+            noise_std: config.camera.noise_std as f32,
+            look: config.look,
+        }
+    }
+
+    /// Projects a point [x, y, z] of the room to [column, row] in pixels from the top left corner (the center of the first
+    /// pixel is 0.5, 0.5); none if the point is behind the camera.
+    #[must_use]
+    pub fn project(&self, point_m: [f32; 3]) -> Option<[f32; 2]> {
+        let to = Vector::from_array(point_m) - self.position;
+        let depth = to.dot(self.forward);
+        (depth > 1e-6).then(|| {
+            let (right, down) = (-to.dot(self.left), -to.dot(self.up));
+            [
+                self.width as f32 / 2.0 + right / (depth * self.pixel_m),
+                self.height as f32 / 2.0 + down / (depth * self.pixel_m),
+            ]
+        })
+    }
+
+    /// Renders an image with noise, and its segmentation mask. Errors: `Frame` if the size is out of range.
+    pub(super) fn capture(
+        &self,
+        robots: &[RenderedRobot],
+        mut noise: ChaCha8Rng,
+    ) -> Result<(Frame, Vec<u8>), SimError> {
+        let samples = self.render(robots);
+        let pixels = samples
+            .iter()
+            .map(|sample| {
+                let normal: f32 = if self.noise_std > 0.0 {
+                    StandardNormal.sample(&mut noise)
+                } else {
+                    0.0
+                };
+                ((sample.gray + self.noise_std * normal).clamp(0.0, 1.0) * 255.0).round() as u8
+            })
+            .collect();
+        let frame = Frame::new(self.width as u32, self.height as u32, pixels)?;
+        Ok((frame, samples.iter().map(|sample| sample.robot_id).collect()))
+    }
+
+    /// Casts one ray through each pixel's center, then more rays at edges.
+    fn render(&self, robots: &[RenderedRobot]) -> Vec<RaySample> {
+        let views: Vec<RobotView> = robots
+            .iter()
+            .map(|robot| RobotView::new(robot, self.position))
+            .collect();
+        let mut centers = Vec::with_capacity(self.width * self.height);
+        for row in 0..self.height {
+            for column in 0..self.width {
+                centers.push(self.sample(&views, column as f32 + 0.5, row as f32 + 0.5));
+            }
+        }
+        (0..centers.len())
+            .map(|index| {
+                if self.is_edge(&centers, index) {
+                    self.average(&views, index)
+                } else {
+                    centers[index]
+                }
+            })
+            .collect()
+    }
+
+    fn is_edge(&self, samples: &[RaySample], index: usize) -> bool {
+        let here = samples[index];
+        let (row, column) = (index / self.width, index % self.width);
+        let differs = |other: usize| {
+            let there = samples[other];
+            there.surface != here.surface || (there.gray - here.gray).abs() > EDGE_STEP
+        };
+        (column > 0 && differs(index - 1))
+            || (column + 1 < self.width && differs(index + 1))
+            || (row > 0 && differs(index - self.width))
+            || (row + 1 < self.height && differs(index + self.width))
+    }
+
+    /// The mean of a grid of rays. In the segmentation mask, the pixel gets the id that most of the rays hit.
+    fn average(&self, views: &[RobotView], index: usize) -> RaySample {
+        let (row, column) = (index / self.width, index % self.width);
+        let mut sum = 0.0;
+        let mut ids = [0u8; EDGE_RAYS * EDGE_RAYS];
+        for (ray, id) in ids.iter_mut().enumerate() {
+            let right = (ray % EDGE_RAYS) as f32 + 0.5;
+            let down = (ray / EDGE_RAYS) as f32 + 0.5;
+            let sample = self.sample(
+                views,
+                column as f32 + right / EDGE_RAYS as f32,
+                row as f32 + down / EDGE_RAYS as f32,
+            );
+            sum += sample.gray;
+            *id = sample.robot_id;
+        }
+        ids.sort_unstable();
+        RaySample {
+            gray: sum / ids.len() as f32,
+            surface: 0,
+            robot_id: most_frequent(&ids),
+        }
+    }
+
+    /// Casts the ray through a point of the image and shades the point that it hits.
+    fn sample(&self, views: &[RobotView], column: f32, row: f32) -> RaySample {
+        let right = (column - self.width as f32 / 2.0) * self.pixel_m;
+        let down = (row - self.height as f32 / 2.0) * self.pixel_m;
+        let direction = self.forward - self.left * right - self.up * down;
+        let mut hit = self.cast_room(direction);
+        for (pillar, index) in arena::PILLARS.iter().zip(6..) {
+            let [x, y] = pillar.position_m;
+            let shape = UprightCylinder {
+                radius: pillar.radius_m,
+                bottom: 0.0,
+                top: arena::HEIGHT_M,
+            };
+            let ray = Ray::new(self.position - Vector::new(x, y, 0.0), direction);
+            if let Some(found) = shape.cast_local_ray_and_get_normal(&ray, hit.time, true) {
+                hit = NearestHit {
+                    time: found.time_of_impact,
+                    normal: found.normal,
+                    albedo: pillar.albedo,
+                    surface: index,
+                    robot_id: 0,
+                };
+            }
+        }
+        for view in views {
+            view.cast(direction, &mut hit);
+        }
+        let mut shade = 1.0;
+        if hit.surface == FLOOR {
+            let point = self.position + direction * hit.time;
+            shade = views
+                .iter()
+                .map(|view| view.robot.shade(point.x, point.y))
+                .product::<f32>();
+        }
+        if self.look == Look::Bright && hit.robot_id == 0 {
+            return RaySample {
+                gray: WHITE * shade,
+                surface: hit.surface,
+                robot_id: 0,
+            };
+        }
+        hit.albedo *= shade;
+        let lambert = hit.normal.dot(*LIGHT).max(0.0);
+        let distance_squared = direction.length_squared() * hit.time * hit.time;
+        let falloff = 1.0 / (1.0 + 0.012 * distance_squared);
+        RaySample {
+            gray: hit.albedo * (AMBIENT + (1.0 - AMBIENT) * lambert) * falloff,
+            surface: hit.surface,
+            robot_id: hit.robot_id,
+        }
+    }
+
+    /// Casts a ray against the room. The camera is inside this box, so every ray hits one of its sides.
+    fn cast_room(&self, direction: Vector) -> NearestHit {
+        let half = Vector::new(arena::LENGTH_M, arena::WIDTH_M, arena::HEIGHT_M) / 2.0;
+        let center = Vector::new(arena::LENGTH_M / 2.0, 0.0, arena::HEIGHT_M / 2.0);
+        let ray = Ray::new(self.position - center, direction);
+        let found = Cuboid::new(half).cast_local_ray_and_get_normal(&ray, f32::MAX, false);
+        let (time, axis) = found.map_or((0.0, 2), |found| (found.time_of_impact, face(&found) % 3));
+        let far = direction[axis] > 0.0;
+        let side = 2 * axis as u16 + u16::from(far);
+        let mut normal = Vector::ZERO;
+        normal[axis] = if far { -1.0 } else { 1.0 };
+        let point = self.position + direction * time;
+        NearestHit {
+            time,
+            normal,
+            albedo: arena::side_albedo(side, point.x, point.y, point.z),
+            surface: side,
+            robot_id: 0,
+        }
+    }
+}
+
+/// The gray value of a white room.
+const WHITE: f32 = 0.97;
+/// The side of the room that is the floor.
+const FLOOR: u16 = 4;
+
+/// The most frequent value of a sorted list; the smallest one if several are equally frequent.
+fn most_frequent(sorted: &[u8]) -> u8 {
+    let mut best = (0, 0);
+    for run in sorted.chunk_by(u8::eq) {
+        if run.len() > best.0 {
+            best = (run.len(), run[0]);
+        }
+    }
+    best.1
+}

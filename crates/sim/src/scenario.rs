@@ -1,0 +1,271 @@
+//! The scenarios, the random parameters of a trial, and which trials are held out for the test on unseen start/goal pairs and
+//! PID gains.
+
+use std::fmt;
+use std::ops::Range;
+use std::str::FromStr;
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::config::in_range;
+use super::pid::Gains;
+use super::{PlanarPose, SimError, arena, robot};
+use foreframe_core::types::Seed;
+
+/// (start, goal) pairs of Tb2 that are never used for training. Their routes cross routes of the other pairs.
+pub const HELD_OUT_PAIRS: [(usize, usize); 2] = [(1, 0), (2, 3)];
+/// Range of Tb2's proportional heading gain, drawn uniformly.
+pub const HEADING_GAIN: Range<f32> = 1.2..4.0;
+/// The tenth of [`HEADING_GAIN`] that is never used for training.
+pub const HELD_OUT_HEADING_GAIN: Range<f32> = 2.44..2.72;
+/// Robots in `crowded` besides Tb1 and Tb2.
+const CROWD: usize = 3;
+/// Largest number of robots besides Tb1 and Tb2 in parameters written by hand.
+const MAX_CROWD: usize = 16;
+
+/// Which robots move, and when a trial ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum Scenario {
+    /// The paper's scenario: Tb1 stands still; the trial ends when Tb2 reaches its goal.
+    StaticObserver,
+    /// Tb1 drives too. When Tb2 reaches its goal, it gets another one; the trial ends at its time limit.
+    MovingObserver,
+    /// Like `moving-observer`, with three more robots.
+    Crowded,
+}
+
+impl Scenario {
+    /// All scenarios.
+    pub const ALL: [Self; 3] = [Self::StaticObserver, Self::MovingObserver, Self::Crowded];
+
+    /// The scenario's name, on the command line and on disk.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::StaticObserver => "static-observer",
+            Self::MovingObserver => "moving-observer",
+            Self::Crowded => "crowded",
+        }
+    }
+
+    /// Whether Tb1 drives.
+    #[must_use]
+    pub fn observer_drives(self) -> bool {
+        self != Self::StaticObserver
+    }
+}
+
+/// Names of all scenarios, separated by commas, for messages.
+pub(super) fn names() -> String {
+    Scenario::ALL.map(Scenario::name).join(", ")
+}
+
+impl fmt::Display for Scenario {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.name())
+    }
+}
+
+impl FromStr for Scenario {
+    type Err = SimError;
+
+    fn from_str(name: &str) -> Result<Self, SimError> {
+        let found = Self::ALL.into_iter().find(|scenario| scenario.name() == name);
+        found.ok_or_else(|| SimError::UnknownScenario { name: name.to_owned() })
+    }
+}
+
+/// Gains of a robot's two PID controllers, for heading and distance, and its highest speed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct PidGains {
+    /// From heading error (rad) to angular velocity (rad/s).
+    pub heading: Gains,
+    /// From distance to the goal (m) to linear velocity (m/s).
+    pub distance: Gains,
+    /// Highest linear velocity, in m/s.
+    pub max_linear_m_s: f32,
+}
+
+impl PidGains {
+    fn draw(random: &mut ChaCha8Rng) -> Self {
+        Self {
+            heading: Gains {
+                proportional: random.random_range(HEADING_GAIN),
+                integral: random.random_range(0.0..3.0),
+                derivative: random.random_range(0.0..0.2),
+            },
+            distance: Gains {
+                proportional: random.random_range(0.5..1.1),
+                integral: random.random_range(0.0..0.1),
+                derivative: random.random_range(0.0..0.1),
+            },
+            max_linear_m_s: random.random_range(0.3..0.6),
+        }
+    }
+}
+
+/// Start pose, first goal and controller gains of a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Route {
+    /// Pose at the start.
+    pub pose: PlanarPose,
+    /// The first goal, [x, y].
+    pub goal_m: [f32; 2],
+    /// Gains of its controllers.
+    pub gains: PidGains,
+}
+
+/// All random parameters of a trial.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct TrialParameters {
+    /// The scenario.
+    pub scenario: Scenario,
+    /// Number of the trial, counted from 0 for each seed.
+    pub trial: u64,
+    /// The seed of all trials.
+    #[cfg_attr(feature = "schema", schema(value_type = u64))]
+    pub seed: Seed,
+    /// Tb2's start, an index of [`arena::STARTS_M`].
+    pub start: usize,
+    /// Tb2's (first) goal, an index of [`arena::GOALS_M`].
+    pub goal: usize,
+    /// Gains of Tb2's controllers.
+    pub gains: PidGains,
+    /// Tb2's heading at the start, in radians.
+    pub start_heading_rad: f32,
+    /// Tb1's pose at the start.
+    pub observer: PlanarPose,
+    /// The robots besides Tb1 and Tb2 (`crowded`).
+    pub crowd: Vec<Route>,
+}
+
+impl TrialParameters {
+    /// Draws the parameters of trial number `trial` of the seed. Other trials need not be drawn first.
+    #[must_use]
+    pub fn draw(scenario: Scenario, seed: Seed, trial: u64) -> Self {
+        let mut random = seed.derive("trial", trial).rng();
+        let start = random.random_range(0..arena::STARTS_M.len());
+        let goal = random.random_range(0..arena::GOALS_M.len());
+        let gains = PidGains::draw(&mut random);
+        let start_m = arena::STARTS_M[start];
+        let ahead = facing(start_m, arena::GOALS_M[goal]);
+        let start_heading_rad = robot::wrap(ahead + random.random_range(-1.5..1.5));
+        let mut taken = vec![start_m];
+        let observer = if scenario.observer_drives() {
+            let position = free_position(&mut random, &taken, 1.0);
+            taken.push(position);
+            let heading = facing(position, start_m) + random.random_range(-0.6..0.6);
+            pose(position, robot::wrap(heading))
+        } else {
+            arena::OBSERVER
+        };
+        let crowd_size = if scenario == Scenario::Crowded { CROWD } else { 0 };
+        let crowd = (0..crowd_size)
+            .map(|_| {
+                let position = free_position(&mut random, &taken, 0.6);
+                taken.push(position);
+                Route {
+                    pose: pose(position, random.random_range(-3.1..3.1)),
+                    goal_m: arena::GOALS_M[random.random_range(0..arena::GOALS_M.len())],
+                    gains: PidGains::draw(&mut random),
+                }
+            })
+            .collect();
+        Self {
+            scenario,
+            trial,
+            seed,
+            start,
+            goal,
+            gains,
+            start_heading_rad,
+            observer,
+            crowd,
+        }
+    }
+
+    /// Checks parameters that were written by hand. Errors: `Setting` if a start or goal does not exist, a robot is outside
+    /// the room, or there are too many robots.
+    pub fn validate(&self) -> Result<(), SimError> {
+        in_range("start", self.start as f64, 0.0, arena::STARTS_M.len() as f64 - 1.0)?;
+        in_range("goal", self.goal as f64, 0.0, arena::GOALS_M.len() as f64 - 1.0)?;
+        in_range("crowd's size", self.crowd.len() as f64, 0.0, MAX_CROWD as f64)?;
+        for pose in self.crowd.iter().map(|route| route.pose).chain([self.observer]) {
+            in_range("x_m", f64::from(pose.x_m), 0.0, f64::from(arena::LENGTH_M))?;
+            let side = f64::from(arena::WIDTH_M) / 2.0;
+            in_range("y_m", f64::from(pose.y_m), -side, side)?;
+            in_range("heading_rad", f64::from(pose.heading_rad), -7.0, 7.0)?;
+        }
+        Ok(())
+    }
+
+    /// Whether the trial must not be used for training, because of its start/goal pair or its heading gain. If Tb2 drives to
+    /// several goals, the first pair counts.
+    #[must_use]
+    pub fn is_held_out(&self) -> bool {
+        self.has_held_out_pair() || HELD_OUT_HEADING_GAIN.contains(&self.gains.heading.proportional)
+    }
+
+    /// Whether the trial's start/goal pair is one of [`HELD_OUT_PAIRS`].
+    #[must_use]
+    pub fn has_held_out_pair(&self) -> bool {
+        HELD_OUT_PAIRS.contains(&(self.start, self.goal))
+    }
+
+    /// The route of Tb2, then those of the other robots. Call it only after [`Self::validate`] has passed.
+    #[expect(clippy::expect_used, reason = "validate() has checked both indexes")]
+    pub(super) fn routes(&self) -> Vec<Route> {
+        let start_m = arena::STARTS_M.get(self.start).copied();
+        let start_m = start_m.expect("an unknown start after validate() is a bug");
+        let goal_m = arena::GOALS_M.get(self.goal).copied();
+        let goal_m = goal_m.expect("an unknown goal after validate() is a bug");
+        let tb2 = Route {
+            pose: pose(start_m, self.start_heading_rad),
+            goal_m,
+            gains: self.gains,
+        };
+        std::iter::once(tb2).chain(self.crowd.iter().copied()).collect()
+    }
+
+    /// A separate random generator of this trial for the named use.
+    pub(super) fn stream(&self, name: &str, index: u64) -> ChaCha8Rng {
+        self.seed.derive("trial", self.trial).derive(name, index).rng()
+    }
+}
+
+fn pose([x_m, y_m]: [f32; 2], heading_rad: f32) -> PlanarPose {
+    PlanarPose { x_m, y_m, heading_rad }
+}
+
+/// Heading from one point to another.
+fn facing(from: [f32; 2], to: [f32; 2]) -> f32 {
+    (to[1] - from[1]).atan2(to[0] - from[0])
+}
+
+/// A random position away from walls and pillars, at least `min_distance` metres from the positions `taken`.
+fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32) -> [f32; 2] {
+    loop {
+        let x = random.random_range(0.4..arena::LENGTH_M - 0.4);
+        let y = random.random_range(0.4 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.4);
+        let is_clear_of_pillars = arena::PILLARS
+            .iter()
+            .all(|pillar| arena::distance(pillar.position_m, [x, y]) > pillar.radius_m + 0.3);
+        if is_clear_of_pillars
+            && taken
+                .iter()
+                .all(|&other| arena::distance(other, [x, y]) >= min_distance)
+        {
+            return [x, y];
+        }
+    }
+}

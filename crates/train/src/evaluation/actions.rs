@@ -1,0 +1,344 @@
+//! Does the action matter? The same weights with true, shuffled, held and zeroed actions, and twins: models of the same
+//! training budget that lack the action, the state or both.
+
+use rand::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::bootstrap::{Bootstrap, Interval, TrialSums};
+use super::inference::{self, ActionSource};
+use super::metrics::StepCurve;
+use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use foreframe_core::frame::preprocess::scale;
+use foreframe_core::frame::quality;
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{Dataset, Window};
+
+/// One row of the action table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Variant {
+    /// The actions that were carried out.
+    True,
+    /// The actions of another window.
+    Shuffled,
+    /// At every step the action that led to the last frame seen.
+    Held,
+    /// Zero in every component.
+    Zeroed,
+    /// A model with the state but without the action, trained with the same budget.
+    TwinWithoutAction,
+    /// A model with the action but without the state, trained with the same budget.
+    TwinWithoutState,
+    /// A model without conditioning, trained with the same budget.
+    UnconditionedTwin,
+}
+
+impl Variant {
+    /// The row's name in words.
+    #[must_use]
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::True => "true actions",
+            Self::Shuffled => "shuffled actions",
+            Self::Held => "held actions",
+            Self::Zeroed => "zeroed actions",
+            Self::TwinWithoutAction => "twin without the action",
+            Self::TwinWithoutState => "twin without the state",
+            Self::UnconditionedTwin => "unconditioned twin",
+        }
+    }
+
+    /// Whether it is another model, which lacks the action.
+    fn is_twin_without_action(self) -> bool {
+        matches!(self, Self::TwinWithoutAction | Self::UnconditionedTwin)
+    }
+}
+
+/// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, has
+/// seen other data, or lacks neither the action nor the state.
+pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant, EvaluationError> {
+    let (spec, other) = (loaded.model.spec(), twin.model.spec());
+    let refused = |found: String, wanted: String| EvaluationError::Twin {
+        twin: twin.manifest.name.clone(),
+        found,
+        model: loaded.manifest.name.clone(),
+        wanted,
+    };
+    let window = |spec: &ModelSpec| format!("{} context frames and {} to predict", spec.context, spec.horizon);
+    if window(spec) != window(other) {
+        return Err(refused(window(other), window(spec)));
+    }
+    let data = |loaded: &LoadedModel| format!("training data \"{}\"", loaded.manifest.dataset.name);
+    if loaded.manifest.dataset.content_hash != twin.manifest.dataset.content_hash {
+        return Err(refused(data(twin), format!("the same {}", data(loaded))));
+    }
+    let inputs = |spec: &ModelSpec| (spec.action_inputs().is_some(), spec.state_inputs().is_some());
+    match (inputs(spec), inputs(other)) {
+        (_, (false, false)) => Ok(Variant::UnconditionedTwin),
+        ((_, true), (false, true)) => Ok(Variant::TwinWithoutAction),
+        ((_, true), (true, false)) => Ok(Variant::TwinWithoutState),
+        ((_, takes_state), _) => {
+            let wanted = if takes_state {
+                "conditioning \"none\", \"state\" or \"action\""
+            } else {
+                "conditioning \"none\""
+            };
+            let found = format!("conditioning \"{}\"", other.conditioning);
+            Err(refused(found, wanted.to_owned()))
+        }
+    }
+}
+
+/// Scores of one variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActionRow {
+    /// Which actions the model got.
+    pub variant: Variant,
+    /// Mean squared error per pixel.
+    pub mse: StepCurve,
+    /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
+    pub interval: Option<Interval>,
+    /// 1 − MSE(true) / MSE(this): the share of this error that the true actions remove.
+    pub reduction: f64,
+    /// Its 95 % interval, both resampled together.
+    pub reduction_interval: Option<Interval>,
+}
+
+/// The table, and the finding from it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActionTable {
+    /// True actions first.
+    pub rows: Vec<ActionRow>,
+    /// Whether true actions beat all other actions and a twin without the action, with intervals that do not overlap.
+    pub conditioning_works: bool,
+    /// The finding in a sentence.
+    pub finding: String,
+}
+
+/// A variant's mean squared errors, `[window][step]`.
+pub type VariantErrors = (Variant, Vec<Vec<f64>>);
+
+/// For each of `count` windows another one whose actions it gets: a single cycle through all (Sattolo 1986), so none
+/// keeps its own. With a single window there is no other.
+#[must_use]
+pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
+    let mut rng = seed.derive("shuffled actions", 0).rng();
+    let mut donors: Vec<usize> = (0..count).collect();
+    for last in (1..count).rev() {
+        donors.swap(last, rng.random_range(0..last));
+    }
+    donors
+}
+
+/// Errors of each variant, per window and step. Errors: those of the network, `NotFinite`.
+pub fn compare(
+    loaded: &LoadedModel,
+    twins: &[&LoadedModel],
+    dataset: &Dataset,
+    windows: &[Window],
+    watched: &EvaluationContext,
+) -> Result<Vec<VariantErrors>, EvaluationError> {
+    let donors: Vec<Window> = shuffle(windows.len(), watched.bootstrap.seed)
+        .into_iter()
+        .map(|donor| windows[donor])
+        .collect();
+    let mut variants = vec![
+        (Variant::True, loaded),
+        (Variant::Shuffled, loaded),
+        (Variant::Held, loaded),
+        (Variant::Zeroed, loaded),
+    ];
+    for twin in twins {
+        variants.push((twin_variant(loaded, twin)?, twin));
+    }
+    let total = variants.len() * windows.len();
+    let mut all = Vec::new();
+    for (variant, model) in variants {
+        let mut errors = Vec::with_capacity(windows.len());
+        for (batch, donors) in windows.chunks(watched.batch).zip(donors.chunks(watched.batch)) {
+            let source = match variant {
+                Variant::Shuffled => ActionSource::OfWindows(donors),
+                Variant::Held => ActionSource::Held,
+                Variant::Zeroed => ActionSource::Zero,
+                _ => ActionSource::Recorded,
+            };
+            errors.extend(errors_of(model, dataset, batch, source)?);
+            watched.report(
+                EvaluationStage::Actions,
+                all.len() * windows.len() + errors.len(),
+                total,
+            )?;
+        }
+        all.push((variant, errors));
+    }
+    Ok(all)
+}
+
+fn errors_of(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    source: ActionSource,
+) -> Result<Vec<Vec<f64>>, EvaluationError> {
+    let spec = loaded.model.spec();
+    let predicted = inference::predict(loaded, dataset, windows, source)?;
+    let frames = predicted.par_chunks_exact(spec.horizon * spec.pixels());
+    let error = |(frames, window): (&[f32], &Window)| {
+        let steps = frames.chunks_exact(spec.pixels()).enumerate();
+        let mse = steps.map(|(step, frame)| {
+            let truth = scale(&dataset.pixels(window.first_frame + spec.context + step)?);
+            Ok(quality::mse(&spec.preprocess.inverse(frame), &truth))
+        });
+        mse.collect()
+    };
+    frames.zip(windows).map(error).collect()
+}
+
+/// The table of these errors per variant, window and step; the true actions come first.
+#[must_use]
+pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
+    let curves: Vec<StepCurve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
+    let of_window = |window: usize| -> Vec<f64> {
+        let mean = |(_, windows): &VariantErrors| StepCurve::new(windows[window].clone()).mean;
+        errors.iter().map(mean).collect()
+    };
+    let trials = TrialSums::group(trial_of, (0..trial_of.len()).map(of_window));
+    let reduction = |means: &[f64], row: usize| {
+        if means[row] > 0.0 {
+            1.0 - means[0] / means[row]
+        } else {
+            0.0
+        }
+    };
+    let intervals = trials.intervals(bootstrap, |means| {
+        let reductions = (0..means.len()).map(|row| reduction(means, row));
+        means.iter().copied().chain(reductions).collect()
+    });
+    let means = trials.means();
+    let rows: Vec<ActionRow> = errors
+        .iter()
+        .zip(curves)
+        .enumerate()
+        .map(|(row, ((variant, _), mse))| ActionRow {
+            variant: *variant,
+            mse,
+            interval: intervals.as_ref().map(|all| all[row]),
+            reduction: reduction(&means, row),
+            reduction_interval: intervals.as_ref().map(|all| all[errors.len() + row]),
+        })
+        .collect();
+    let (conditioning_works, finding) = judge(&rows);
+    ActionTable {
+        rows,
+        conditioning_works,
+        finding,
+    }
+}
+
+fn mean_over(windows: &[Vec<f64>]) -> StepCurve {
+    let mut sums = vec![0.0; windows.first().map_or(0, Vec::len)];
+    for window in windows {
+        for (sum, value) in sums.iter_mut().zip(window) {
+            *sum += value;
+        }
+    }
+    StepCurve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
+}
+
+/// Conditioning works only where true actions beat all others and a twin without the action, with intervals apart. A twin
+/// without the state says nothing about the action.
+fn judge(rows: &[ActionRow]) -> (bool, String) {
+    let Some((truth, others)) = rows.split_first() else {
+        return (false, "Nothing was compared.".to_owned());
+    };
+    let apart = |row: &&ActionRow| match (&truth.interval, &row.interval) {
+        (Some(truth), Some(other)) => truth.is_below(other),
+        _ => false,
+    };
+    let labels = |rows: &[&ActionRow]| {
+        rows.iter()
+            .map(|row| row.variant.label())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    let others = || others.iter().filter(|row| row.variant != Variant::TwinWithoutState);
+    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others().partition(apart);
+    if !unbeaten.is_empty() {
+        let finding = format!(
+            "Conditioning is not shown to work: the interval of true actions does not lie below that of {}.",
+            labels(&unbeaten)
+        );
+        return (false, finding);
+    }
+    if !others().any(|row| row.variant.is_twin_without_action()) {
+        let finding = format!(
+            "Conditioning is not shown to work yet: true actions beat {} with intervals apart, but no twin without the action was compared.",
+            labels(&beaten)
+        );
+        return (false, finding);
+    }
+    let least = others().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
+    let finding = format!(
+        "Conditioning works: true actions beat {} with intervals apart, by at least {:.0} % of the MSE.",
+        labels(&beaten),
+        100.0 * least
+    );
+    (true, finding)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn shuffling_permutes_and_no_window_keeps_its_own(count in 2usize..300, seed in any::<u64>()) {
+            let donors = shuffle(count, Seed(seed));
+            prop_assert!(donors.iter().enumerate().all(|(window, &donor)| window != donor));
+            let mut sorted = donors;
+            sorted.sort_unstable();
+            prop_assert_eq!(sorted, (0..count).collect::<Vec<_>>());
+        }
+    }
+
+    fn table_of(levels: &[(Variant, f64)]) -> ActionTable {
+        let trial_of: Vec<usize> = (0..60).map(|i| i / 3).collect();
+        let noisy = |level: f64| -> Vec<Vec<f64>> {
+            trial_of
+                .iter()
+                .map(|&trial| vec![level * (1.0 + 0.1 * (trial as f64).sin()); 2])
+                .collect()
+        };
+        let errors: Vec<_> = levels.iter().map(|&(variant, level)| (variant, noisy(level))).collect();
+        let bootstrap = Bootstrap {
+            samples: 200,
+            seed: Seed(1),
+        };
+        table(&errors, &trial_of, &bootstrap)
+    }
+
+    #[test]
+    fn conditioning_works_only_where_all_others_are_beaten() {
+        let all = [
+            (Variant::True, 1.0),
+            (Variant::Shuffled, 2.0),
+            (Variant::Zeroed, 1.5),
+            (Variant::UnconditionedTwin, 1.4),
+        ];
+        let good = table_of(&all);
+        assert!(good.conditioning_works, "{}", good.finding);
+        assert!((good.rows[1].reduction - 0.5).abs() < 1e-9);
+        assert!(!table_of(&all[..3]).conditioning_works);
+        let close = table_of(&[all[0], all[1], (Variant::Zeroed, 1.01), all[3]]);
+        assert!(
+            !close.conditioning_works && close.finding.contains("zeroed"),
+            "{}",
+            close.finding
+        );
+    }
+}

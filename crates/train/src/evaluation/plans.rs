@@ -1,0 +1,228 @@
+//! Plan identification: does the model tell what each of several plans would lead to? The simulator branches at a
+//! context into one true future for each plan; the model predicts one for each. Counted is how often a true future is
+//! nearest to the prediction of its own plan.
+
+use rand::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::bootstrap::{Interval, TrialSums};
+use super::inference::{self, ActionSource};
+use super::score::evenly;
+use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use foreframe_core::frame::preprocess::scale;
+use foreframe_core::frame::quality;
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::types::{Action, Seed};
+use foreframe_data::dataset::{Dataset, Window};
+use foreframe_sim::{World, WorldConfig};
+
+/// Plans at each context: the one that was carried out, and those of other windows.
+pub const PLANS: usize = 8;
+/// Contexts at most, evenly spread over the windows.
+const MAX_CONTEXTS: usize = 60;
+/// A replayed frame that differs by more than this mean squared error is not the recorded one.
+const REPLAY_TOLERANCE: f64 = 1e-4;
+
+/// How often plans were identified, or why that was not measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "status", rename_all = "kebab-case")]
+pub enum PlanOutcome {
+    /// It was measured.
+    Measured(PlanIdentification),
+    /// It could not be measured.
+    Skipped {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// How often the true future of a plan is nearest to the prediction for that plan.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PlanIdentification {
+    /// Contexts at which the simulator branched.
+    pub contexts: usize,
+    /// Plans at each context.
+    pub plans: usize,
+    /// Share of the true futures that are nearest to their own plan's prediction.
+    pub rate: f64,
+    /// Its 95 % bootstrap interval over trials; absent with fewer than two trials.
+    pub interval: Option<Interval>,
+    /// The share that guessing gives.
+    pub chance: f64,
+}
+
+/// The true futures of a context, one for each plan; each `horizon` frames, 0…1. None if the replay differs.
+type Futures = Option<Vec<Vec<f32>>>;
+
+/// Measures a model that takes actions on these windows. Errors: those of the network and the simulator, `Cancelled`.
+pub fn identify(
+    loaded: &LoadedModel,
+    dataset: &Dataset,
+    windows: &[Window],
+    watched: &EvaluationContext,
+) -> Result<PlanOutcome, EvaluationError> {
+    let skipped = |reason: &str| {
+        Ok(PlanOutcome::Skipped {
+            reason: reason.to_owned(),
+        })
+    };
+    let Some(world) = &dataset.info().world else {
+        return skipped("the data set is a recording, so no other plan can be tried");
+    };
+    if windows.len() < PLANS {
+        return skipped("there are fewer windows than plans to compare");
+    }
+    let drives = |window: &Window| {
+        let trial = dataset.episodes()[window.episode].trial.as_ref();
+        trial.is_some_and(|trial| trial.scenario.observer_drives())
+    };
+    if !windows.iter().all(drives) {
+        return skipped("the camera stands still in this scenario, whatever the plan");
+    }
+    let spec = loaded.model.spec();
+    let contexts = evenly(windows, MAX_CONTEXTS);
+    let mut identified = Vec::with_capacity(contexts.len());
+    for (first, part) in contexts.chunks((watched.batch / PLANS).max(1)).enumerate() {
+        let first = first * (watched.batch / PLANS).max(1);
+        let plans: Vec<Vec<Window>> = (first..)
+            .zip(part)
+            .map(|(index, &own)| plans_of(own, windows, watched.bootstrap.seed.derive("plans", index as u64)))
+            .collect();
+        let futures: Result<Vec<Futures>, EvaluationError> = part
+            .par_iter()
+            .zip(&plans)
+            .map(|(&context, plans)| futures(spec, dataset, world, (context, plans)))
+            .collect();
+        let Some(futures) = futures?.into_iter().collect::<Option<Vec<_>>>() else {
+            return skipped("the simulator no longer reproduces the frames of this data set");
+        };
+        let repeated: Vec<Window> = part.iter().flat_map(|&context| [context; PLANS]).collect();
+        let predicted = inference::predict(loaded, dataset, &repeated, ActionSource::OfWindows(&plans.concat()))?;
+        let predicted = predicted.par_chunks_exact(PLANS * spec.horizon * spec.pixels());
+        identified.par_extend(
+            predicted
+                .zip(&futures)
+                .map(|(predicted, futures)| share_identified(spec, predicted, futures)),
+        );
+        watched.report(EvaluationStage::Plans, identified.len(), contexts.len())?;
+    }
+    let trial_of: Vec<usize> = contexts.iter().map(|context| context.episode).collect();
+    let trials = TrialSums::group(&trial_of, identified.iter().map(|&share| [share]));
+    let interval = trials.intervals(&watched.bootstrap, <[f64]>::to_vec);
+    Ok(PlanOutcome::Measured(PlanIdentification {
+        contexts: contexts.len(),
+        plans: PLANS,
+        rate: trials.means().first().copied().unwrap_or(0.0),
+        interval: interval.and_then(|all| all.first().copied()),
+        chance: 1.0 / PLANS as f64,
+    }))
+}
+
+/// The windows whose actions are the plans at a context: its own first, then others drawn at random.
+fn plans_of(own: Window, windows: &[Window], seed: Seed) -> Vec<Window> {
+    let mut rng = seed.rng();
+    let mut plans = vec![own];
+    while plans.len() < PLANS {
+        let drawn = windows[rng.random_range(0..windows.len())];
+        if !plans.contains(&drawn) {
+            plans.push(drawn);
+        }
+    }
+    plans
+}
+
+/// Replays the trial up to the context's last frame, once for each plan, and carries the plan out.
+fn futures(
+    spec: &ModelSpec,
+    dataset: &Dataset,
+    world: &WorldConfig,
+    (context, plans): (Window, &[Window]),
+) -> Result<Futures, EvaluationError> {
+    let episode = &dataset.episodes()[context.episode];
+    let Some(trial) = &episode.trial else {
+        return Ok(None);
+    };
+    let last = context.first_frame + spec.context - 1;
+    let action = |frame: usize| Action::try_from(dataset.action(frame).to_vec()).map_err(EvaluationError::Action);
+    let mut futures = Vec::with_capacity(plans.len());
+    for plan in plans {
+        let mut branch = World::from_parameters(trial.clone(), world)?;
+        for frame in episode.first_frame..last {
+            branch.step(&action(frame)?)?;
+        }
+        let replayed = scale(branch.observe().frame.pixels());
+        if quality::mse(&replayed, &scale(&dataset.pixels(last)?)) > REPLAY_TOLERANCE {
+            return Ok(None);
+        }
+        let first_action = plan.first_frame + spec.context - 1;
+        let mut future = Vec::with_capacity(spec.horizon * spec.pixels());
+        for frame in first_action..first_action + spec.horizon {
+            let result = branch.step(&action(frame)?)?;
+            future.extend(scale(result.observation.frame.pixels()));
+        }
+        futures.push(future);
+    }
+    Ok(Some(futures))
+}
+
+/// The share of the futures whose own prediction is the nearest.
+fn share_identified(spec: &ModelSpec, predicted: &[f32], futures: &[Vec<f32>]) -> f64 {
+    let predicted: Vec<Vec<f32>> = predicted
+        .chunks_exact(spec.horizon * spec.pixels())
+        .map(|frames| spec.preprocess.inverse(frames))
+        .collect();
+    let is_own = |(plan, future): &(usize, &Vec<f32>)| {
+        let own = predicted
+            .get(*plan)
+            .map_or(f64::INFINITY, |own| quality::mse(own, future));
+        let others = predicted.iter().enumerate().filter(|(other, _)| other != plan);
+        others
+            .map(|(_, other)| quality::mse(other, future))
+            .all(|other| own < other)
+    };
+    futures.iter().enumerate().filter(is_own).count() as f64 / futures.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_future_counts_only_if_its_own_prediction_is_nearest() {
+        let spec = ModelSpec {
+            frame_width_px: 1,
+            frame_height_px: 1,
+            horizon: 2,
+            preprocess: foreframe_core::frame::preprocess::Preprocess {
+                blur_sigma_px: 0.0,
+                invert: false,
+            },
+            ..ModelSpec::default()
+        };
+        let futures = [vec![0.1, 0.1], vec![0.5, 0.5], vec![0.9, 0.9]];
+        assert_eq!(share_identified(&spec, &[0.1, 0.2, 0.5, 0.4, 0.8, 0.9], &futures), 1.0);
+        assert!((share_identified(&spec, &[0.5, 0.5, 0.1, 0.1, 0.9, 0.9], &futures) - 1.0 / 3.0).abs() < 1e-9);
+        assert_eq!(
+            share_identified(&spec, &[0.5; 6], &futures),
+            0.0,
+            "equal predictions identify nothing"
+        );
+    }
+
+    #[test]
+    fn the_plans_at_a_context_differ_and_its_own_is_first() {
+        let windows: Vec<Window> = (0..10)
+            .map(|frame| Window {
+                episode: 0,
+                first_frame: frame,
+            })
+            .collect();
+        let plans = plans_of(windows[4], &windows, Seed(1));
+        let mut distinct = plans.clone();
+        distinct.sort_unstable();
+        distinct.dedup();
+        assert_eq!((plans[0], distinct.len()), (windows[4], PLANS));
+    }
+}

@@ -1,0 +1,347 @@
+//! The result of an evaluation. `report.json` holds it as it is, `report.md` by [`EvaluationReport::to_markdown`].
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use super::actions::ActionTable;
+use super::baselines::Method;
+use super::bootstrap::{Bootstrap, TrialSums};
+use super::figures::FigureFile;
+use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
+use super::plans::PlanOutcome;
+use super::skill::{Skill, skill};
+use super::uncertainty::{NoveltyScores, UncertaintyScores};
+use super::{EvaluateConfig, Purpose, markdown};
+use foreframe_core::registry::{DatasetStamp, LoadedModel, ProgramStamp};
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{Dataset, Window};
+
+/// The result of an evaluation, and how to repeat it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EvaluationReport {
+    /// What was evaluated, how and where.
+    pub stamp: ReportStamp,
+    /// The model's sizes.
+    pub model: ModelSummary,
+    /// The test sets, or the validation split.
+    pub sets: Vec<SetReport>,
+    /// How well the model's novelty tells other data sets from its own; empty if none were given.
+    #[serde(default)]
+    pub novelty: Vec<NoveltyScores>,
+    /// The pictures in the same directory; filled in when they are written.
+    pub figures: Vec<FigureFile>,
+}
+
+impl EvaluationReport {
+    /// The report as Markdown, with its figures in the same directory.
+    #[must_use]
+    pub fn to_markdown(&self) -> String {
+        markdown::render(self)
+    }
+
+    /// The scores of a set by its split's name, unless it was skipped.
+    #[must_use]
+    pub fn scores(&self, split: &str) -> Option<&SetScores> {
+        self.sets.iter().find(|set| set.split == split)?.outcome.scores()
+    }
+
+    /// The scores in a few numbers for each set, for the model's manifest.
+    #[must_use]
+    pub fn headline(&self) -> Value {
+        let mut headline = Map::new();
+        for set in &self.sets {
+            let Some(scores) = set.outcome.scores() else { continue };
+            let Some(model) = scores.methods.first() else { continue };
+            let interval = scores.skill.mean_interval.as_ref();
+            let mut summary = json!({
+                "skill": scores.skill.skill.mean,
+                "strongest_baseline": scores.skill.best_mean_baseline,
+                "skill_interval_95": interval.map(|interval| [interval.low, interval.high]),
+                "mse": model.mse.mean,
+                "psnr_db": model.psnr_db.mean,
+                "ssim": model.ssim.mean,
+                "mover_mse": model.mover_mse.as_ref().map(|mse| mse.mean),
+                "plan_identification": scores.plan_rate(),
+                "band_90_coverage": scores.uncertainty.as_ref().map(|scores| scores.coverage.mean),
+                "windows": scores.windows,
+                "trials": scores.trials,
+                "dataset_content_hash": self.stamp.dataset_content_hash,
+            });
+            if let Some(benchmark) = &model.benchmark {
+                summary["squared_error_per_frame"] = json!(benchmark.squared_error.mean);
+                summary["ssim_even_windows"] = json!(benchmark.ssim.mean);
+            }
+            headline.insert(set.split.clone(), summary);
+        }
+        Value::Object(headline)
+    }
+}
+
+/// What was evaluated, how and where.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ReportStamp {
+    /// The data set's name.
+    pub dataset: String,
+    /// SHA-256 of its content.
+    pub dataset_content_hash: String,
+    /// Seed of the split into training, validation and test.
+    pub split_seed: Seed,
+    /// The model's name.
+    pub model: String,
+    /// SHA-256 of its weights' file.
+    pub model_sha256: String,
+    /// Name and SHA-256 of each twin that was compared.
+    #[serde(default)]
+    pub twins: Vec<(String, String)>,
+    /// Whether the validation split or the test sets were scored.
+    #[serde(default)]
+    pub purpose: Purpose,
+    /// The program's version and the commit it was built from.
+    pub program: ProgramStamp,
+    /// The command line.
+    pub command: String,
+    /// Frames from the start of one window to that of the next.
+    pub stride: usize,
+    /// Training windows among which the baseline looked for the nearest one, at most.
+    #[serde(default = "nearest_windows")]
+    pub nearest_windows: usize,
+    /// Resamples for the intervals.
+    pub bootstrap_samples: usize,
+    /// Seed of the resamples and of the shuffled actions.
+    pub seed: Seed,
+    /// Duration in seconds.
+    pub wall_time_s: f64,
+    /// The processor's name.
+    pub cpu: String,
+    /// Threads of the computation.
+    pub threads: usize,
+}
+
+impl ReportStamp {
+    pub(super) fn new(
+        loaded: &LoadedModel,
+        dataset: &Dataset,
+        split_seed: Seed,
+        config: &EvaluateConfig,
+        wall_time: Duration,
+    ) -> Self {
+        let named = |model: &LoadedModel| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
+        let (model, model_sha256) = named(loaded);
+        Self {
+            dataset: dataset.info().name.clone(),
+            dataset_content_hash: dataset.info().content_hash.clone(),
+            split_seed,
+            model,
+            model_sha256,
+            twins: config.twins.iter().map(|twin| named(twin)).collect(),
+            purpose: config.purpose,
+            program: ProgramStamp::current(),
+            command: config.command.clone(),
+            stride: config.stride,
+            nearest_windows: config.nearest_windows,
+            bootstrap_samples: config.bootstrap_samples,
+            seed: config.seed,
+            wall_time_s: wall_time.as_secs_f64(),
+            cpu: cpu_name(),
+            threads: rayon::current_num_threads(),
+        }
+    }
+}
+
+/// Of reports from before this number was a setting.
+fn nearest_windows() -> usize {
+    super::NEAREST_WINDOWS
+}
+
+/// From `/proc/cpuinfo`; the architecture where that does not exist.
+fn cpu_name() -> String {
+    let listed = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    listed
+        .lines()
+        .find(|line| line.starts_with("model name"))
+        .and_then(|line| line.split_once(':'))
+        .map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}
+
+/// The model's sizes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelSummary {
+    /// Width of a frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of a frame in pixels.
+    pub frame_height_px: u32,
+    /// Seconds between frames.
+    pub frame_period_s: f64,
+    /// Frames seen.
+    pub context: usize,
+    /// Frames predicted.
+    pub horizon: usize,
+    /// What it is conditioned on.
+    pub conditioning: String,
+    /// Whether its inputs have inverted intensities.
+    pub inverted: bool,
+    /// Number of trained values.
+    pub parameters: u64,
+    /// Multiply–adds to predict one frame.
+    pub multiply_adds_per_frame: u64,
+    /// What it was trained on.
+    pub trained_on: DatasetStamp,
+}
+
+impl ModelSummary {
+    pub(super) fn of(loaded: &LoadedModel) -> Self {
+        let spec = loaded.model.spec();
+        Self {
+            frame_width_px: spec.frame_width_px,
+            frame_height_px: spec.frame_height_px,
+            frame_period_s: spec.frame_period_s,
+            context: spec.context,
+            horizon: spec.horizon,
+            conditioning: spec.conditioning.to_string(),
+            inverted: spec.preprocess.invert,
+            parameters: spec.parameter_count(),
+            multiply_adds_per_frame: spec.multiply_adds_per_frame(),
+            trained_on: loaded.manifest.dataset.clone(),
+        }
+    }
+}
+
+/// One test set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SetReport {
+    /// `test`, `unseen-pairs`, `unseen-gains` or `validation`.
+    pub split: String,
+    /// Its scores, or why there are none.
+    #[serde(flatten)]
+    pub outcome: SetOutcome,
+}
+
+/// A test set's scores, or why there are none.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "status", rename_all = "kebab-case")]
+pub enum SetOutcome {
+    /// It was tested.
+    Scored(Box<SetScores>),
+    /// It is empty.
+    Skipped {
+        /// Why.
+        reason: String,
+    },
+}
+
+impl SetOutcome {
+    /// The scores, unless it was skipped.
+    #[must_use]
+    pub fn scores(&self) -> Option<&SetScores> {
+        match self {
+            Self::Scored(scores) => Some(scores),
+            Self::Skipped { .. } => None,
+        }
+    }
+}
+
+/// The scores of one test set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SetScores {
+    /// Windows tested.
+    pub windows: usize,
+    /// Windows available at that stride.
+    pub windows_available: usize,
+    /// Trials that they come from; in a recording, blocks of time.
+    pub trials: usize,
+    /// The headline.
+    pub skill: Skill,
+    /// Model, baselines and codec.
+    pub methods: Vec<MethodScores>,
+    /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
+    /// between models that preprocess differently.
+    pub model_space_mse: StepCurve,
+    /// Mean squared error of the reconstruction of the frames seen, the oldest first; empty if the model does not reconstruct.
+    pub reconstruction_mse: StepCurve,
+    /// Does the action matter? Absent for a model that takes none.
+    pub actions: Option<ActionTable>,
+    /// How often plans are identified by their predictions. Absent for a model that takes no actions.
+    #[serde(default)]
+    pub plans: Option<PlanOutcome>,
+    /// How well the expected errors fit. Absent for a model without calibration.
+    #[serde(default)]
+    pub uncertainty: Option<UncertaintyScores>,
+    /// The windows that the figures show.
+    pub samples: Vec<SampleWindow>,
+}
+
+impl SetScores {
+    /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
+    pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Self {
+        let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
+        let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
+        let own_space = by_trial(|window| &window.model_space_mse);
+        Self {
+            windows: windows.len(),
+            windows_available: windows.len(),
+            trials: own_space.count(),
+            skill: skill(methods, windows, bootstrap),
+            methods: summarize(methods, windows),
+            model_space_mse: StepCurve::new(own_space.means()),
+            reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
+            actions: None,
+            plans: None,
+            uncertainty: None,
+            samples: SampleWindow::choose(windows),
+        }
+    }
+
+    /// Share of the plans that were identified, where that was measured.
+    fn plan_rate(&self) -> Option<f64> {
+        match &self.plans {
+            Some(PlanOutcome::Measured(plans)) => Some(plans.rate),
+            _ => None,
+        }
+    }
+}
+
+/// A window that the figures show, chosen by the model's error alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SampleWindow {
+    /// `median`, `best` or `worst`.
+    pub rank: String,
+    /// Position of its trial in the data set.
+    pub episode: usize,
+    /// Its first frame in the data set.
+    pub first_frame: usize,
+    /// The model's mean squared error over all steps.
+    pub mse: f64,
+}
+
+impl SampleWindow {
+    /// The window in the data set.
+    pub(super) fn window(&self) -> Window {
+        Window {
+            episode: self.episode,
+            first_frame: self.first_frame,
+        }
+    }
+
+    fn choose(windows: &[WindowScores]) -> Vec<Self> {
+        let mut ranked: Vec<&WindowScores> = windows.iter().collect();
+        ranked.sort_by(|a, b| a.model_mse().total_cmp(&b.model_mse()));
+        let places = [
+            ("median", ranked.len() / 2),
+            ("best", 0),
+            ("worst", ranked.len().saturating_sub(1)),
+        ];
+        places
+            .into_iter()
+            .filter_map(|(rank, place)| {
+                ranked.get(place).map(|window| Self {
+                    rank: rank.to_owned(),
+                    episode: window.episode,
+                    first_frame: window.first_frame,
+                    mse: window.model_mse(),
+                })
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,163 @@
+//! Whether a model's expected errors and its novelty keep what they promise, on windows that neither training nor
+//! calibration saw.
+
+use serde::{Deserialize, Serialize};
+
+use super::calibrate::quantile;
+use super::forecast::{Forecast, contexts, forecasts};
+use super::metrics::StepCurve;
+use super::score::evenly;
+use super::{EvaluationContext, EvaluationError};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::calibration::Calibration;
+use foreframe_data::dataset::{Dataset, Window};
+
+/// How well the expected errors of a set's windows fit the true ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct UncertaintyScores {
+    /// Share of the windows whose error lies in its 90 % band.
+    pub coverage: StepCurve,
+    /// Mean width of the bands, as an MSE.
+    pub width: StepCurve,
+    /// Width of the one band that holds for 90 % of this set's windows: what a constant would need.
+    pub constant_width: StepCurve,
+    /// Correlation of the logarithms of the expected and the true error; a constant has 0.
+    pub correlation: StepCurve,
+    /// Mean novelty of the windows; 0.5 where they are like the validation split.
+    pub novelty: f64,
+}
+
+/// How well novelty tells another data set from the windows of the evaluation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NoveltyScores {
+    /// The other data set's name.
+    pub dataset: String,
+    /// Its windows.
+    pub windows: usize,
+    /// Mean novelty of its windows.
+    pub novelty: f64,
+    /// Area under the ROC curve: how often a window of the other data set has a greater novelty than one of the evaluation
+    /// (ties count half).
+    pub auroc: f64,
+}
+
+/// Scores the calibration on these windows; also gives their novelty. Errors: those of the network, `Cancelled`.
+pub(super) fn measure(
+    loaded: &LoadedModel,
+    calibration: &Calibration,
+    (dataset, windows): (&Dataset, &[Window]),
+    watched: &EvaluationContext,
+) -> Result<(UncertaintyScores, Vec<f64>), EvaluationError> {
+    let found = forecasts(loaded, dataset, (windows, &calibration.novelty), watched)?;
+    let novelty: Vec<f64> = found
+        .iter()
+        .map(|forecast| f64::from(calibration.novelty.novelty(&forecast.context)))
+        .collect();
+    let steps = 0..calibration.steps.len().min(loaded.model.spec().horizon);
+    let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new(steps.clone().map(of).collect());
+    let mean = |value: &dyn Fn(&Forecast) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
+    Ok((
+        UncertaintyScores {
+            coverage: curve(&|step| mean(&|forecast| f64::from(u8::from(is_inside(forecast, step))))),
+            width: curve(&|step| {
+                mean(&|forecast| f64::from(forecast.expected[step].high - forecast.expected[step].low))
+            }),
+            constant_width: curve(&|step| {
+                let errors: Vec<f64> = found.iter().map(|forecast| forecast.errors[step]).collect();
+                quantile(errors.clone(), 0.95) - quantile(errors, 0.05)
+            }),
+            correlation: curve(&|step| correlation(&found, step)),
+            novelty: novelty.iter().sum::<f64>() / novelty.len().max(1) as f64,
+        },
+        novelty,
+    ))
+}
+
+fn is_inside(forecast: &Forecast, step: usize) -> bool {
+    let expected = forecast.expected[step];
+    (f64::from(expected.low)..=f64::from(expected.high)).contains(&forecast.errors[step])
+}
+
+fn correlation(found: &[Forecast], step: usize) -> f64 {
+    let pairs = || {
+        found.iter().map(|forecast| {
+            (
+                f64::from(forecast.expected[step].mse).ln(),
+                forecast.errors[step].max(1e-9).ln(),
+            )
+        })
+    };
+    let count = found.len().max(1) as f64;
+    let (x_mean, y_mean) = pairs().fold((0.0, 0.0), |(x, y), pair| (x + pair.0 / count, y + pair.1 / count));
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for (x, y) in pairs() {
+        xx += (x - x_mean).powi(2);
+        xy += (x - x_mean) * (y - y_mean);
+        yy += (y - y_mean).powi(2);
+    }
+    xy / (xx * yy).sqrt().max(f64::MIN_POSITIVE)
+}
+
+/// Compares the novelty of another data set's contexts with that of `own`. Frames of another size are cropped and resized.
+/// Errors: those of the network, `NoContext` if no recording is long enough.
+pub(super) fn compare(
+    loaded: &LoadedModel,
+    calibration: &Calibration,
+    (other, own, limit): (&Dataset, &[f64], usize),
+    watched: &EvaluationContext,
+) -> Result<NoveltyScores, EvaluationError> {
+    let context = loaded.model.spec().context;
+    let windows: Vec<Window> = other
+        .episodes()
+        .iter()
+        .flat_map(|episode| {
+            let last = (episode.first_frame + episode.frame_count + 1).saturating_sub(context);
+            (episode.first_frame..last).map(|first_frame| Window {
+                episode: episode.index,
+                first_frame,
+            })
+        })
+        .collect();
+    if windows.is_empty() {
+        return Err(EvaluationError::NoContext {
+            dataset: other.info().name.clone(),
+            context,
+        });
+    }
+    let windows = evenly(&windows, limit);
+    let seen = contexts(loaded, other, &windows, watched)?;
+    let novelty: Vec<f64> = seen
+        .iter()
+        .map(|context| f64::from(calibration.novelty.novelty(context)))
+        .collect();
+    Ok(NoveltyScores {
+        dataset: other.info().name.clone(),
+        windows: windows.len(),
+        novelty: novelty.iter().sum::<f64>() / novelty.len() as f64,
+        auroc: auroc(own, &novelty),
+    })
+}
+
+/// How often one of `novel` is greater than one of `known`; ties count half.
+fn auroc(known: &[f64], novel: &[f64]) -> f64 {
+    let mut sorted = known.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let below: usize = novel
+        .iter()
+        .map(|value| sorted.partition_point(|known| known < value) + sorted.partition_point(|known| known <= value))
+        .sum();
+    below as f64 / (2 * known.len().max(1) * novel.len().max(1)) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_area_is_one_when_all_are_told_apart_and_half_when_none() {
+        assert_eq!(auroc(&[0.1, 0.2], &[0.3, 0.9]), 1.0);
+        assert_eq!(auroc(&[0.1, 0.2], &[0.1, 0.2]), 0.5);
+        assert_eq!(auroc(&[1.0], &[1.0]), 0.5);
+        assert_eq!(auroc(&[0.5], &[0.1]), 0.0);
+    }
+}

@@ -1,0 +1,7 @@
+//! Training and evaluation of Foreframe's models. Use it through the crate `foreframe`.
+
+pub mod settings;
+
+pub mod training;
+
+pub mod evaluation;

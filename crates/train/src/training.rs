@@ -1,0 +1,434 @@
+//! Training. [`run`] has two stages: `pretrain` trains the dense codec on single frames, `fit` trains the recurrent network
+//! on windows. Both use the loop in `stage`. With `checkpoint`, a training can be stopped at any step and resumed; the
+//! result has the same bits as an uninterrupted training.
+
+mod augment;
+mod batches;
+mod checkpoint;
+pub mod config;
+mod fit;
+pub mod observer;
+pub mod optimizer;
+mod preset;
+mod pretrain;
+mod principal_components;
+mod random_codec;
+mod stage;
+mod start;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use self::augment::Augmentation;
+use self::batches::FrameSource;
+pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition, seal, state_entry};
+use self::checkpoint::{Checkpoint, RunFiles};
+pub use self::config::TrainConfig;
+use self::config::{CodecStart, WindowBudget};
+pub use self::observer::{Observer, TrainingEvent, TrainingStage};
+use self::stage::{StageEnd, StageRunner, TrainState};
+use foreframe_core::files::write_atomically;
+use foreframe_core::frame::FrameError;
+use foreframe_core::nn::spec::MIN_CHANNEL_STD;
+use foreframe_core::nn::{Architecture, Conditioning, ModelSpec, NnError, Parameters};
+use foreframe_core::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError, StoredWeights};
+use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_data::dataset::{Dataset, DatasetError, Window};
+
+/// Largest number of frames from which the codec's initial weights are computed.
+const MAX_PRINCIPAL_FRAMES: usize = 8192;
+
+/// The entry of a manifest's training settings that names the model whose weights the training started from.
+const START_KEY: &str = "from";
+
+/// Why a training could not start or stopped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TrainError {
+    /// No preset has this name.
+    #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]
+    UnknownPreset(String),
+    /// A setting is unknown or out of range.
+    #[error("{0}")]
+    Config(String),
+    /// The directory contains something else.
+    #[error("{dir} exists and holds no training run; use a new directory", dir = .0.display())]
+    NotARun(PathBuf),
+    /// Another training is writing to the directory.
+    #[error("another training is running in {}; wait until it ends or use another directory", .0.display())]
+    Busy(PathBuf),
+    /// The directory holds a run with another configuration or data set.
+    #[error(
+        "{} holds a run with another {what}; use the {what} of that run to resume it, or use a new directory",
+        run_dir.display()
+    )]
+    OtherRun {
+        /// The run's directory.
+        run_dir: PathBuf,
+        /// `configuration` or `data set`.
+        what: &'static str,
+    },
+    /// The training split or the validation split has no window.
+    #[error(
+        "the data set has {train} training windows and {validation} validation windows of {frames} frames; training needs \
+         at least 1 of each: collect 40 trials or more"
+    )]
+    NoWindows {
+        /// Windows of the training split.
+        train: usize,
+        /// Windows of the validation split.
+        validation: usize,
+        /// Frames of a window.
+        frames: usize,
+    },
+    /// The model takes actions, but the data set has none that change.
+    #[error(
+        "data set \"{dataset}\" has {}; a model with conditioning \"{conditioning}\" learns nothing from them: use a preset \
+         for a standing camera, or model.conditioning=none{}",
+        if *has_actions { "actions that never change (its camera stands still)" } else { "no actions" },
+        if *has_actions { ", or allow it with data.constant_actions=true" } else { "" }
+    )]
+    ConstantActions {
+        /// The data set's name.
+        dataset: String,
+        /// Whether it has actions at all.
+        has_actions: bool,
+        /// What the model takes.
+        conditioning: Conditioning,
+    },
+    /// The loss or a gradient became NaN or infinite, or the loss became very large.
+    #[error(
+        "training diverged in {stage} at step {step}: {what}; the last checkpoint is from step {checkpoint_step}; \
+         use a lower learning rate"
+    )]
+    Diverged {
+        /// The stage.
+        stage: TrainingStage,
+        /// The update that failed.
+        step: usize,
+        /// The value of the loss or the gradient.
+        what: String,
+        /// The step of the last checkpoint.
+        checkpoint_step: usize,
+    },
+    /// The weights to start from belong to another network.
+    #[error(
+        "the training cannot start from the model {model:?}: {source}; it needs the same frame size, layers and numbers of channels"
+    )]
+    OtherNetwork {
+        /// The model.
+        model: String,
+        /// The first difference.
+        source: NnError,
+    },
+    /// The model to start from takes other units, or the same channels in another order.
+    #[error(
+        "the training cannot start from the model {model:?}: it takes the {kind} [{found}], and the data set has [{expected}]; \
+         the units and the order of the channels must be the same"
+    )]
+    OtherUnits {
+        /// The model.
+        model: String,
+        /// `action` or `state`.
+        kind: &'static str,
+        /// What the model takes, with units.
+        found: String,
+        /// What the data set has, with units.
+        expected: String,
+    },
+    /// A file of the run could not be read or written.
+    #[error("could not {action} {}: {source}", path.display())]
+    Io {
+        /// `read` or `write`.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The checkpoint is damaged.
+    #[error("cannot resume from the checkpoint {}: {reason}; delete it to start again", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The data set cannot be used.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// A frame is invalid.
+    #[error(transparent)]
+    Frame(#[from] FrameError),
+    /// The network refused its input.
+    #[error(transparent)]
+    Network(#[from] NnError),
+    /// An update failed.
+    #[error(transparent)]
+    Optimizer(#[from] optimizer::OptimizerError),
+    /// The model could not be published.
+    #[error(transparent)]
+    Registry(#[from] RegistryError),
+}
+
+impl From<candle_core::Error> for TrainError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Network(error.into())
+    }
+}
+
+/// How a training ended.
+#[derive(Debug)]
+pub enum TrainingOutcome {
+    /// The training is complete and the model is published in `model_dir`.
+    Finished {
+        /// The model's directory.
+        model_dir: PathBuf,
+        /// The model's manifest.
+        manifest: Box<Manifest>,
+    },
+    /// The training was cancelled. The same call resumes it.
+    Interrupted {
+        /// The stage in which it stopped.
+        stage: TrainingStage,
+        /// Updates made in that stage.
+        step: usize,
+    },
+}
+
+/// The inputs of a training.
+pub struct Training<'a> {
+    /// The configuration.
+    pub config: &'a TrainConfig,
+    /// The data set.
+    pub dataset: &'a Dataset,
+    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, and at the end `history.json` and `model/`.
+    pub run_dir: &'a Path,
+    /// The command line, for the manifest.
+    pub command: &'a str,
+    /// The model whose weights it starts from (fine-tuning); `None` for new weights.
+    pub start: Option<&'a StoredWeights>,
+}
+
+/// Starts a training, or resumes the run in `run_dir`, until it is complete or cancelled. A resumed run ends with the same
+/// bits as an uninterrupted one. Errors: any of [`TrainError`]; the last checkpoint stays on disk.
+pub fn run(
+    training: &Training<'_>,
+    observer: &mut dyn Observer,
+    cancelled: &AtomicBool,
+) -> Result<TrainingOutcome, TrainError> {
+    let (config, dataset) = (training.config, training.dataset);
+    config.validate()?;
+    let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
+    // Check the data before creating the directory, so that a refused training leaves no files.
+    let plan = TrainingPlan::new(config, dataset)?;
+    training
+        .start
+        .map(|start| start::parameters(&plan, start))
+        .transpose()?;
+    let _lock = files.lock()?;
+    let model_dir = files.model_dir();
+    if model_dir.join(registry::MANIFEST_FILE).is_file() {
+        let manifest = Box::new(registry::manifest::read(&model_dir)?);
+        return Ok(TrainingOutcome::Finished { model_dir, manifest });
+    }
+    let mut state = match Checkpoint::load_latest(&files, (&plan.spec, &config.run), observer)? {
+        Some(checkpoint) => checkpoint.into_state(),
+        None => match initial_parameters(&plan, training, cancelled)? {
+            Some(parameters) => TrainState::new(parameters, &config.run)?,
+            None => {
+                return Ok(TrainingOutcome::Interrupted {
+                    stage: TrainingStage::Pretrain,
+                    step: 0,
+                });
+            }
+        },
+    };
+    for point in &state.history {
+        observer.on_event(TrainingEvent::Restored {
+            stage: point.stage,
+            step: point.step,
+            train_loss: point.train_loss,
+            validation_loss: point.validation_loss,
+        });
+    }
+    observer.on_event(TrainingEvent::Started {
+        stage: state.stage,
+        step: state.step,
+        windows: plan.train.len(),
+    });
+    let runner = StageRunner {
+        files: &files,
+        run: &config.run,
+        cancelled,
+    };
+    if state.stage == TrainingStage::Pretrain {
+        let codec = pretrain::CodecObjective::new(&plan, config)?;
+        if runner.run(&codec, &mut state, observer)? == StageEnd::Interrupted {
+            return Ok(TrainingOutcome::Interrupted {
+                stage: TrainingStage::Pretrain,
+                step: state.step,
+            });
+        }
+        state.start_stage(TrainingStage::Fit, &config.run)?;
+        runner.save(&state, observer)?;
+    }
+    let sequence = fit::SequenceObjective::new(&plan, config);
+    if runner.run(&sequence, &mut state, observer)? == StageEnd::Interrupted {
+        return Ok(TrainingOutcome::Interrupted {
+            stage: TrainingStage::Fit,
+            step: state.step,
+        });
+    }
+    state.restore_best()?;
+    let manifest = plan.manifest(training, &state)?;
+    write_history(&files, &state)?;
+    let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
+    Ok(TrainingOutcome::Finished { model_dir, manifest })
+}
+
+/// The weights to start from; `None` if cancelled.
+fn initial_parameters(
+    plan: &TrainingPlan<'_>,
+    training: &Training<'_>,
+    cancelled: &AtomicBool,
+) -> Result<Option<Parameters>, TrainError> {
+    let config = training.config;
+    if let Some(start) = training.start {
+        return start::parameters(plan, start).map(Some);
+    }
+    let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
+    if plan.spec.architecture == Architecture::Flow {
+        return Ok(Some(parameters));
+    }
+    let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
+    let stride = frames.len().div_ceil(MAX_PRINCIPAL_FRAMES).max(1);
+    let frames: Vec<usize> = frames.into_iter().step_by(stride).collect();
+    let (inputs, targets) = (plan.source.inputs(&frames)?, plan.source.targets(&frames)?);
+    match config.pretrain.start {
+        CodecStart::Random => random_codec::centre(&parameters, &inputs, &targets)?,
+        CodecStart::Principal => {
+            let seed = config.seed.derive("principal", 0);
+            if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
+                return Ok(None);
+            }
+        }
+    }
+    Ok(Some(parameters))
+}
+
+fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
+    let path = files.history();
+    let text = serde_json::to_vec(&state.history)
+        .map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
+    write_atomically(&path, &text).map_err(|source| TrainError::Io {
+        action: "write",
+        path,
+        source,
+    })
+}
+
+/// What is fixed before the first step: the windows and the model specification.
+struct TrainingPlan<'a> {
+    source: FrameSource<'a>,
+    spec: ModelSpec,
+    train: Vec<Window>,
+    validation: Vec<Window>,
+}
+
+impl<'a> TrainingPlan<'a> {
+    fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
+        let shape = config.window_shape();
+        let splits = Splits::new(dataset, config.data.split_seed);
+        let available = splits.windows(dataset, Split::Train, shape, 1)?;
+        let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
+        if available.is_empty() || validation.is_empty() {
+            return Err(TrainError::NoWindows {
+                train: available.len(),
+                validation: validation.len(),
+                frames: shape.frames(),
+            });
+        }
+        let train = match config.data.windows {
+            WindowBudget::Count(count) => {
+                splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
+            }
+            WindowBudget::All(_) => available,
+        };
+        let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
+        let validation = validation.into_iter().step_by(stride).collect();
+        let frames = window_frames(&train, shape.context + shape.horizon);
+        let spec = config.model_spec(dataset, &frames);
+        check_actions(config, dataset, &spec)?;
+        spec.validate()?;
+        let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
+        Ok(Self {
+            source: FrameSource::new(dataset, spec.preprocess, config.fit.target, augmentation),
+            spec,
+            train,
+            validation,
+        })
+    }
+
+    fn manifest(&self, training: &Training<'_>, state: &TrainState) -> Result<Manifest, TrainError> {
+        let (config, info) = (training.config, training.dataset.info());
+        let mut settings = serde_json::to_value(config).map_err(|error| TrainError::Config(error.to_string()))?;
+        if let Some(start) = training.start {
+            settings[START_KEY] = serde_json::json!({
+                "model": start.manifest.name,
+                "version": start.manifest.version,
+                "weights_sha256": start.manifest.weights_sha256,
+            });
+        }
+        Ok(Manifest {
+            name: config.name.clone(),
+            version: 1,
+            spec: self.spec.clone(),
+            weights_sha256: String::new(),
+            dataset: DatasetStamp {
+                name: info.name.clone(),
+                content_hash: info.content_hash.clone(),
+                scenario: info.scenario.clone(),
+                windows: self.train.len(),
+                split_seed: config.data.split_seed,
+            },
+            seed: config.seed,
+            command: training.command.to_owned(),
+            training: settings,
+            metrics: serde_json::json!({
+                "validation": { "mse": state.best_loss, "step": state.best_step }
+            }),
+            calibration: None,
+            parameters: self.spec.parameter_count(),
+            multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),
+            program: ProgramStamp::current(),
+        })
+    }
+}
+
+/// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.
+fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+    let never_change =
+        spec.action_inputs().is_some() && spec.actions.iter().all(|action| action.std <= MIN_CHANNEL_STD);
+    if !never_change || config.data.constant_actions {
+        return Ok(());
+    }
+    Err(TrainError::ConstantActions {
+        dataset: dataset.info().name.clone(),
+        has_actions: !spec.actions.is_empty(),
+        conditioning: spec.conditioning,
+    })
+}
+
+/// The distinct frames of windows of `length` frames, in increasing order.
+fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
+    let mut starts: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
+    starts.sort_unstable();
+    let (mut frames, mut next) = (Vec::new(), 0);
+    for start in starts {
+        // Windows overlap; each frame is listed once.
+        frames.extend(next.max(start)..start + length);
+        next = start + length;
+    }
+    frames
+}

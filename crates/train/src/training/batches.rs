@@ -1,0 +1,346 @@
+//! Makes batches of frames and windows as tensors, and shuffles the training data.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use candle_core::{Device, Tensor};
+use rand::seq::SliceRandom;
+use rayon::prelude::*;
+
+use super::TrainError;
+use super::augment::{ACTION, Augmentation, STATE, WindowChange};
+use super::config::Target;
+use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::nn::ConditioningTensors;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::sampler::WindowShape;
+use foreframe_data::dataset::{Dataset, Window};
+
+/// A data set's frames, converted to the model's value range.
+pub(super) struct FrameSource<'a> {
+    dataset: &'a Dataset,
+    preprocess: Preprocess,
+    target: Preprocess,
+    augmentation: Augmentation,
+}
+
+/// A window of a batch, and how it is changed.
+#[derive(Clone, Copy)]
+pub(super) struct DrawnWindow<'a> {
+    pub(super) window: &'a Window,
+    pub(super) change: WindowChange,
+}
+
+impl<'a> DrawnWindow<'a> {
+    /// The window as it was recorded.
+    pub(super) fn unchanged(window: &'a Window) -> Self {
+        Self {
+            window,
+            change: WindowChange::NONE,
+        }
+    }
+
+    /// The data set's frame at this place of the window of that shape, as it is played.
+    fn frame(&self, place: usize, shape: WindowShape) -> usize {
+        let last = shape.frames() - 1;
+        self.window.first_frame + if self.change.is_reversed { last - place } else { place }
+    }
+}
+
+/// One batch of windows.
+pub(super) struct WindowBatch {
+    /// Context frames as inputs of the encoder, `[B, T, P]`.
+    pub(super) inputs: Tensor,
+    /// Context frames as targets of the reconstruction, `[B, T, P]`.
+    pub(super) input_targets: Tensor,
+    /// Future frames as targets of the prediction, `[B, horizon, P]`.
+    pub(super) targets: Tensor,
+    /// Future frames as inputs of the encoder, `[B, horizon, P]`; only for teacher forcing.
+    pub(super) future: Option<Tensor>,
+    /// The actions that lead to the future frames, and the state at the last context frame.
+    pub(super) condition: ConditioningTensors,
+    /// The states at the targets `[B, horizon, S]`, where the data set has states.
+    pub(super) future_states: Option<Tensor>,
+}
+
+impl<'a> FrameSource<'a> {
+    pub(super) fn new(
+        dataset: &'a Dataset,
+        preprocess: Preprocess,
+        target: Target,
+        augmentation: Augmentation,
+    ) -> Self {
+        let target = match target {
+            Target::Sharp => Preprocess {
+                blur_sigma_px: 0.0,
+                ..preprocess
+            },
+            Target::Smoothed => preprocess,
+        };
+        Self {
+            dataset,
+            preprocess,
+            target,
+            augmentation,
+        }
+    }
+
+    /// The augmentation of training windows.
+    pub(super) fn augmentation(&self) -> &Augmentation {
+        &self.augmentation
+    }
+
+    /// The frames as inputs of the encoder, `[N, P]`.
+    pub(super) fn inputs(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
+        self.preprocessed(self.preprocess, &unchanged(frames))
+    }
+
+    /// The frames as targets of the decoder, `[N, P]`.
+    pub(super) fn targets(&self, frames: &[usize]) -> Result<Tensor, TrainError> {
+        self.preprocessed(self.target, &unchanged(frames))
+    }
+
+    fn preprocessed(&self, preprocess: Preprocess, frames: &[(usize, WindowChange)]) -> Result<Tensor, TrainError> {
+        let info = self.dataset.info();
+        let pixels = info.frame_pixels();
+        let width = info.frame_width_px as usize;
+        let mut values = vec![0.0; frames.len() * pixels];
+        values
+            .par_chunks_exact_mut(pixels)
+            .zip(frames)
+            .try_for_each(|(out, &(frame, change))| {
+                let mut frame = self.dataset.frame(frame)?;
+                if change.are_movers_mirrored {
+                    self.augmentation.mirror_movers(frame.pixels_mut(), width);
+                }
+                out.copy_from_slice(&preprocess.forward(&frame));
+                change.apply(out, width, preprocess.invert);
+                Ok::<(), TrainError>(())
+            })?;
+        Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
+    }
+
+    /// One batch of windows. `future` is made only if `with_future`.
+    pub(super) fn windows(
+        &self,
+        windows: &[DrawnWindow<'_>],
+        shape: WindowShape,
+        with_future: bool,
+    ) -> Result<WindowBatch, TrainError> {
+        let (context, horizon) = (shape.context, shape.horizon);
+        let span = |from: usize, length: usize| -> Vec<(usize, WindowChange)> {
+            let places = from..from + length;
+            windows
+                .iter()
+                .flat_map(|drawn| places.clone().map(|place| (drawn.frame(place, shape), drawn.change)))
+                .collect()
+        };
+        let inputs = |frames: &[(usize, WindowChange)]| self.preprocessed(self.preprocess, frames);
+        let targets = |frames: &[(usize, WindowChange)]| self.preprocessed(self.target, frames);
+        let (past, future) = (span(0, context), span(context, horizon));
+        let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
+        Ok(WindowBatch {
+            inputs: batched(inputs(&past)?, context)?,
+            input_targets: batched(targets(&past)?, context)?,
+            future: with_future
+                .then(|| inputs(&future))
+                .transpose()?
+                .map(|f| batched(f, horizon))
+                .transpose()?,
+            targets: batched(targets(&future)?, horizon)?,
+            condition: self.condition(windows, shape)?,
+            future_states: self.future_states(windows, shape)?,
+        })
+    }
+
+    fn future_states(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<Option<Tensor>, TrainError> {
+        let states = self.dataset.info().state_channels.len();
+        if states == 0 {
+            return Ok(None);
+        }
+        let mut values = Vec::with_capacity(windows.len() * shape.horizon * states);
+        for drawn in windows {
+            for place in shape.context..shape.frames() {
+                self.push(&mut values, STATE, (drawn.frame(place, shape), drawn.change));
+            }
+        }
+        let shape = (windows.len(), shape.horizon, states);
+        Ok(Some(Tensor::from_vec(values, shape, &Device::Cpu)?))
+    }
+
+    /// Appends a frame's action or state as it is in the changed window.
+    fn push(&self, values: &mut Vec<f32>, kind: usize, (frame, change): (usize, WindowChange)) {
+        let from = values.len();
+        values.extend_from_slice(if kind == ACTION {
+            self.dataset.action(frame)
+        } else {
+            self.dataset.state(frame)
+        });
+        if change.is_frame_mirrored {
+            self.augmentation.turn_signs(kind, &mut values[from..]);
+        }
+    }
+
+    fn condition(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {
+        let (actions, states) = (
+            self.dataset.info().action_channels.len(),
+            self.dataset.info().state_channels.len(),
+        );
+        let (mut future, mut present) = (Vec::new(), Vec::new());
+        for drawn in windows {
+            // An action acts from its frame to the next one, so the action of the last input leads to the first target. Models
+            // with windows that are played backwards take no actions.
+            let last = drawn.window.first_frame + shape.context - 1;
+            for frame in last..last + shape.horizon {
+                self.push(&mut future, ACTION, (frame, drawn.change));
+            }
+            self.push(
+                &mut present,
+                STATE,
+                (drawn.frame(shape.context - 1, shape), drawn.change),
+            );
+        }
+        let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
+        Ok(ConditioningTensors {
+            actions: (actions > 0)
+                .then(|| tensor(future, &[windows.len(), shape.horizon, actions]))
+                .transpose()?,
+            state: (states > 0)
+                .then(|| tensor(present, &[windows.len(), states]))
+                .transpose()?,
+        })
+    }
+}
+
+fn unchanged(frames: &[usize]) -> Vec<(usize, WindowChange)> {
+    frames.iter().map(|&frame| (frame, WindowChange::NONE)).collect()
+}
+
+/// Draws positions `0..count`, each once per epoch. The order depends only on the seed and the number of the draw, so that a
+/// resumed training draws the same positions as an uninterrupted one.
+pub(super) struct Shuffle {
+    count: usize,
+    seed: Seed,
+    /// The order of the epoch that was drawn from last: to shuffle millions of positions for each batch would take long.
+    last: Mutex<(usize, Arc<Vec<usize>>)>,
+}
+
+impl Shuffle {
+    /// Shuffles `count` positions. `count` is at least 1: a training without windows is refused earlier.
+    pub(super) fn new(count: usize, seed: Seed) -> Self {
+        Self {
+            count,
+            seed,
+            last: Mutex::new((usize::MAX, Arc::default())),
+        }
+    }
+
+    /// The positions of batch number `step`. A batch larger than the number of positions continues in the next epoch.
+    pub(super) fn batch(&self, step: usize, batch_size: usize) -> Vec<usize> {
+        let draws = step * batch_size..(step + 1) * batch_size;
+        let (mut epoch, mut order) = (usize::MAX, Arc::default());
+        draws
+            .map(|draw| {
+                if draw / self.count != epoch {
+                    epoch = draw / self.count;
+                    order = self.order(epoch);
+                }
+                order[draw % self.count]
+            })
+            .collect()
+    }
+
+    /// The positions in the order of an epoch.
+    fn order(&self, epoch: usize) -> Arc<Vec<usize>> {
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.0 != epoch {
+            let mut order: Vec<usize> = (0..self.count).collect();
+            order.shuffle(&mut self.seed.derive("epoch", epoch as u64).rng());
+            *last = (epoch, Arc::new(order));
+        }
+        Arc::clone(&last.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::training::TrainConfig;
+    use foreframe_core::types::Channel;
+    use foreframe_data::dataset::{DatasetInfo, EpisodeData};
+
+    /// Four frames of one pixel. Intensity and state of frame n are n / 5.
+    fn four_frames() -> Dataset {
+        let info = DatasetInfo {
+            frame_width_px: 1,
+            frame_height_px: 1,
+            frame_period_s: 0.1,
+            state_channels: vec![Channel::new("place", "m")],
+            ..DatasetInfo::default()
+        };
+        let episode = EpisodeData {
+            pixels: vec![0, 51, 102, 153],
+            states: vec![0.0, 0.2, 0.4, 0.6],
+            timestamps_s: vec![0.0, 0.1, 0.2, 0.3],
+            ..EpisodeData::default()
+        };
+        Dataset::from_episodes(info, vec![episode]).unwrap()
+    }
+
+    #[test]
+    fn a_reversed_window_is_played_backwards() {
+        let (dataset, config) = (four_frames(), TrainConfig::preset("moving-mnist").unwrap());
+        let augmentation = Augmentation::new(&config.data, &dataset, &[], Seed(1)).unwrap();
+        let source = FrameSource::new(&dataset, config.model.preprocess, Target::Sharp, augmentation);
+        let window = Window {
+            episode: 0,
+            first_frame: 0,
+        };
+        let shape = WindowShape { context: 3, horizon: 1 };
+        let played = |is_reversed| {
+            let change = WindowChange {
+                is_reversed,
+                ..WindowChange::NONE
+            };
+            let drawn = DrawnWindow {
+                window: &window,
+                change,
+            };
+            let batch = source.windows(&[drawn], shape, true).unwrap();
+            let tensors = [
+                Some(batch.inputs),
+                Some(batch.targets),
+                batch.future,
+                batch.condition.state,
+                batch.future_states,
+            ];
+            tensors.map(|tensor| tensor.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap())
+        };
+        let all = |inputs: &[f32], present: f32, next: f32| {
+            [inputs, &[next], &[next], &[present], &[next]].map(<[f32]>::to_vec)
+        };
+        assert_eq!(played(false), all(&[0.0, 0.2, 0.4], 0.4, 0.6));
+        assert_eq!(played(true), all(&[0.6, 0.4, 0.2], 0.2, 0.0));
+    }
+
+    #[test]
+    fn an_epoch_draws_every_position_once() {
+        let shuffle = Shuffle::new(10, Seed(3));
+        let mut first: Vec<usize> = (0..2).flat_map(|step| shuffle.batch(step, 5)).collect();
+        first.sort_unstable();
+        assert_eq!(first, (0..10).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_batch_larger_than_the_data_repeats_positions() {
+        let mut batch = Shuffle::new(3, Seed(1)).batch(0, 6);
+        batch.sort_unstable();
+        assert_eq!(batch, [0, 0, 1, 1, 2, 2]);
+    }
+
+    #[test]
+    fn a_batch_does_not_depend_on_earlier_batches() {
+        let (early, late) = (Shuffle::new(7, Seed(1)), Shuffle::new(7, Seed(1)));
+        (0..9).for_each(|step| drop(early.batch(step, 4)));
+        assert_eq!(early.batch(9, 4), late.batch(9, 4));
+    }
+}

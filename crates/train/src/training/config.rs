@@ -1,0 +1,359 @@
+//! The configuration of a training: all settings. `checks` has their ranges.
+
+mod checks;
+
+use serde::{Deserialize, Serialize};
+
+use super::TrainError;
+use super::optimizer::{OptimizerConfig, UpdateRule};
+use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::nn::loss::Loss;
+use foreframe_core::nn::{
+    Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, PredictorOutput, Reconstruction,
+};
+use foreframe_core::types::{Channel, Seed};
+use foreframe_data::dataset::{Dataset, sampler::WindowShape};
+
+/// All settings of a training. Together with the data set, they determine the weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// The model's name.
+    pub name: String,
+    /// The origin of all randomness.
+    pub seed: Seed,
+    /// Settings of the network.
+    pub model: ModelConfig,
+    /// Settings of the windows.
+    pub data: DataConfig,
+    /// Stage 1, pre-training: the dense codec alone, as an autoencoder of single frames.
+    pub pretrain: PretrainConfig,
+    /// Stage 2, sequence training: the recurrent network.
+    pub fit: FitConfig,
+    /// Settings of both stages.
+    pub run: RunConfig,
+}
+
+/// Settings of the network. The other values of the [`ModelSpec`] come from the data set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// The kind of network.
+    #[serde(default = "Architecture::dense")]
+    pub architecture: Architecture,
+    /// Number of context frames.
+    pub context: usize,
+    /// Number of predicted frames.
+    pub horizon: usize,
+    /// Features of a frame (dense network).
+    #[serde(default = "default_features")]
+    pub features: usize,
+    /// Hidden units of each LSTM (dense network).
+    #[serde(default = "default_hidden")]
+    pub hidden: usize,
+    /// Which of the paper's two approaches reconstructs the context (dense network).
+    #[serde(default = "default_reconstruction")]
+    pub reconstruction: Reconstruction,
+    /// Whether the predictor gives the change of the features or the features themselves (dense network).
+    #[serde(default = "PredictorOutput::residual")]
+    pub predictor_output: PredictorOutput,
+    /// The inputs of a prediction besides the context frames.
+    pub conditioning: Conditioning,
+    /// How frames are converted to the model's value range.
+    pub preprocess: Preprocess,
+    /// Layer sizes of the flow network.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flow: Option<FlowLayers>,
+}
+
+fn default_features() -> usize {
+    ModelSpec::default().features
+}
+
+fn default_hidden() -> usize {
+    ModelSpec::default().hidden
+}
+
+fn default_reconstruction() -> Reconstruction {
+    ModelSpec::default().reconstruction
+}
+
+/// Settings of the windows.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataConfig {
+    /// Number of training windows, drawn at random, or `"all"`.
+    pub windows: WindowBudget,
+    /// Largest number of validation windows used to choose the best weights.
+    pub validation_windows: usize,
+    /// The seed of the split into training, validation and test parts.
+    pub split_seed: Seed,
+    /// What is mirrored left to right in half of the training windows.
+    #[serde(default)]
+    pub mirror: Mirror,
+    /// Whether half of the training windows are played backwards. Only for models that take no actions and no state.
+    #[serde(default)]
+    pub reverse: bool,
+    /// Each training window is made brighter or darker by up to this share, 0 to 0.9.
+    #[serde(default)]
+    pub brightness: f64,
+    /// Each training window shows a part of the frames, enlarged: up to this share of each side is cut off, 0 to 0.5. Only for
+    /// data sets without a camera model.
+    #[serde(default)]
+    pub crop: f64,
+    /// Whether a model may be conditioned on actions that never change in the training windows.
+    #[serde(default)]
+    pub constant_actions: bool,
+}
+
+/// A number of windows, or all windows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum WindowBudget {
+    /// This number of windows.
+    Count(usize),
+    /// All windows.
+    All(All),
+}
+
+/// The word `all`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum All {
+    /// `"all"`
+    All,
+}
+
+/// What is mirrored left to right in half of the training windows: nothing (`"off"`), what moves in front of a standing
+/// camera (`"movers"`), or whole frames (a list of the channels of actions and states whose sign changes in a mirror, as in
+/// `["steering"]`; it may be empty).
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Mirror {
+    /// `"off"` or `"movers"`.
+    Word(MirrorWord),
+    /// Whole frames, with the sign of these channels changed.
+    Channels(Vec<String>),
+}
+
+/// A word for what is mirrored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MirrorWord {
+    /// `"off"`
+    Off,
+    /// `"movers"`
+    Movers,
+}
+
+impl Default for Mirror {
+    fn default() -> Self {
+        Self::Word(MirrorWord::Off)
+    }
+}
+
+/// Settings of pre-training (stage 1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PretrainConfig {
+    /// The initial weights of the codec.
+    pub start: CodecStart,
+    /// Number of updates.
+    pub steps: usize,
+    /// Frames per update.
+    pub batch_size: usize,
+    /// The highest learning rate.
+    pub learning_rate: f64,
+}
+
+/// The initial weights of the codec.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CodecStart {
+    /// The principal components of the training frames.
+    Principal,
+    /// Random weights, with biases that centre the features.
+    Random,
+}
+
+/// Settings of sequence training (stage 2).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FitConfig {
+    /// Number of updates.
+    pub steps: usize,
+    /// Windows per update.
+    pub batch_size: usize,
+    /// The highest learning rate.
+    pub learning_rate: f64,
+    /// Whether the pre-trained codec is trained further.
+    pub codec: CodecTraining,
+    /// The loss function, computed in the model's value range.
+    pub loss: Loss,
+    /// The target frames of the decoder, in both stages.
+    pub target: Target,
+    /// What the predictor gets as the previous frame in training, after its first step.
+    pub feedback: TrainingFeedback,
+    /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
+    /// trained.
+    pub reconstruction_weight: f64,
+    /// Weight of the similarity loss (flow network): 1 minus the structural similarity of the predicted frames.
+    #[serde(default)]
+    pub ssim_weight: f64,
+    /// In this share of the updates, the first ones, the frame and SSIM losses count only the first `short_horizon` predicted
+    /// frames of each window (flow network). In its recurrent form, these updates take less time.
+    #[serde(default)]
+    pub short_share: f64,
+    /// Frames that count in these first updates, 1 to the horizon.
+    #[serde(default = "FitConfig::default_short_horizon")]
+    pub short_horizon: usize,
+    /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
+    #[serde(default)]
+    pub scene_weight: f64,
+    /// Weight of the motion loss (flow network): the difference between the predicted camera motion and the motion between
+    /// the measured poses, if the states have a pose.
+    #[serde(default)]
+    pub motion_weight: f64,
+}
+
+impl FitConfig {
+    fn default_short_horizon() -> usize {
+        1
+    }
+
+    /// How many frames of a window of `horizon` count in the update after `step` updates.
+    pub(super) fn frames_that_count(&self, step: usize, horizon: usize) -> usize {
+        if (step as f64) < self.short_share * self.steps as f64 {
+            self.short_horizon
+        } else {
+            horizon
+        }
+    }
+}
+
+/// The target frames of the decoder, in both stages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Target {
+    /// The camera's frames without smoothing, inverted if the model inverts.
+    Sharp,
+    /// The same frames as the encoder's inputs: smoothed.
+    Smoothed,
+}
+
+/// How the pre-trained codec is used in stage 2.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CodecTraining {
+    /// Its weights do not change.
+    Frozen,
+    /// It is trained together with the recurrent network.
+    FineTuned,
+}
+
+/// What the predictor gets as the previous frame in training, after its first step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TrainingFeedback {
+    /// Its own last prediction, as in use (autoregressive).
+    Prediction,
+    /// The true frame's features (teacher forcing).
+    TeacherForcing,
+}
+
+/// Settings of both stages.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// How weights are updated: `"adam"`, or `"muon"` (flow network).
+    #[serde(default)]
+    pub optimizer: UpdateRule,
+    /// Updates over which the learning rate rises from 0.
+    pub warmup_steps: usize,
+    /// The final learning rate as a share of the highest one; the rate decreases along a cosine.
+    pub final_learning_rate: f64,
+    /// The largest norm of all gradients together; larger gradients are scaled down.
+    pub clip_norm: f64,
+    /// Number of equal parts of a batch whose gradients are computed in parallel, each on one core.
+    pub batch_parts: usize,
+    /// Updates between two validations.
+    pub validate_every_steps: usize,
+    /// Updates between two checkpoints.
+    pub checkpoint_every_steps: usize,
+}
+
+impl RunConfig {
+    /// The optimizer's constants.
+    pub(super) fn optimizer(&self) -> OptimizerConfig {
+        OptimizerConfig {
+            rule: self.optimizer,
+            clip_norm: self.clip_norm,
+            ..OptimizerConfig::default()
+        }
+    }
+}
+
+impl TrainConfig {
+    /// The configuration as TOML text. Errors: `Config`.
+    pub fn to_toml(&self) -> Result<String, TrainError> {
+        toml::to_string_pretty(self).map_err(|error| TrainError::Config(error.to_string()))
+    }
+
+    /// Context and horizon of a window.
+    #[must_use]
+    pub fn window_shape(&self) -> WindowShape {
+        WindowShape {
+            context: self.model.context,
+            horizon: self.model.horizon,
+        }
+    }
+
+    /// The model specification for this data set. Channels are scaled by their statistics over the given training frames.
+    #[must_use]
+    pub fn model_spec(&self, dataset: &Dataset, frames: &[usize]) -> ModelSpec {
+        let (info, model) = (dataset.info(), &self.model);
+        let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
+        let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
+        let is_flow = model.architecture == Architecture::Flow;
+        ModelSpec {
+            architecture: model.architecture,
+            frame_width_px: info.frame_width_px,
+            frame_height_px: info.frame_height_px,
+            frame_period_s: info.frame_period_s,
+            preprocess: model.preprocess,
+            context: model.context,
+            horizon: model.horizon,
+            features: model.features,
+            hidden: model.hidden,
+            reconstruction: model.reconstruction,
+            predictor_output: model.predictor_output,
+            conditioning: model.conditioning,
+            actions,
+            states,
+            flow: is_flow.then(|| model.flow.unwrap_or_default()),
+            camera: info.camera.filter(|_| is_flow),
+        }
+    }
+}
+
+/// Mean and standard deviation of each channel over the frames.
+fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> &'a [f32]) -> Vec<ChannelScale> {
+    let count = frames.len().max(1) as f64;
+    let moment = |index: usize, power: i32, mean: f64| {
+        frames
+            .iter()
+            .map(|&frame| (f64::from(values(frame)[index]) - mean).powi(power))
+            .sum::<f64>()
+            / count
+    };
+    let scale = |(index, channel): (usize, &Channel)| {
+        let mean = moment(index, 1, 0.0);
+        ChannelScale {
+            name: channel.name.clone(),
+            unit: channel.unit.clone(),
+            mean: mean as f32,
+            std: (moment(index, 2, mean).sqrt() as f32).max(1e-3),
+        }
+    };
+    channels.iter().enumerate().map(scale).collect()
+}

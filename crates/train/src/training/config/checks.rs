@@ -1,0 +1,121 @@
+//! The ranges of all settings of a training, and which settings others must allow.
+
+use super::{Mirror, MirrorWord, TrainConfig, WindowBudget};
+use crate::training::TrainError;
+use crate::training::optimizer::UpdateRule;
+use foreframe_core::nn::{Architecture, Conditioning};
+
+/// Largest number of steps of one stage.
+const MAX_STEPS: usize = 10_000_000;
+/// Largest number of windows or frames in one batch.
+const MAX_BATCH_SIZE: usize = 4096;
+
+impl TrainConfig {
+    /// Checks all settings. Errors: `Config` with the first field that is out of range, and its range.
+    pub fn validate(&self) -> Result<(), TrainError> {
+        if !foreframe_core::registry::is_valid_name(&self.name) {
+            return Err(foreframe_core::registry::RegistryError::Name(self.name.clone()).into());
+        }
+        let (run, fit, pretrain) = (&self.run, &self.fit, &self.pretrain);
+        let counts = [
+            ("pretrain.steps", pretrain.steps, 0, MAX_STEPS),
+            ("pretrain.batch_size", pretrain.batch_size, 1, MAX_BATCH_SIZE),
+            ("fit.steps", fit.steps, 1, MAX_STEPS),
+            ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),
+            ("data.validation_windows", self.data.validation_windows, 1, MAX_STEPS),
+            ("run.batch_parts", run.batch_parts, 1, 64),
+            ("run.validate_every_steps", run.validate_every_steps, 1, MAX_STEPS),
+            ("run.checkpoint_every_steps", run.checkpoint_every_steps, 1, MAX_STEPS),
+            ("run.warmup_steps", run.warmup_steps, 0, MAX_STEPS),
+        ];
+        for (field, value, min, max) in counts {
+            if !(min..=max).contains(&value) {
+                return Err(TrainError::Config(format!(
+                    "{field} is {value}; it must be {min} to {max}"
+                )));
+            }
+        }
+        let numbers = [
+            ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
+            ("fit.learning_rate", fit.learning_rate, 1.0),
+            ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
+            ("fit.ssim_weight", fit.ssim_weight, 100.0),
+            ("fit.short_share", fit.short_share, 0.9),
+            ("fit.scene_weight", fit.scene_weight, 100.0),
+            ("fit.motion_weight", fit.motion_weight, 100.0),
+            ("data.brightness", self.data.brightness, 0.9),
+            ("data.crop", self.data.crop, 0.5),
+            ("run.final_learning_rate", run.final_learning_rate, 1.0),
+            ("run.clip_norm", run.clip_norm, 1e6),
+        ];
+        for (field, value, max) in numbers {
+            if !(0.0..=max).contains(&value) {
+                return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {max}")));
+            }
+        }
+        for (field, value) in [
+            ("fit.learning_rate", fit.learning_rate),
+            ("run.clip_norm", run.clip_norm),
+        ] {
+            if value == 0.0 {
+                return Err(TrainError::Config(format!(
+                    "{field} is 0, so nothing would be learned; it must be above 0"
+                )));
+            }
+        }
+        for (field, size) in [
+            ("pretrain.batch_size", pretrain.batch_size),
+            ("fit.batch_size", fit.batch_size),
+        ] {
+            if !size.is_multiple_of(run.batch_parts) {
+                return Err(TrainError::Config(format!(
+                    "{field} is {size}; it must be a multiple of run.batch_parts, {}",
+                    run.batch_parts
+                )));
+            }
+        }
+        if self.data.windows == WindowBudget::Count(0) {
+            return Err(TrainError::Config(
+                "data.windows is 0; it must be at least 1, or \"all\"".to_owned(),
+            ));
+        }
+        self.validate_together()
+    }
+
+    /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
+    fn validate_together(&self) -> Result<(), TrainError> {
+        let (run, fit) = (&self.run, &self.fit);
+        if self.model.architecture == Architecture::Dense {
+            let refused = [
+                ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
+                ("fit.short_share", fit.short_share > 0.0, "0"),
+            ];
+            if let Some((field, _, needed)) = refused.iter().find(|(_, is_set, _)| *is_set) {
+                return Err(TrainError::Config(format!(
+                    "{field} is for the flow network only; it must be {needed} where model.architecture is dense"
+                )));
+            }
+        }
+        if self.data.mirror == Mirror::Word(MirrorWord::Movers) && self.model.conditioning != Conditioning::None {
+            return Err(TrainError::Config(format!(
+                "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
+                 model.conditioning is {}: set it to none, or data.mirror to off",
+                self.model.conditioning
+            )));
+        }
+        if self.data.reverse && self.model.conditioning != Conditioning::None {
+            return Err(TrainError::Config(format!(
+                "data.reverse is true, but actions and states do not fit a window that is played backwards; \
+                 model.conditioning is {}: set it to none, or data.reverse to false",
+                self.model.conditioning
+            )));
+        }
+        if fit.short_share > 0.0 && !(1..=self.model.horizon).contains(&fit.short_horizon) {
+            return Err(TrainError::Config(format!(
+                "fit.short_horizon is {}; it must be 1 to model.horizon, {}",
+                fit.short_horizon, self.model.horizon
+            )));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,148 @@
+//! Stage 2, sequence training: trains the encoder together with its two decoders, for prediction and for reconstruction.
+
+use candle_core::Tensor;
+
+use super::batches::{DrawnWindow, Shuffle, WindowBatch};
+use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
+use super::observer::TrainingStage;
+use super::stage::{BatchPart, Objective};
+use super::{TrainError, TrainingPlan};
+use foreframe_core::nn::loss::Loss;
+use foreframe_core::nn::ssim_loss::ssim_loss;
+use foreframe_core::nn::{Architecture, Feedback, Model, Parameters};
+
+/// Prefix of the names of the codec's tensors.
+const CODEC_PREFIX: &str = "frame_";
+/// Validation windows per batch.
+const VALIDATION_BATCH_SIZE: usize = 64;
+
+/// The loss of prediction and reconstruction.
+pub(super) struct SequenceObjective<'a> {
+    plan: &'a TrainingPlan<'a>,
+    config: &'a TrainConfig,
+    shuffle: Shuffle,
+}
+
+impl<'a> SequenceObjective<'a> {
+    pub(super) fn new(plan: &'a TrainingPlan<'a>, config: &'a TrainConfig) -> Self {
+        Self {
+            plan,
+            config,
+            shuffle: Shuffle::new(plan.train.len(), config.seed.derive("fit", 0)),
+        }
+    }
+
+    fn is_frozen(&self) -> bool {
+        self.config.fit.codec == CodecTraining::Frozen
+    }
+
+    /// Encodes frames `[B, T, P]` to features `[B, T, F]`.
+    fn features(&self, model: &Model, frames: &Tensor) -> Result<Tensor, TrainError> {
+        let (batch, time, pixels) = frames.dims3()?;
+        let features = model.encode_frames(&frames.reshape((batch * time, pixels))?)?;
+        Ok(features.reshape((batch, time, self.plan.spec.code_len()))?)
+    }
+
+    /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
+    /// In the frame and SSIM losses, only the first `counting` frames count.
+    fn flow_loss(&self, model: &Model, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
+        let fit = &self.config.fit;
+        let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition, counting)? else {
+            return Err(TrainError::Config("only the flow network has this loss".to_owned()));
+        };
+        let targets = batch.targets.narrow(1, 0, counting)?.contiguous()?;
+        let mut loss = fit.loss.between(&predicted.frames, &targets)?;
+        if fit.ssim_weight > 0.0 {
+            let width = self.plan.spec.frame_width_px as usize;
+            let similarity = ssim_loss(&predicted.frames, &targets, width)?;
+            loss = (loss + (similarity * fit.ssim_weight)?)?;
+        }
+        if fit.scene_weight > 0.0 {
+            let scene = fit.loss.between(&predicted.scene, &batch.targets)?;
+            loss = (loss + (scene * fit.scene_weight)?)?;
+        }
+        if fit.motion_weight > 0.0
+            && let (Some(state), Some(future)) = (&batch.condition.state, &batch.future_states)
+            && let Some(truth) = self.plan.spec.measured_motion(state, future)?
+        {
+            let motion = Loss::Mse.between(&predicted.motion, &truth)?;
+            loss = (loss + (motion * fit.motion_weight)?)?;
+        }
+        Ok(loss)
+    }
+
+    /// Decodes features `[B, T, F]` to frames `[B, T, P]`.
+    fn frames(model: &Model, features: &Tensor) -> Result<Tensor, TrainError> {
+        let (batch, time, width) = features.dims3()?;
+        let frames = model.decode_frames(&features.reshape((batch * time, width))?)?;
+        Ok(frames.reshape((batch, time, ()))?)
+    }
+}
+
+impl Objective for SequenceObjective<'_> {
+    fn stage(&self) -> TrainingStage {
+        TrainingStage::Fit
+    }
+
+    fn steps(&self) -> usize {
+        self.config.fit.steps
+    }
+
+    fn learning_rate(&self) -> f64 {
+        self.config.fit.learning_rate
+    }
+
+    fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
+        let fit = &self.config.fit;
+        let drawn = self.shuffle.batch(step, fit.batch_size).into_iter().enumerate();
+        let windows = drawn.map(|(place, position)| DrawnWindow {
+            window: &self.plan.train[position],
+            change: self.plan.source.augmentation().draw(step, place),
+        });
+        let windows = part.of(windows.collect());
+        let is_teacher_forced = fit.feedback == TrainingFeedback::TeacherForcing;
+        let batch = self
+            .plan
+            .source
+            .windows(&windows, self.config.window_shape(), is_teacher_forced)?;
+        let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
+        let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
+        if self.plan.spec.architecture == Architecture::Flow {
+            let counting = fit.frames_that_count(step, self.plan.spec.horizon);
+            return self.flow_loss(&model, &batch, counting);
+        }
+        let inputs = self.features(&model, &batch.inputs)?;
+        let true_features = batch
+            .future
+            .as_ref()
+            .map(|future| self.features(&model, future))
+            .transpose()?;
+        let feedback = true_features
+            .as_ref()
+            .map_or(Feedback::Prediction, Feedback::TeacherForcing);
+        let predicted = model.predict(&inputs, &batch.condition, feedback)?;
+        let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
+        if fit.reconstruction_weight == 0.0 {
+            return Ok(loss);
+        }
+        let Some(reconstructed) = model.reconstruct(&inputs)? else {
+            return Ok(loss);
+        };
+        let reconstructed = Self::frames(&model, &reconstructed)?;
+        let reconstruction = fit.loss.between(&reconstructed, &batch.input_targets)?;
+        Ok((loss + (reconstruction * fit.reconstruction_weight)?)?)
+    }
+
+    fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
+        let model = Model::new(self.plan.spec.clone(), parameters)?;
+        let windows: Vec<DrawnWindow> = self.plan.validation.iter().map(DrawnWindow::unchanged).collect();
+        let mut sum = 0.0;
+        for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
+            let batch = self.plan.source.windows(chunk, self.config.window_shape(), false)?;
+            let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
+            let loss = Loss::Mse.between(&predicted, &batch.targets)?.to_scalar::<f32>()?;
+            sum += f64::from(loss) * chunk.len() as f64;
+        }
+        Ok(sum / windows.len().max(1) as f64)
+    }
+}

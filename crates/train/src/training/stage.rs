@@ -1,0 +1,255 @@
+//! The training loop of both stages: draw a batch, compute gradients, update; validate and keep the best weights; write
+//! checkpoints.
+
+use std::collections::BTreeMap;
+use std::f64::consts::PI;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use candle_core::Tensor;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::TrainError;
+use super::checkpoint::{Checkpoint, RunFiles};
+use super::config::RunConfig;
+use super::observer::{Observer, TrainingEvent, TrainingStage};
+use super::optimizer::{Gradients, Optimizer, OptimizerError};
+use foreframe_core::nn::Parameters;
+
+/// A larger loss counts as diverged, because pixels are in 0…1.
+const MAX_LOSS: f64 = 1e3;
+
+/// The objective of a stage.
+pub(super) trait Objective: Sync {
+    /// The stage.
+    fn stage(&self) -> TrainingStage;
+    /// Number of updates.
+    fn steps(&self) -> usize;
+    /// The highest learning rate.
+    fn learning_rate(&self) -> f64;
+    /// The loss of one part of a step's batch, as a scalar with gradients.
+    fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
+    /// The mean squared error of the validation split against the target frames.
+    fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
+}
+
+/// One of the equal parts of a batch, whose gradients are computed in parallel. Their number is a setting and not the number
+/// of cores, so that the result has the same bits on every machine.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct BatchPart {
+    pub(super) index: usize,
+    pub(super) count: usize,
+}
+
+impl BatchPart {
+    /// This part of the batch's items.
+    pub(super) fn of<T>(self, items: Vec<T>) -> Vec<T> {
+        let size = items.len() / self.count;
+        items.into_iter().skip(self.index * size).take(size).collect()
+    }
+}
+
+/// One point of the loss curves.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct HistoryPoint {
+    pub(super) stage: TrainingStage,
+    pub(super) step: usize,
+    pub(super) train_loss: f64,
+    pub(super) validation_loss: f64,
+}
+
+/// The training state: everything that the next step depends on.
+pub(super) struct TrainState {
+    pub(super) stage: TrainingStage,
+    /// Number of completed updates of the stage.
+    pub(super) step: usize,
+    pub(super) parameters: Parameters,
+    pub(super) optimizer: Optimizer,
+    /// The parameters with the lowest validation loss of the stage.
+    pub(super) best: BTreeMap<String, Tensor>,
+    pub(super) best_step: usize,
+    pub(super) best_loss: Option<f64>,
+    pub(super) history: Vec<HistoryPoint>,
+}
+
+impl TrainState {
+    pub(super) fn new(parameters: Parameters, run: &RunConfig) -> Result<Self, TrainError> {
+        let best = parameters.snapshot()?;
+        Ok(Self {
+            stage: TrainingStage::Pretrain,
+            step: 0,
+            parameters,
+            optimizer: Optimizer::new(run.optimizer()),
+            best,
+            best_step: 0,
+            best_loss: None,
+            history: Vec::new(),
+        })
+    }
+
+    /// Restores the best weights of this stage and starts the next stage with a new optimizer.
+    pub(super) fn start_stage(&mut self, stage: TrainingStage, run: &RunConfig) -> Result<(), TrainError> {
+        self.restore_best()?;
+        self.stage = stage;
+        self.step = 0;
+        self.optimizer = Optimizer::new(run.optimizer());
+        self.best_step = 0;
+        self.best_loss = None;
+        Ok(())
+    }
+
+    /// Sets the parameters to the best weights of this stage.
+    pub(super) fn restore_best(&mut self) -> Result<(), TrainError> {
+        self.parameters.restore(&self.best)?;
+        Ok(())
+    }
+}
+
+/// How a stage ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum StageEnd {
+    Done,
+    Interrupted,
+}
+
+/// Runs the training loop of a stage.
+pub(super) struct StageRunner<'a> {
+    pub(super) files: &'a RunFiles,
+    pub(super) run: &'a RunConfig,
+    pub(super) cancelled: &'a AtomicBool,
+}
+
+impl StageRunner<'_> {
+    /// Runs until the stage's last step or until cancelled, then writes a checkpoint. Errors: `Diverged`, and those of the
+    /// objective; the last checkpoint stays on disk.
+    pub(super) fn run(
+        &self,
+        objective: &dyn Objective,
+        state: &mut TrainState,
+        observer: &mut dyn Observer,
+    ) -> Result<StageEnd, TrainError> {
+        let (stage, steps) = (objective.stage(), objective.steps());
+        let mut saved_step = state.step;
+        while state.step < steps {
+            if self.cancelled.load(Ordering::Relaxed) {
+                self.save(state, observer)?;
+                return Ok(StageEnd::Interrupted);
+            }
+            let loss = self.update(objective, state, saved_step)?;
+            state.step += 1;
+            let step = state.step;
+            observer.on_event(TrainingEvent::Step {
+                stage,
+                step,
+                steps,
+                loss,
+            });
+            if step.is_multiple_of(self.run.validate_every_steps) || step == steps {
+                Self::validate(objective, state, loss, observer)?;
+            }
+            if step.is_multiple_of(self.run.checkpoint_every_steps) || step == steps {
+                self.save(state, observer)?;
+                saved_step = step;
+            }
+        }
+        Ok(StageEnd::Done)
+    }
+
+    /// Computes one update and returns the batch's loss.
+    fn update(
+        &self,
+        objective: &dyn Objective,
+        state: &mut TrainState,
+        checkpoint_step: usize,
+    ) -> Result<f64, TrainError> {
+        let step = state.step;
+        let diverged = |what| TrainError::Diverged {
+            stage: objective.stage(),
+            step: step + 1,
+            what,
+            checkpoint_step,
+        };
+        let parameters = &state.parameters;
+        let gradients_of_part = |index| -> Result<Result<Gradients, OptimizerError>, TrainError> {
+            let loss = objective.loss(
+                parameters,
+                step,
+                BatchPart {
+                    index,
+                    count: self.run.batch_parts,
+                },
+            )?;
+            Ok(Gradients::of(&loss, parameters, &[]))
+        };
+        let parts = (0..self.run.batch_parts)
+            .into_par_iter()
+            .map(gradients_of_part)
+            .collect::<Result<Vec<_>, _>>()?;
+        let rate = objective.learning_rate() * self.schedule(step, objective.steps());
+        let updated = parts
+            .into_iter()
+            .collect::<Result<_, _>>()
+            .and_then(Gradients::mean)
+            .and_then(|gradients| {
+                state.optimizer.update(&state.parameters, &gradients, rate)?;
+                Ok(gradients.loss())
+            });
+        match updated {
+            Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, more than {MAX_LOSS}"))),
+            Ok(loss) => Ok(loss),
+            Err(OptimizerError::LossNotFinite { value }) => Err(diverged(format!("the loss is {value}"))),
+            Err(error @ OptimizerError::GradientNotFinite { .. }) => Err(diverged(error.to_string())),
+            Err(other) => Err(TrainError::Optimizer(other)),
+        }
+    }
+
+    /// The learning rate as a share of its highest value: a linear rise, then half a cosine.
+    fn schedule(&self, step: usize, steps: usize) -> f64 {
+        let (step, steps, warmup) = (step as f64, steps as f64, self.run.warmup_steps as f64);
+        if step < warmup {
+            return (step + 1.0) / warmup;
+        }
+        let progress = (step - warmup) / (steps - warmup).max(1.0);
+        let last = self.run.final_learning_rate;
+        last + (1.0 - last) * 0.5 * (1.0 + (PI * progress).cos())
+    }
+
+    fn validate(
+        objective: &dyn Objective,
+        state: &mut TrainState,
+        train_loss: f64,
+        observer: &mut dyn Observer,
+    ) -> Result<(), TrainError> {
+        let (stage, step) = (objective.stage(), state.step);
+        let loss = objective.validation_loss(&state.parameters)?;
+        let is_best = state.best_loss.is_none_or(|best| loss < best);
+        if is_best {
+            state.best = state.parameters.snapshot()?;
+            state.best_step = step;
+            state.best_loss = Some(loss);
+        }
+        state.history.push(HistoryPoint {
+            stage,
+            step,
+            train_loss,
+            validation_loss: loss,
+        });
+        observer.on_event(TrainingEvent::Validated {
+            stage,
+            step,
+            loss,
+            is_best,
+        });
+        Ok(())
+    }
+
+    /// Writes a checkpoint.
+    pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
+        Checkpoint::save(self.files, state)?;
+        observer.on_event(TrainingEvent::Checkpointed {
+            stage: state.stage,
+            step: state.step,
+        });
+        Ok(())
+    }
+}
