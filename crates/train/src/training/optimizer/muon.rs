@@ -77,7 +77,15 @@ fn orthogonal(matrix: &Tensor) -> Result<Tensor, OptimizerError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use foreframe_core::nn::gradient_check::noise;
+    use foreframe_core::types::Seed;
+
+    /// Values −1 to 1 without a pattern.
+    fn noise(shape: &[usize; 2], seed: u64) -> Tensor {
+        use rand::Rng as _;
+        let mut rng = Seed(seed).rng();
+        let values: Vec<f32> = (0..shape[0] * shape[1]).map(|_| rng.random_range(-1.0..=1.0)).collect();
+        Tensor::from_vec(values, shape.as_slice(), &Device::Cpu).unwrap()
+    }
 
     #[test]
     fn rows_become_orthogonal_and_of_length_one() {
