@@ -77,6 +77,7 @@ mod sim;
 mod sim_errors;
 mod sizes;
 mod slow_clients;
+mod source_graph;
 mod store;
 mod store_attempts;
 mod store_away;
