@@ -17,6 +17,7 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use crate::keys::new_key;
 use crate::service::{InProcessServer, TIMEOUT, post, run};
+use crate::skip::skip_without;
 
 const PROGRAMS: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 
@@ -183,7 +184,7 @@ async fn serve_with(data_dir: &Path, max_environments: usize) -> (App, Keys, InP
 #[tokio::test]
 async fn the_page_drives_a_robot_and_shows_predictions() {
     let Some(program) = chromium() else {
-        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        skip_without("there is no Chromium in PATH; install it to have the page tested");
         return;
     };
     let dir = tempfile::tempdir().unwrap();
@@ -225,7 +226,7 @@ async fn the_page_drives_a_robot_and_shows_predictions() {
 #[tokio::test]
 async fn the_page_asks_for_an_api_key_and_hides_it() {
     let Some(program) = chromium() else {
-        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        skip_without("there is no Chromium in PATH; install it to have the page tested");
         return;
     };
     let dir = tempfile::tempdir().unwrap();
@@ -273,7 +274,7 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
 #[tokio::test]
 async fn the_documentation_is_shown_under_its_security_policy() {
     let Some(program) = chromium() else {
-        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        skip_without("there is no Chromium in PATH; install it to have the page tested");
         return;
     };
     let dir = tempfile::tempdir().unwrap();
@@ -294,7 +295,7 @@ async fn the_documentation_is_shown_under_its_security_policy() {
 #[tokio::test]
 async fn page_deletes_its_environment_when_it_closes() {
     let Some(program) = chromium() else {
-        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        skip_without("there is no Chromium in PATH; install it to have the page tested");
         return;
     };
     let dir = tempfile::tempdir().unwrap();
@@ -313,7 +314,7 @@ async fn page_deletes_its_environment_when_it_closes() {
 #[tokio::test]
 async fn page_says_what_to_do_without_models() {
     let Some(program) = chromium() else {
-        eprintln!("skipped: there is no Chromium in PATH; install it to have the page tested");
+        skip_without("there is no Chromium in PATH; install it to have the page tested");
         return;
     };
     let dir = tempfile::tempdir().unwrap();

@@ -76,6 +76,7 @@ mod shared_datasets;
 mod sim;
 mod sim_errors;
 mod sizes;
+mod skip;
 mod slow_clients;
 mod source_graph;
 mod store;

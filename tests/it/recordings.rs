@@ -11,6 +11,7 @@ use foreframe::types::Channel;
 use serde_json::json;
 
 use crate::bag_files::{BagMessage, Chunks, image, mcap, odometry, twist};
+use crate::skip::skip_without;
 
 /// Size of the recorded images in pixels.
 pub(crate) const SIZE: (u32, u32) = (48, 32);
@@ -259,7 +260,7 @@ pub(crate) fn has_ffmpeg() -> bool {
     };
     let found = starts("ffmpeg") && starts("ffprobe");
     if !found {
-        eprintln!("skipped: ffmpeg and ffprobe are not installed");
+        skip_without("ffmpeg and ffprobe are not installed");
     }
     found
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use crate::skip::skip_without;
 use foreframe::store::{
     Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob, Store,
     StoreConfig,
@@ -29,7 +30,7 @@ fn config(database: Option<String>) -> (TempDir, StoreConfig) {
 /// The URL of a new database beside the one that `FOREFRAME_TEST_POSTGRES` names.
 pub(crate) async fn postgres(name: &str) -> Option<String> {
     let Ok(url) = std::env::var("FOREFRAME_TEST_POSTGRES") else {
-        println!("skipped on PostgreSQL: FOREFRAME_TEST_POSTGRES holds no URL");
+        skip_without("FOREFRAME_TEST_POSTGRES holds no URL of a PostgreSQL server");
         return None;
     };
     let mut connection = PgConnection::connect(&url).await.unwrap();

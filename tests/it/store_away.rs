@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 use crate::process::{RunningServer, output, text};
 use crate::service::TIMEOUT;
+use crate::skip::skip_without;
 
 /// A PostgreSQL server of this test. Dropping it stops it.
 pub(crate) struct OwnPostgres {
@@ -24,7 +25,7 @@ impl OwnPostgres {
     /// A new database cluster that is not started yet; none if PostgreSQL is not installed.
     pub(crate) fn new() -> Option<Self> {
         let Some(tools) = tools() else {
-            println!("skipped: PostgreSQL's programs are not installed");
+            skip_without("PostgreSQL's programs are not installed");
             return None;
         };
         let dir = tempfile::tempdir().unwrap();

@@ -66,7 +66,8 @@ pub struct TrainSpec {
     /// The model's name: a to z, 0 to 9 and `-`, at most 64 characters.
     #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: String,
-    /// `paper`, `static` or `moving`.
+    /// The preset of its settings.
+    #[schema(schema_with = preset_schema)]
     pub preset: String,
     /// Name of a data set in the data directory.
     pub dataset: String,
@@ -74,6 +75,15 @@ pub struct TrainSpec {
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
     pub settings: serde_json::Map<String, serde_json::Value>,
+}
+
+/// The names of all presets.
+fn preset_schema() -> utoipa::openapi::Object {
+    utoipa::openapi::ObjectBuilder::new()
+        .schema_type(utoipa::openapi::Type::String)
+        .description(Some("The preset of its settings."))
+        .enum_values(Some(TrainConfig::preset_names()))
+        .build()
 }
 
 /// An evaluation: writes a report with figures, which the job's files contain.
