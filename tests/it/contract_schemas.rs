@@ -182,8 +182,9 @@ fn every_example_in_asyncapi_fits_its_schema() {
 
 /// The bodies that the documents send with curl: path and JSON.
 fn documented_bodies() -> Vec<(String, Value)> {
-    let (readme, mut found) = (read("README.md").replace("\\\n", " "), Vec::new());
-    for command in readme.split("\ncurl ").skip(1) {
+    let documents = ["README.md", "docs/http.md", "docs/training.md", "docs/operations.md"].map(read);
+    let (text, mut found) = (documents.join("\n").replace("\\\n", " "), Vec::new());
+    for command in text.split("\ncurl ").skip(1) {
         let address = command.split("8642").nth(1).unwrap().split_whitespace().next().unwrap();
         let Some((_, rest)) = command.split_once("-d ") else {
             continue;
@@ -198,7 +199,7 @@ fn documented_bodies() -> Vec<(String, Value)> {
 }
 
 #[test]
-fn every_body_in_the_readme_fits_its_schema() {
+fn every_body_in_the_documents_fits_its_schema() {
     let mut contracts = Contracts::read();
     let bodies = documented_bodies();
     let mismatches: Vec<_> = bodies

@@ -13,7 +13,7 @@ use crate::process::{Program, RunningServer, foreframe, text};
 use crate::service::TIMEOUT;
 
 /// The documents whose commands are run, in the order in which a reader would read them.
-const DOCUMENTS: [&str; 1] = ["README.md"];
+const DOCUMENTS: [&str; 4] = ["README.md", "docs/http.md", "docs/training.md", "docs/operations.md"];
 
 /// How commands that are not run begin, and why they are not.
 const NOT_RUN: [(&str, &str); 9] = [
