@@ -11,6 +11,7 @@ use tokio::time::sleep;
 use super::requests::BASE;
 use super::shared::{CreatedKey, EnduranceRun, RunClient};
 use crate::http::Request;
+use crate::project;
 
 const JOB_PERIOD: Duration = Duration::from_secs(4);
 /// Every third job is a training.
@@ -179,13 +180,13 @@ async fn revoke(run: &EnduranceRun, id: &str) -> bool {
 
 /// The output of a command on the run's store; `None` if it failed, as it may while the store is away.
 pub(super) async fn command(run: &EnduranceRun, arguments: &[&str]) -> Option<String> {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_foreframe"));
+    let mut command = Command::new(project::program());
     command
         .args(arguments)
         .arg("--data-dir")
         .arg(&run.data_dir)
         .args(&run.store_arguments)
-        .current_dir(env!("CARGO_MANIFEST_DIR"));
+        .current_dir(project::root());
     let output = tokio::task::spawn_blocking(move || command.output().unwrap());
     let output = output.await.unwrap();
     let is_done = output.status.success();

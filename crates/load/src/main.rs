@@ -4,15 +4,16 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod churn;
-#[path = "../../tests/malformed/corpus.rs"]
+#[path = "../../../tests/malformed/corpus.rs"]
 mod corpus;
 mod endurance;
 mod health;
 mod http;
-#[path = "../../tests/malformed/mutation.rs"]
+#[path = "../../../tests/malformed/mutation.rs"]
 mod mutation;
 mod previews;
 mod process_usage;
+mod project;
 mod report;
 mod robot;
 mod robots;
@@ -34,12 +35,12 @@ use report::Bounds;
 /// a bound is exceeded.
 #[derive(clap::Parser)]
 #[command(
-    name = "load",
+    name = "foreframe-load",
     args_conflicts_with_subcommands = true,
     after_help = "Without a scenario, `stream` runs with the options above.
 
 To give the server and the load one core each (Linux):
-  taskset -c 1 cargo bench --bench load -- stream --sessions 100 --server-cpu 0"
+  taskset -c 1 cargo run --release -p foreframe-load -- stream --sessions 100 --server-cpu 0"
 )]
 struct Cli {
     #[command(subcommand)]
@@ -49,9 +50,6 @@ struct Cli {
     /// Run a short form of every scenario but `endurance`, as CI does
     #[arg(long)]
     test: bool,
-    /// Added by cargo
-    #[arg(long, hide = true, global = true)]
-    bench: bool,
 }
 
 #[derive(clap::Subcommand)]

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::http::{Http, Request};
 use crate::process_usage::Process;
+use crate::project;
 use crate::report::Bounds;
 
 /// How long the server may take to become ready.
@@ -39,11 +40,11 @@ pub(crate) struct Server {
 impl Server {
     /// Starts the server with these settings and waits until it is ready.
     pub(crate) async fn start(target: &Target, settings: &[(&str, usize)]) -> Self {
-        let (program, data) = (env!("CARGO_BIN_EXE_foreframe"), tempfile::tempdir().unwrap());
+        let (program, data) = (project::program(), tempfile::tempdir().unwrap());
         let mut command = match target.server_cpu {
             Some(cpu) => {
                 let mut command = Command::new("taskset");
-                command.args(["-c", &cpu.to_string(), program]);
+                command.args(["-c", &cpu.to_string()]).arg(program);
                 command
             }
             None => Command::new(program),
@@ -57,7 +58,7 @@ impl Server {
                     .iter()
                     .flat_map(|(name, value)| ["--set".to_owned(), format!("{name}={value}")]),
             )
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .current_dir(project::root())
             .env("RUST_LOG", "warn")
             .stdout(Stdio::piped())
             .stderr(File::create(&log).unwrap())

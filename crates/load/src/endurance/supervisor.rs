@@ -8,6 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::http::{Http, Request};
+use crate::project;
 
 /// How long the server may take to become ready.
 const START_LIMIT: Duration = Duration::from_mins(2);
@@ -59,12 +60,12 @@ impl Supervisor {
     }
 
     fn spawn_process(&mut self, log: File) -> SocketAddr {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))
+        let mut child = Command::new(project::program())
             .args(["serve", "--bind", &self.address.to_string(), "--data-dir"])
             .arg(&self.data_dir)
             .args(&self.store_arguments)
             .args(SETTINGS.iter().flat_map(|setting| ["--set", setting]))
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .current_dir(project::root())
             .env("RUST_LOG", "warn")
             .stdout(Stdio::piped())
             .stderr(log)

@@ -1,7 +1,6 @@
 //! Frames and requests made from the frames in `examples`, in the form that a model takes.
 
 use std::fs;
-use std::path::Path;
 
 use foreframe::frame::codec;
 use foreframe::nn::ModelSpec;
@@ -12,6 +11,7 @@ use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
 
 use crate::http::Request;
+use crate::project;
 
 const FRAMES: usize = 15;
 /// Each component of the actions and states.
@@ -30,7 +30,7 @@ pub(crate) struct Workload {
 
 impl Workload {
     pub(crate) fn of(model: &str) -> Self {
-        let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let project = project::root();
         let manifest = manifest::read(&project.join("models").join(model)).expect("the model is shipped");
         let file = |index| fs::read(project.join(format!("examples/frames/frame-{index:03}.png"))).unwrap();
         let files: Vec<Vec<u8>> = (0..FRAMES).map(file).collect();

@@ -30,6 +30,7 @@ use self::supervisor::Supervisor;
 use self::verify::EndedJobs;
 use crate::health::post;
 use crate::http::{Http, Request};
+use crate::project;
 use crate::report::Bounds;
 use crate::workload::Workload;
 
@@ -98,7 +99,7 @@ pub(crate) async fn run(args: &EnduranceArgs, bounds: &mut Bounds) {
     let outages: Vec<Outage> = disk.into_iter().chain([Outage::Database(database)]).collect();
     let mut supervisor = Supervisor::start(&data_dir, &store_arguments, &scratch.path().join("log")).await;
     let run = Arc::new(set_up(args, &supervisor).await);
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let models = project::root().join("models");
     let model = registry::load(&models.join(&args.model)).expect("the model is shipped");
     let load = Load::start(args, &run, &model);
     sleep_until(load.attack.into()).await;
