@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use crate::skip::skip_without;
 use foreframe::store::{
-    Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob, Store,
-    StoreConfig,
+    Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob,
+    PublishedVersion, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
 use tempfile::TempDir;
@@ -312,7 +312,11 @@ async fn versions_are_numbered_after_the_shipped_one() {
         );
         assert_eq!(store.published_versions().await.unwrap(), []);
         let published = |version, activates| JobOutcome {
-            published: Some(("m".to_owned(), version, activates)),
+            published: Some(PublishedVersion {
+                model: "m".to_owned(),
+                version,
+                activates,
+            }),
             ..outcome("succeeded")
         };
         assert!(

@@ -6,6 +6,7 @@
 mod checkpoints;
 pub mod child;
 pub mod datasets;
+mod executor;
 mod instance;
 pub mod job;
 pub mod memory;
@@ -16,6 +17,7 @@ mod progress;
 pub mod queue;
 mod report;
 mod runner;
+mod shared;
 pub mod spec;
 pub mod state;
 
@@ -23,11 +25,12 @@ use crate::store::{StoreError, unix_s};
 use crate::versions::VersionError;
 use foreframe_data::dataset::DatasetError;
 
+pub use executor::{JobExecutor, JobFailure, JobResult};
 pub use job::{Job, JobFilter};
 pub use progress::{JobProgress, Losses};
-pub use queue::{JobLimits, Jobs};
+pub use queue::Jobs;
 pub use report::JobReporter;
-pub use runner::{JobExecutor, JobFailure, JobResult};
+pub use shared::JobLimits;
 pub use spec::{CollectSpec, EvaluateSpec, ImportSpec, JobSpec, TrainSpec};
 pub use state::{JobState, JobTransition};
 

@@ -9,225 +9,45 @@ pub mod bootstrap;
 mod calibrate;
 mod cholesky;
 pub mod compatible;
+mod config;
 mod error;
 pub mod figures;
+mod file;
 mod forecast;
 pub mod inference;
 mod markdown;
+pub mod method;
 pub mod metrics;
 mod output;
 pub mod plans;
+mod progress;
 pub mod report;
 mod samples;
 pub mod score;
 pub mod skill;
 pub mod uncertainty;
+mod windows;
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use serde::{Deserialize, Serialize};
-
 pub use self::calibrate::{calibrate, calibrate_trained};
+pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, Purpose};
 pub use self::error::EvaluationError;
 pub use self::output::{prepare, write};
+pub use self::progress::{EvaluationContext, EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
 pub use self::samples::figure_inputs;
 
-use self::baselines::{Baselines, Method};
-use self::bootstrap::Bootstrap;
+use self::baselines::Baselines;
+use self::method::Method;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::uncertainty::NoveltyScores;
-use foreframe_core::nn::{Architecture, ModelSpec};
+use self::windows::{evenly, window_shape};
+use foreframe_core::nn::Architecture;
 use foreframe_core::registry::LoadedModel;
-use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
-use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
-
-/// What a model is scored on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Purpose {
-    /// To choose between models and settings: the validation split.
-    Validation,
-    /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
-    #[default]
-    Test,
-    /// To publish: all of a data set that holds nothing but test data, as the files of published benchmarks do.
-    WholeSet,
-}
-
-impl Purpose {
-    /// The splits that are scored, in the order of the report.
-    #[must_use]
-    pub fn splits(self) -> &'static [Split] {
-        match self {
-            Self::Validation => &[Split::Validation],
-            Self::Test => &[Split::Test, Split::UnseenPairs, Split::UnseenGains],
-            Self::WholeSet => &[Split::Test],
-        }
-    }
-
-    /// How the data set is split for it.
-    fn divide(self, dataset: &Dataset, seed: Seed) -> Splits {
-        match self {
-            Self::WholeSet => Splits::all_for_test(dataset),
-            Self::Validation | Self::Test => Splits::new(dataset, seed),
-        }
-    }
-}
-
-/// Training windows among which the nearest-window baseline looks, unless other numbers are asked for.
-pub const NEAREST_WINDOWS: usize = 15_000;
-
-/// What to test on, and how closely.
-#[derive(Clone)]
-pub struct EvaluateConfig<'a> {
-    /// Which part of the data set.
-    pub purpose: Purpose,
-    /// Seed of the split; that of the model's training if none is given.
-    pub split_seed: Option<Seed>,
-    /// Frames from the start of one window to that of the next.
-    pub stride: usize,
-    /// Windows of each set at most, evenly spread over its trials.
-    pub max_windows: usize,
-    /// Training windows among which the baseline looks for the nearest one, at most, evenly spread.
-    pub nearest_windows: usize,
-    /// Resamples for the intervals.
-    pub bootstrap_samples: usize,
-    /// Seed of the resamples and of the shuffled actions.
-    pub seed: Seed,
-    /// Windows that go through the model at once.
-    pub batch: usize,
-    /// Models trained with the same budget without the action, without the state or without both, for the action table.
-    pub twins: Vec<&'a LoadedModel>,
-    /// Other data sets, which the model's novelty must tell from the scored windows.
-    pub novel: Vec<&'a Dataset>,
-    /// The command line, for the stamp.
-    pub command: String,
-    /// Set by another thread to stop the evaluation.
-    pub cancelled: Option<&'a AtomicBool>,
-}
-
-impl Default for EvaluateConfig<'_> {
-    fn default() -> Self {
-        Self {
-            purpose: Purpose::default(),
-            split_seed: None,
-            stride: 1,
-            max_windows: 2000,
-            nearest_windows: NEAREST_WINDOWS,
-            bootstrap_samples: 1000,
-            seed: Seed(0),
-            batch: 64,
-            twins: Vec::new(),
-            novel: Vec::new(),
-            command: String::new(),
-            cancelled: None,
-        }
-    }
-}
-
-impl EvaluateConfig<'_> {
-    /// Errors: `Setting` where a number is too small.
-    pub fn validate(&self) -> Result<(), EvaluationError> {
-        for (setting, value, least) in [
-            ("the stride of windows", self.stride, 1),
-            ("the number of windows", self.max_windows, 1),
-            ("the number of training windows to search", self.nearest_windows, 1),
-            ("the number of bootstrap samples", self.bootstrap_samples, 100),
-            ("the batch size", self.batch, 1),
-        ] {
-            if value < least {
-                return Err(EvaluationError::Setting { setting, value, least });
-            }
-        }
-        Ok(())
-    }
-
-    /// What a pass over this split needs besides its windows.
-    fn watched<'a>(
-        &'a self,
-        split: Split,
-        on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
-    ) -> EvaluationContext<'a> {
-        EvaluationContext {
-            split,
-            batch: self.batch,
-            bootstrap: Bootstrap {
-                samples: self.bootstrap_samples,
-                seed: self.seed,
-            },
-            on_progress,
-            cancelled: self.cancelled,
-        }
-    }
-}
-
-/// What is being computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum EvaluationStage {
-    /// Model and baselines, frame by frame.
-    Scores,
-    /// The action table.
-    Actions,
-    /// Plan identification.
-    Plans,
-    /// Expected errors and novelty.
-    Calibration,
-}
-
-impl EvaluationStage {
-    /// The stage in a word.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Scores => "scores",
-            Self::Actions => "actions",
-            Self::Plans => "plans",
-            Self::Calibration => "calibration",
-        }
-    }
-}
-
-/// Progress of the evaluation.
-#[derive(Clone, Copy, Debug)]
-pub struct EvaluationProgress {
-    /// The set.
-    pub split: Split,
-    /// What is being computed.
-    pub stage: EvaluationStage,
-    /// Windows done.
-    pub done: usize,
-    /// Windows in all.
-    pub total: usize,
-}
-
-/// What every pass over a set needs besides its windows.
-pub struct EvaluationContext<'a> {
-    split: Split,
-    batch: usize,
-    bootstrap: Bootstrap,
-    on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
-    cancelled: Option<&'a AtomicBool>,
-}
-
-impl EvaluationContext<'_> {
-    /// Reports progress. Errors: `Cancelled` if the evaluation is to stop.
-    fn report(&self, stage: EvaluationStage, done: usize, total: usize) -> Result<(), EvaluationError> {
-        (self.on_progress)(EvaluationProgress {
-            split: self.split,
-            stage,
-            done,
-            total,
-        });
-        match self.cancelled {
-            Some(cancelled) if cancelled.load(Ordering::Acquire) => Err(EvaluationError::Cancelled),
-            _ => Ok(()),
-        }
-    }
-}
+use foreframe_data::dataset::sampler::{Split, Splits};
 
 /// Scores the model on the splits that [`EvaluateConfig::purpose`] names: the validation split, the three test sets
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Errors: model and data set that
@@ -329,14 +149,6 @@ fn compare_novelty(
     config.novel.iter().map(compare).collect()
 }
 
-/// The windows that a model of that specification takes.
-fn window_shape(spec: &ModelSpec) -> WindowShape {
-    WindowShape {
-        context: spec.context,
-        horizon: spec.horizon,
-    }
-}
-
 /// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
     loaded: &LoadedModel,
@@ -356,7 +168,7 @@ fn score_split(
         let reason = reason.to_owned();
         return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
-    let windows = score::evenly(&available, config.max_windows);
+    let windows = evenly(&available, config.max_windows);
     let windows_scored = score::score(loaded, dataset, &windows, baselines, watched)?;
     let mut scores = SetScores::new(baselines.methods(), &windows_scored, &watched.bootstrap);
     if baselines.are_of_benchmark() {

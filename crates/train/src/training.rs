@@ -15,6 +15,7 @@ mod principal_components;
 mod random_codec;
 mod stage;
 mod start;
+mod state;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -26,7 +27,8 @@ use self::checkpoint::{Checkpoint, RunFiles};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
-use self::stage::{StageEnd, StageRunner, TrainState};
+use self::stage::{StageEnd, StageRunner};
+use self::state::TrainState;
 use foreframe_core::files::write_atomically;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;

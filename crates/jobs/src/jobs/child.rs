@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize};
 
+use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::patience::Patience;
 use super::pipeline::Pipeline;
 use super::report::{JobReporter, ReportEvent};
-use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};
 use crate::versions::Versions;

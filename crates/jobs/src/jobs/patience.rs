@@ -9,8 +9,8 @@ use tokio::runtime::Handle;
 use tracing::warn;
 
 use super::JobError;
+use super::executor::JobFailure;
 use super::report::JobReporter;
-use super::runner::JobFailure;
 use crate::store::StoreError;
 use crate::versions::VersionError;
 use foreframe_core::error_text;

@@ -14,13 +14,13 @@ use tokio::runtime::Handle;
 
 use self::training_report::TrainingReporter;
 use super::checkpoints::{self, CheckpointSync};
+use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::patience::{Patience, retry_while_busy};
 use super::report::JobReporter;
-use super::runner::{JobExecutor, JobFailure, JobResult};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
-use crate::store::{ModelMetrics, Store, StoreError};
+use crate::store::{ModelMetrics, PublishedVersion, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
@@ -208,7 +208,11 @@ impl Pipeline {
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
                 Ok(JobResult {
                     result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
-                    published: Some((spec.name.clone(), version, activates)),
+                    published: Some(PublishedVersion {
+                        model: spec.name.clone(),
+                        version,
+                        activates,
+                    }),
                     measured: None,
                 })
             }

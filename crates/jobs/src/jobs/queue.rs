@@ -1,58 +1,28 @@
 //! The handle to the jobs: submits, reads, cancels and resumes them.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
+use super::executor::JobExecutor;
 use super::instance::Instance;
 use super::job::number_of;
 use super::progress::StoredProgress;
-use super::runner::{self, JobExecutor};
+use super::runner;
+use super::shared::{JobLimits, SharedJobs};
 use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition};
-use crate::store::{Author, EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store, job_id};
+use crate::store::{Author, EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// The maximum length of an idempotency key.
 const MAX_KEY_LENGTH: usize = 128;
 
-/// The limits of jobs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct JobLimits {
-    /// How many jobs can wait.
-    pub queued: usize,
-    /// How many ended jobs are kept; the oldest are deleted first.
-    pub ended: usize,
-    /// How many lines of a job's log are kept.
-    pub log_lines: usize,
-    /// How many threads a job uses.
-    pub threads: usize,
-    /// After this many attempts in a row that ended abnormally without progress, a job fails.
-    pub max_attempts: u32,
-    /// How long one attempt can run.
-    pub time_limit: Option<Duration>,
-    /// How long a running job may report no progress.
-    pub stall_limit: Option<Duration>,
-    /// After this time without a sign of life from the runner, another runner can claim its job.
-    pub lease: Duration,
-}
-
-pub(super) struct JobsInner {
-    pub(super) store: Store,
-    pub(super) limits: JobLimits,
-    pub(super) execute: Arc<dyn JobExecutor>,
-    /// A job may be waiting.
-    pub(super) wake: Notify,
-    /// A job has ended in this process.
-    pub(super) ended: Notify,
-    pub(super) stop: watch::Sender<bool>,
-}
-
 /// The handle to the jobs; clones share them.
 #[derive(Clone)]
 pub struct Jobs {
-    shared: Arc<JobsInner>,
+    shared: Arc<SharedJobs>,
     runner: Arc<Mutex<Option<JoinHandle<()>>>>,
 }
 
@@ -60,7 +30,7 @@ impl Jobs {
     /// A handle to the store's jobs. With `runs`, this process also runs them, one at a time. Needs a tokio runtime.
     /// Errors: `Instance`, `Threads`.
     pub fn start(store: Store, limits: JobLimits, execute: Arc<dyn JobExecutor>, runs: bool) -> Result<Self, JobError> {
-        let shared = Arc::new(JobsInner {
+        let shared = Arc::new(SharedJobs {
             store,
             limits,
             execute,
@@ -243,23 +213,6 @@ impl Jobs {
             None => None,
         };
         found.ok_or_else(|| JobError::Unknown { id: id.to_owned() })
-    }
-}
-
-impl JobsInner {
-    /// Deletes the oldest ended jobs with their files.
-    pub(super) async fn forget_oldest(&self) {
-        let forgotten = match self.store.forget_ended(self.limits.ended as i64).await {
-            Ok(forgotten) => forgotten,
-            Err(error) => return warn!(%error, "could not delete old jobs"),
-        };
-        for id in forgotten.into_iter().map(job_id) {
-            for dir in ["runs", "reports"] {
-                if let Err(error) = self.store.objects().delete(&format!("{dir}/{id}")).await {
-                    warn!(job.id = %id, %error, "could not delete the files of an old job");
-                }
-            }
-        }
     }
 }
 

@@ -5,19 +5,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use futures_util::future::BoxFuture;
 use metrics::counter;
 use rayon::ThreadPool;
-use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, watch};
 use tracing::{info, warn};
 
+use super::executor::{JobFailure, JobResult};
 use super::instance::Instance;
 use super::progress::{ReportBuffer, StoredProgress};
-use super::queue::JobsInner;
 use super::report::JobReporter;
+use super::shared::SharedJobs;
 use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
-use crate::store::{JobOutcome, JobReport, JobRow, Lease, ModelMetrics, StoreError};
+use crate::store::{JobOutcome, JobReport, JobRow, Lease, StoreError};
 use foreframe_core::metric_names;
 
 /// How often a job's report is written, unless the lease needs it more often.
@@ -26,39 +25,6 @@ const WRITE_EVERY: Duration = Duration::from_millis(500);
 const POLL_EVERY: Duration = Duration::from_secs(1);
 /// How often a runner that is asked to stop tries to write a job's outcome.
 const END_ATTEMPTS: u32 = 5;
-
-/// Why a job's work ended without a result.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum JobFailure {
-    /// It was asked to stop, or its lease was lost.
-    Cancelled,
-    /// The work failed. One sentence says why.
-    Failed(String),
-    /// The job's process ended abnormally, so another attempt can succeed. One sentence says how.
-    Crashed(String),
-}
-
-/// The result of a job that succeeded.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct JobResult {
-    /// The result in the API.
-    pub result: serde_json::Value,
-    /// The name and version of a published model, and whether it becomes active if no version is.
-    pub published: Option<(String, u32, bool)>,
-    /// What an evaluation measured.
-    pub measured: Option<ModelMetrics>,
-}
-
-/// Does the work of jobs.
-pub trait JobExecutor: Send + Sync + 'static {
-    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading
-    /// data sets and models.
-    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
-
-    /// Does the work, or resumes it. Returns `Cancelled` soon after `cancelled` becomes true. Blocks.
-    fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
-}
 
 /// The threads for jobs, separate from those for predictions and with lower priority. Errors: `Threads`.
 pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
@@ -70,7 +36,7 @@ pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
         .map_err(JobError::Threads)
 }
 
-pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: ThreadPool) {
+pub(super) async fn run(shared: Arc<SharedJobs>, instance: Instance, pool: ThreadPool) {
     let pool = Arc::new(pool);
     let mut stop = shared.stop.subscribe();
     // This process holds the lock of the id, so all leases under the id are of an earlier process that has ended.
@@ -93,7 +59,7 @@ pub(super) async fn run(shared: Arc<JobsInner>, instance: Instance, pool: Thread
     }
 }
 
-async fn pause(shared: &JobsInner, stop: &mut watch::Receiver<bool>) {
+async fn pause(shared: &SharedJobs, stop: &mut watch::Receiver<bool>) {
     tokio::select! {
         () = shared.wake.notified() => {}
         () = tokio::time::sleep(POLL_EVERY) => {}
@@ -108,7 +74,7 @@ async fn stop_requested(stop: &mut watch::Receiver<bool>) {
 
 /// One attempt of a job.
 struct JobRun<'a> {
-    shared: &'a JobsInner,
+    shared: &'a SharedJobs,
     report: JobReporter,
     cancelled: Arc<AtomicBool>,
     /// Whether the job was cancelled by request.
@@ -134,7 +100,7 @@ impl Drop for JobRun<'_> {
 }
 
 impl<'a> JobRun<'a> {
-    fn new(shared: &'a JobsInner, row: &JobRow, lease: Lease) -> Self {
+    fn new(shared: &'a SharedJobs, row: &JobRow, lease: Lease) -> Self {
         let stored: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
         Self {
             shared,

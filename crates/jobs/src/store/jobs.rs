@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::audit::Author;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
-use super::models::version_id;
+use super::lease::Lease;
+use super::models::{PublishedVersion, version_id};
 use super::reports::{JobReport, write_report};
 use super::{ModelMetrics, Store, StoreError};
 
@@ -100,15 +101,6 @@ pub enum EnqueueResult {
     Taken,
 }
 
-/// The right to work on a job: its number and the fencing token of the claim.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Lease {
-    /// The job.
-    pub number: i64,
-    /// The fencing token.
-    pub token: i64,
-}
-
 /// How an attempt of a job ended.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JobOutcome {
@@ -120,8 +112,8 @@ pub struct JobOutcome {
     pub outcome: Option<String>,
     /// When, in seconds since 1970; `None` if the job goes back to the queue.
     pub ended_s: Option<f64>,
-    /// The published model's name and version, and whether it becomes active if no version is.
-    pub published: Option<(String, u32, bool)>,
+    /// The published version.
+    pub published: Option<PublishedVersion>,
     /// What an evaluation measured.
     pub measured: Option<ModelMetrics>,
     /// Whether the attempt ended abnormally.
@@ -395,11 +387,11 @@ impl Store {
             return Ok(false);
         };
         let mut change = None;
-        if let Some((model, version, activates)) = outcome.published {
+        if let Some(published) = &outcome.published {
             let now_s = outcome.ended_s.unwrap_or_default();
-            super::models::write_published(&mut tx, (&model, version), activates, now_s).await?;
+            super::models::write_published(&mut tx, published, now_s).await?;
             let by = Author::of_key(&row.get::<String>("submitter")?);
-            change = Some(by.change("version.publish", version_id(&model, version)));
+            change = Some(by.change("version.publish", version_id(&published.model, published.version)));
         }
         if let Some(measured) = outcome.measured {
             super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::audit::Author;
 use super::database::{DatabaseRow, Tx};
-use super::jobs::Lease;
+use super::lease::Lease;
 use super::{Store, StoreError};
 
 /// A published version.
@@ -16,6 +16,17 @@ pub struct VersionRow {
     pub version: u32,
     /// When it was published, in seconds since 1970.
     pub published_s: f64,
+}
+
+/// A version that a job published.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PublishedVersion {
+    /// The model's name.
+    pub model: String,
+    /// The version's number.
+    pub version: u32,
+    /// Whether it becomes active if no version is.
+    pub activates: bool,
 }
 
 /// What an evaluation measured of a version.
@@ -161,16 +172,11 @@ pub(super) fn version_id(model: &str, version: u32) -> String {
     format!("{model}@{version}")
 }
 
-pub(super) async fn write_published(
-    tx: &mut Tx,
-    (model, version): (&str, u32),
-    activates: bool,
-    now_s: f64,
-) -> Result<(), StoreError> {
+pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, now_s: f64) -> Result<(), StoreError> {
     let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
-    let values = || vec![model.into(), version.into(), now_s.into()];
+    let values = || vec![published.model.as_str().into(), published.version.into(), now_s.into()];
     tx.execute(sql, values()).await?;
-    if activates {
+    if published.activates {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
         tx.execute(sql, values()).await?;
     }

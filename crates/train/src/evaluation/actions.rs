@@ -5,10 +5,11 @@ use rand::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::EvaluationError;
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
 use super::inference::{self, ActionSource};
 use super::metrics::StepCurve;
-use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;

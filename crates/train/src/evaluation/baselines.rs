@@ -3,49 +3,21 @@
 mod affine_flow;
 mod cut_out;
 mod ego_motion;
-mod method;
+mod input;
 mod nearest;
 
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
-pub use self::method::Method;
+pub use self::input::BaselineInput;
+use self::input::mean;
 use self::nearest::TrainingWindows;
 use super::EvaluationError;
-use super::score::{evenly, training_mean};
-use foreframe_core::frame::preprocess::scale;
+use super::method::Method;
+use super::windows::evenly;
 use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
 use foreframe_data::dataset::{Dataset, DatasetError, Window};
 use foreframe_data::motion::{Shift, phase_correlation, shifted};
-
-/// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
-#[derive(Clone, Debug)]
-pub struct BaselineInput<'a> {
-    /// The input frames, oldest first; at least one.
-    pub inputs: &'a [Vec<f32>],
-    /// The action that led to the last input frame; the first of `actions` where only one frame is known.
-    pub previous_action: &'a [f32],
-    /// The actions that lead to each predicted frame.
-    pub actions: Vec<&'a [f32]>,
-    /// The state at the last input frame.
-    pub state: &'a [f32],
-}
-
-impl<'a> BaselineInput<'a> {
-    /// The input of a window of that shape, whose first frames are `inputs`.
-    #[must_use]
-    pub fn of_window(dataset: &'a Dataset, window: Window, shape: WindowShape, inputs: &'a [Vec<f32>]) -> Self {
-        let last = window.first_frame + shape.context - 1;
-        Self {
-            inputs,
-            previous_action: dataset.action(last.saturating_sub(1).max(window.first_frame)),
-            actions: (last..last + shape.horizon)
-                .map(|frame| dataset.action(frame))
-                .collect(),
-            state: dataset.state(last),
-        }
-    }
-}
 
 /// How the camera's motion follows from the actions.
 enum EgoMotion {
@@ -170,23 +142,6 @@ fn training_windows(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> R
 }
 
 /// A frame of a data set, 0…1.
-fn frame_of(dataset: &Dataset, frame: usize) -> Result<Vec<f32>, EvaluationError> {
-    Ok(scale(&dataset.pixels(frame)?))
-}
-
-fn mean(frames: &[Vec<f32>]) -> Vec<f32> {
-    let mut sum = vec![0.0; frames.first().map_or(0, Vec::len)];
-    for frame in frames {
-        for (sum, value) in sum.iter_mut().zip(frame) {
-            *sum += value;
-        }
-    }
-    for value in &mut sum {
-        *value /= frames.len() as f32;
-    }
-    sum
-}
-
 /// With times centred on their mean, a pixel's slope is Σ time · value / Σ time².
 fn extrapolate(frames: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
     let mean = mean(frames);
@@ -229,6 +184,21 @@ fn move_on(inputs: &[Vec<f32>], width: usize, horizon: usize) -> Vec<Vec<f32>> {
             )
         })
         .collect()
+}
+
+/// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
+/// Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
+fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
+    let pair = WindowShape { context: 1, horizon: 1 };
+    let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
+    let mut sums = vec![0_u64; dataset.info().frame_pixels()];
+    for pair in &pairs {
+        for (sum, &value) in sums.iter_mut().zip(&*dataset.pixels(pair.first_frame)?) {
+            *sum += u64::from(value);
+        }
+    }
+    let scale = 1.0 / (255.0 * pairs.len().max(1) as f64);
+    Ok(sums.into_iter().map(|sum| (sum as f64 * scale) as f32).collect())
 }
 
 #[cfg(test)]
@@ -285,7 +255,7 @@ mod tests {
         let (baselines, splits) = fitted(dataset, searched);
         let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
         let errors = windows.iter().flat_map(|&window| {
-            let frame = |step: usize| frame_of(dataset, window.first_frame + step).unwrap();
+            let frame = |step: usize| input::frame_of(dataset, window.first_frame + step).unwrap();
             let inputs: Vec<Vec<f32>> = (0..SHAPE.context).map(frame).collect();
             let input = BaselineInput::of_window(dataset, window, SHAPE, &inputs);
             let predicted = baselines.predict(dataset, method, &input, SHAPE.horizon).unwrap();
@@ -355,7 +325,7 @@ mod tests {
         let shape = WindowShape { context: 1, horizon: 1 };
         let splits = Splits::new(&dataset, Seed(1));
         let baselines = Baselines::fit(&dataset, &splits, shape, usize::MAX).unwrap();
-        let inputs = [frame_of(&dataset, 0).unwrap()];
+        let inputs = [input::frame_of(&dataset, 0).unwrap()];
         let window = Window {
             episode: 0,
             first_frame: 0,

@@ -5,9 +5,12 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use super::cholesky;
+use super::config::EvaluateConfig;
 use super::forecast::{Forecast, contexts, forecasts};
-use super::score::evenly;
-use super::{EvaluateConfig, EvaluationError, EvaluationProgress, compatible, window_shape};
+use super::progress::EvaluationProgress;
+use super::windows::evenly;
+use super::windows::window_shape;
+use super::{EvaluationError, compatible};
 use foreframe_core::registry::calibration::{
     APPEARANCE, Calibration, ContextStatistics, ERROR_INPUTS, NoveltyScale, StepErrors, ValueRange,
 };

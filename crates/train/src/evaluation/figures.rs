@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 use self::animation::Animation;
 use self::montage::{MontageRow, Style};
 use super::EvaluationError;
-use super::baselines::Method;
-use super::output::save;
+use super::file::save;
+use super::method::Method;
 use foreframe_core::frame::{Frame, FrameError, codec};
 
 /// A file that was written, and what it shows.

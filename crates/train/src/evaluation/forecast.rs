@@ -1,7 +1,8 @@
 //! Predictions with what is known of them before the truth is: for the calibration of their errors, and for its test.
 
+use super::EvaluationError;
 use super::inference::{self, ActionSource};
-use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::{Frame, quality};
 use foreframe_core::registry::LoadedModel;

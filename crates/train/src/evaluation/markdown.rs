@@ -4,10 +4,10 @@ mod uncertainty;
 
 use std::fmt::Write;
 
-use super::Purpose;
 use super::actions::ActionTable;
-use super::baselines::Method;
 use super::bootstrap::{CONFIDENCE, Interval};
+use super::config::Purpose;
+use super::method::Method;
 use super::metrics::{MethodScores, PSNR_CAP_DB, StepCurve};
 use super::plans::PlanOutcome;
 use super::report::{EvaluationReport, ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
@@ -15,11 +15,15 @@ use super::report::{EvaluationReport, ModelSummary, ReportStamp, SetOutcome, Set
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
 
-pub(super) fn render(report: &EvaluationReport) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_report(&mut text, report);
-    text
+impl EvaluationReport {
+    /// The report as Markdown, with its figures in the same directory.
+    #[must_use]
+    pub fn to_markdown(&self) -> String {
+        let mut text = String::new();
+        // Writing to a string cannot fail.
+        let _ = write_report(&mut text, self);
+        text
+    }
 }
 
 fn write_report(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {

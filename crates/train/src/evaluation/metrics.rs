@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::baselines::Method;
+use super::method::Method;
 use foreframe_core::frame::quality;
 
 /// The greatest PSNR of a frame, in dB: that of rounding to 8 bits. Without it, one perfect frame would make a mean

@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use super::figures::{self, FigureInputs};
+use super::file::save;
 use super::{EvaluationError, EvaluationReport};
-use foreframe_core::files::write_atomically;
 
 /// Creates the output directory. Call it before the evaluation, so that a wrong path is refused at once.
 /// Errors: `OutputExists` if there is something in it or it is no directory, `Io`.
@@ -41,11 +41,4 @@ pub fn write(
     bytes.push(b'\n');
     save(&json, &bytes)?;
     Ok([markdown, json])
-}
-
-pub(super) fn save(path: &Path, bytes: &[u8]) -> Result<(), EvaluationError> {
-    write_atomically(path, bytes).map_err(|source| EvaluationError::Io {
-        path: path.to_owned(),
-        source,
-    })
 }

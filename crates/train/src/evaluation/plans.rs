@@ -6,10 +6,11 @@ use rand::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::EvaluationError;
 use super::bootstrap::{Interval, TrialSums};
 use super::inference::{self, ActionSource};
-use super::score::evenly;
-use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage};
+use super::windows::evenly;
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;

@@ -6,14 +6,14 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
-use super::baselines::Method;
 use super::bootstrap::{Bootstrap, TrialSums};
+use super::config::{EvaluateConfig, NEAREST_WINDOWS, Purpose};
 use super::figures::FigureFile;
+use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
 use super::skill::{Skill, skill};
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
-use super::{EvaluateConfig, Purpose, markdown};
 use foreframe_core::registry::{DatasetStamp, LoadedModel, ProgramStamp};
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::{Dataset, Window};
@@ -35,12 +35,6 @@ pub struct EvaluationReport {
 }
 
 impl EvaluationReport {
-    /// The report as Markdown, with its figures in the same directory.
-    #[must_use]
-    pub fn to_markdown(&self) -> String {
-        markdown::render(self)
-    }
-
     /// The scores of a set by its split's name, unless it was skipped.
     #[must_use]
     pub fn scores(&self, split: &str) -> Option<&SetScores> {
@@ -152,7 +146,7 @@ impl ReportStamp {
 
 /// Of reports from before this number was a setting.
 fn nearest_windows() -> usize {
-    super::NEAREST_WINDOWS
+    NEAREST_WINDOWS
 }
 
 /// From `/proc/cpuinfo`; the architecture where that does not exist.

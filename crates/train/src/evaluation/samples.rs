@@ -1,11 +1,11 @@
 //! The content of the figures: frames of the chosen windows, the curves of the tables, an animation of a trial.
 
 use super::EvaluationError;
-use super::baselines::Method;
 use super::figures::animation::{Animation, AnimationFrame};
 use super::figures::{Chart, FigureInputs, SampleFigure};
 use super::inference::{ActionSource, predict, reconstruct};
 use super::markdown::set_title;
+use super::method::Method;
 use super::report::{EvaluationReport, SampleWindow, SetScores};
 use foreframe_core::frame::Frame;
 use foreframe_core::registry::LoadedModel;

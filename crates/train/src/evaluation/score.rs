@@ -2,41 +2,19 @@
 
 use rayon::prelude::*;
 
-use super::baselines::{BaselineInput, Baselines, Method};
+use super::EvaluationError;
+use super::baselines::{BaselineInput, Baselines};
 use super::bootstrap::resampled_with;
 use super::inference::{Predicted, predict_with_ceiling};
+use super::method::Method;
 use super::metrics::{FrameScore, TargetFrame, WindowScores};
-use super::{EvaluationContext, EvaluationError, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::LoadedModel;
-use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
+use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, DatasetError, Window};
-
-/// At most `count` of the windows, evenly spread over all.
-#[must_use]
-pub fn evenly(windows: &[Window], count: usize) -> Vec<Window> {
-    if windows.len() <= count {
-        return windows.to_vec();
-    }
-    (0..count).map(|i| windows[i * windows.len() / count]).collect()
-}
-
-/// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
-/// Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
-pub fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
-    let pair = WindowShape { context: 1, horizon: 1 };
-    let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
-    let mut sums = vec![0_u64; dataset.info().frame_pixels()];
-    for pair in &pairs {
-        for (sum, &value) in sums.iter_mut().zip(&*dataset.pixels(pair.first_frame)?) {
-            *sum += u64::from(value);
-        }
-    }
-    let scale = 1.0 / (255.0 * pairs.len().max(1) as f64);
-    Ok(sums.into_iter().map(|sum| (sum as f64 * scale) as f32).collect())
-}
 
 /// Scores every window. Errors: those of the network, `NotFinite`.
 pub fn score(

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::baselines::Method;
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
+use super::method::Method;
 use super::metrics::{StepCurve, WindowScores};
 
 /// skill = 1 − MSE / MSE of the strongest baseline: 1 is perfect, 0 is no better than that baseline, below 0 is worse.

@@ -3,11 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::EvaluationError;
 use super::calibrate::quantile;
 use super::forecast::{Forecast, contexts, forecasts};
 use super::metrics::StepCurve;
-use super::score::evenly;
-use super::{EvaluationContext, EvaluationError};
+use super::progress::EvaluationContext;
+use super::windows::evenly;
 use foreframe_core::registry::LoadedModel;
 use foreframe_core::registry::calibration::Calibration;
 use foreframe_data::dataset::{Dataset, Window};

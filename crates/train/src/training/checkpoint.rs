@@ -12,7 +12,7 @@ use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
 use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Optimizer;
-use super::stage::{HistoryPoint, TrainState};
+use super::state::{HistoryPoint, TrainState};
 use foreframe_core::files::{
     is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, try_lock, write_atomically,
 };

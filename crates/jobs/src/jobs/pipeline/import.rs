@@ -7,9 +7,9 @@ use serde_json::json;
 use super::super::datasets;
 use super::super::patience::retry_while_busy;
 use super::super::report::JobReporter;
-use super::super::runner::{JobFailure, JobResult};
 use super::super::spec::ImportSpec;
 use super::{Pipeline, failed};
+use crate::jobs::executor::{JobFailure, JobResult};
 use foreframe_data::dataset::DatasetError;
 use foreframe_data::dataset::import::{ImportConfig, ImportError, ImportProgress, Imported, import, saved_shards};
 

@@ -3,7 +3,8 @@
 
 use rayon::prelude::*;
 
-use super::{BaselineInput, evenly};
+use super::input::BaselineInput;
+use crate::evaluation::windows::evenly;
 use crate::evaluation::{EvaluationError, cholesky};
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::frame::warp::sample;

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use super::mean;
+use super::input::mean;
 use crate::evaluation::EvaluationError;
 use foreframe_data::dataset::background::{Background, MAX_CHANGED_SHARE, differing};
 use foreframe_data::dataset::{Dataset, Window};

@@ -1,6 +1,6 @@
 //! The last frame warped by the rotation that the commanded actions bring about, through the data set's camera model.
 
-use super::BaselineInput;
+use super::input::BaselineInput;
 use foreframe_core::frame::warp::{CameraModel, rotation_grid, sample};
 use foreframe_core::types::Channel;
 use foreframe_data::dataset::DatasetInfo;

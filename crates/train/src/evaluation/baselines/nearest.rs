@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::frame_of;
+use super::input::frame_of;
 use crate::evaluation::EvaluationError;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};

@@ -13,7 +13,7 @@ use plotters::style::{Color, ShapeStyle};
 
 use super::Chart;
 use crate::evaluation::EvaluationError;
-use crate::evaluation::baselines::Method;
+use crate::evaluation::method::Method;
 
 const SIZE_PX: (u32, u32) = (920, 480);
 const LEGEND_WIDTH_PX: u32 = 250;

@@ -1,0 +1,54 @@
+//! What a baseline may look at.
+
+use crate::evaluation::EvaluationError;
+use foreframe_core::frame::preprocess::scale;
+use foreframe_data::dataset::sampler::WindowShape;
+use foreframe_data::dataset::{Dataset, Window};
+
+/// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
+#[derive(Clone, Debug)]
+pub struct BaselineInput<'a> {
+    /// The input frames, oldest first; at least one.
+    pub inputs: &'a [Vec<f32>],
+    /// The action that led to the last input frame; the first of `actions` where only one frame is known.
+    pub previous_action: &'a [f32],
+    /// The actions that lead to each predicted frame.
+    pub actions: Vec<&'a [f32]>,
+    /// The state at the last input frame.
+    pub state: &'a [f32],
+}
+
+impl<'a> BaselineInput<'a> {
+    /// The input of a window of that shape, whose first frames are `inputs`.
+    #[must_use]
+    pub fn of_window(dataset: &'a Dataset, window: Window, shape: WindowShape, inputs: &'a [Vec<f32>]) -> Self {
+        let last = window.first_frame + shape.context - 1;
+        Self {
+            inputs,
+            previous_action: dataset.action(last.saturating_sub(1).max(window.first_frame)),
+            actions: (last..last + shape.horizon)
+                .map(|frame| dataset.action(frame))
+                .collect(),
+            state: dataset.state(last),
+        }
+    }
+}
+
+/// A frame of the data set, 0…1.
+pub(super) fn frame_of(dataset: &Dataset, frame: usize) -> Result<Vec<f32>, EvaluationError> {
+    Ok(scale(&dataset.pixels(frame)?))
+}
+
+/// The mean of the frames, pixel by pixel.
+pub(super) fn mean(frames: &[Vec<f32>]) -> Vec<f32> {
+    let mut sum = vec![0.0; frames.first().map_or(0, Vec::len)];
+    for frame in frames {
+        for (sum, value) in sum.iter_mut().zip(frame) {
+            *sum += value;
+        }
+    }
+    for value in &mut sum {
+        *value /= frames.len() as f32;
+    }
+    sum
+}

@@ -1,0 +1,133 @@
+//! What an evaluation scores, on what, and how closely.
+
+use std::sync::atomic::AtomicBool;
+
+use serde::{Deserialize, Serialize};
+
+use super::EvaluationError;
+use super::bootstrap::Bootstrap;
+use super::progress::{EvaluationContext, EvaluationProgress};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::sampler::{Split, Splits};
+
+/// What a model is scored on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Purpose {
+    /// To choose between models and settings: the validation split.
+    Validation,
+    /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
+    #[default]
+    Test,
+    /// To publish: all of a data set that holds nothing but test data, as the files of published benchmarks do.
+    WholeSet,
+}
+
+impl Purpose {
+    /// The splits that are scored, in the order of the report.
+    #[must_use]
+    pub fn splits(self) -> &'static [Split] {
+        match self {
+            Self::Validation => &[Split::Validation],
+            Self::Test => &[Split::Test, Split::UnseenPairs, Split::UnseenGains],
+            Self::WholeSet => &[Split::Test],
+        }
+    }
+
+    /// How the data set is split for it.
+    pub(super) fn divide(self, dataset: &Dataset, seed: Seed) -> Splits {
+        match self {
+            Self::WholeSet => Splits::all_for_test(dataset),
+            Self::Validation | Self::Test => Splits::new(dataset, seed),
+        }
+    }
+}
+
+/// Training windows among which the nearest-window baseline looks, unless other numbers are asked for.
+pub const NEAREST_WINDOWS: usize = 15_000;
+
+/// What to test on, and how closely.
+#[derive(Clone)]
+pub struct EvaluateConfig<'a> {
+    /// Which part of the data set.
+    pub purpose: Purpose,
+    /// Seed of the split; that of the model's training if none is given.
+    pub split_seed: Option<Seed>,
+    /// Frames from the start of one window to that of the next.
+    pub stride: usize,
+    /// Windows of each set at most, evenly spread over its trials.
+    pub max_windows: usize,
+    /// Training windows among which the baseline looks for the nearest one, at most, evenly spread.
+    pub nearest_windows: usize,
+    /// Resamples for the intervals.
+    pub bootstrap_samples: usize,
+    /// Seed of the resamples and of the shuffled actions.
+    pub seed: Seed,
+    /// Windows that go through the model at once.
+    pub batch: usize,
+    /// Models trained with the same budget without the action, without the state or without both, for the action table.
+    pub twins: Vec<&'a LoadedModel>,
+    /// Other data sets, which the model's novelty must tell from the scored windows.
+    pub novel: Vec<&'a Dataset>,
+    /// The command line, for the stamp.
+    pub command: String,
+    /// Set by another thread to stop the evaluation.
+    pub cancelled: Option<&'a AtomicBool>,
+}
+
+impl Default for EvaluateConfig<'_> {
+    fn default() -> Self {
+        Self {
+            purpose: Purpose::default(),
+            split_seed: None,
+            stride: 1,
+            max_windows: 2000,
+            nearest_windows: NEAREST_WINDOWS,
+            bootstrap_samples: 1000,
+            seed: Seed(0),
+            batch: 64,
+            twins: Vec::new(),
+            novel: Vec::new(),
+            command: String::new(),
+            cancelled: None,
+        }
+    }
+}
+
+impl EvaluateConfig<'_> {
+    /// Errors: `Setting` where a number is too small.
+    pub fn validate(&self) -> Result<(), EvaluationError> {
+        for (setting, value, least) in [
+            ("the stride of windows", self.stride, 1),
+            ("the number of windows", self.max_windows, 1),
+            ("the number of training windows to search", self.nearest_windows, 1),
+            ("the number of bootstrap samples", self.bootstrap_samples, 100),
+            ("the batch size", self.batch, 1),
+        ] {
+            if value < least {
+                return Err(EvaluationError::Setting { setting, value, least });
+            }
+        }
+        Ok(())
+    }
+
+    /// What a pass over this split needs besides its windows.
+    pub(super) fn watched<'a>(
+        &'a self,
+        split: Split,
+        on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
+    ) -> EvaluationContext<'a> {
+        EvaluationContext {
+            split,
+            batch: self.batch,
+            bootstrap: Bootstrap {
+                samples: self.bootstrap_samples,
+                seed: self.seed,
+            },
+            on_progress,
+            cancelled: self.cancelled,
+        }
+    }
+}
