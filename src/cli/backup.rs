@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use super::error::CliError;
 use super::error::UsageError;
+use super::process::print_line;
 use super::settings::{CommonArgs, open_store, with_checked_directories};
 use super::workspace::block_on;
-use super::{CliError, print_line};
 use crate::store::backup::BackupError;
 
 /// Copy the data directory and its database into a new directory, also while a server runs.

@@ -6,9 +6,12 @@ use std::str::FromStr;
 
 use clap::value_parser;
 
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::collect::{CollectConfig, CollectProgress, collect};
 use crate::dataset::moving_mnist::{DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits};
 use crate::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};

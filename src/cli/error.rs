@@ -31,6 +31,14 @@ impl CliError {
         Self::Failed(error_text::with_causes(&error))
     }
 
+    /// The calibration failed, or was interrupted, which is no failure.
+    pub(super) fn not_calibrated(error: EvaluationError) -> Self {
+        match error {
+            EvaluationError::Cancelled => Self::Interrupted("stopped; the model has no new calibration".to_owned()),
+            other => other.into(),
+        }
+    }
+
     /// A file that cannot be used: `Usage` if the path leads to nothing of the right kind.
     pub(super) fn io(action: &str, path: &Path, source: &io::Error) -> Self {
         let sentence = format!("could not {action} {}: {source}", path.display());

@@ -3,9 +3,12 @@
 use std::io::ErrorKind;
 use std::path::PathBuf;
 
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
 use crate::dataset::{DatasetInfo, is_finished};
 use crate::error_text::with_causes;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::CliError;
+use super::error::CliError;
 use crate::config::{Config, ConfigError, LoadedConfig};
 use crate::settings::{SettingsError, SettingsLayer};
 use crate::store::{Store, StoreError};

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 
-use super::CliError;
+use super::error::CliError;
 use super::settings::open_store;
 use crate::config::Config;
 use crate::dataset::{self, Dataset};
@@ -144,6 +144,17 @@ impl Workspace {
     pub(super) fn config(&self) -> &Config {
         &self.config
     }
+}
+
+/// The scenario that the model was trained on: the default name of its data set.
+pub(super) fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
+    let manifest = &loaded.manifest;
+    manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
+        CliError::Usage(format!(
+            "--dataset is missing; model {:?} was trained on {:?}, which is not a simulated scenario",
+            manifest.name, manifest.dataset.name
+        ))
+    })
 }
 
 /// A model's name and, after an `@`, its version.

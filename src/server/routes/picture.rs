@@ -38,6 +38,14 @@ pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
     }
 }
 
+/// A copy of the context for an answer in that format: empty if the answer does not show it.
+pub(super) fn context_for(format: ResponseFormat, context: &[Frame]) -> Vec<Frame> {
+    match format {
+        ResponseFormat::Json => Vec::new(),
+        ResponseFormat::Png | ResponseFormat::Gif => context.to_vec(),
+    }
+}
+
 /// The response with a PNG picture.
 pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, PictureError> {
     let bytes = png_file(picture)?;
