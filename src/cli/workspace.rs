@@ -8,7 +8,7 @@ use super::error::CliError;
 use super::settings::open_store;
 use crate::config::Config;
 use crate::dataset::{self, Dataset};
-use crate::jobs::{self, JobError};
+use crate::jobs;
 use crate::registry::{self, LoadedModel, RegistryError, StoredWeights};
 use crate::server::ServerConfig;
 use crate::versions::{VersionError, Versions};
@@ -177,26 +177,4 @@ pub(super) fn block_on<T>(task: impl Future<Output = Result<T, CliError>>) -> Re
         .build()
         .map_err(CliError::failed)?;
     runtime.block_on(task)
-}
-
-impl From<JobError> for CliError {
-    fn from(error: JobError) -> Self {
-        match error {
-            JobError::NotFound { .. } => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
-}
-
-impl From<VersionError> for CliError {
-    fn from(error: VersionError) -> Self {
-        match error {
-            VersionError::Unknown { .. } | VersionError::Active { .. } | VersionError::Shipped { .. } => {
-                Self::Usage(error.to_string())
-            }
-            VersionError::Registry(error) => error.into(),
-            VersionError::Store(error) => error.into(),
-            other => Self::failed(other),
-        }
-    }
 }

@@ -6,7 +6,6 @@ mod positioned;
 use std::cmp::Ordering;
 use std::error::Error;
 use std::ffi::OsString;
-use std::fmt::Write as _;
 use std::fs::File;
 use std::fs::TryLockError;
 use std::io::{self, Write as _};
@@ -16,6 +15,7 @@ use std::time::{Duration, SystemTime};
 use sha2::{Digest, Sha256};
 
 pub use self::positioned::PositionedFile;
+pub use ::hex::encode as hex;
 
 /// Extension of a file that is being written.
 const PARTIAL: &str = "partial";
@@ -185,15 +185,6 @@ pub fn none_if_missing<T>(found: io::Result<T>) -> io::Result<Option<T>> {
 #[must_use]
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
-}
-
-/// Lower-case hexadecimal digits of the bytes.
-pub fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut hex, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(hex, "{byte:02x}");
-        hex
-    })
 }
 
 /// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.

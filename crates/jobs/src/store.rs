@@ -30,6 +30,7 @@ pub use self::models::{ModelMetrics, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
 pub use self::restore::restore;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files;
 
 /// The embedded database's file in the data directory.
@@ -125,6 +126,24 @@ pub enum StoreError {
         /// The object store's reason.
         source: object_store::Error,
     },
+}
+
+impl HasErrorKind for StoreError {
+    fn kind(&self) -> ErrorKind {
+        if self.is_unavailable() {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Url { .. } | Self::NoTls => ErrorKind::Usage,
+            Self::Damaged { .. } | Self::Restoring { .. } => ErrorKind::Unusable,
+            Self::Open { .. }
+            | Self::Away { .. }
+            | Self::Migrate(_)
+            | Self::Query(_)
+            | Self::Io { .. }
+            | Self::Object { .. } => ErrorKind::Internal,
+        }
+    }
 }
 
 impl StoreError {

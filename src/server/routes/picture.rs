@@ -34,7 +34,7 @@ impl From<PictureError> for ApiError {
 pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
     match format {
         ResponseFormat::Json => app.predictions(),
-        ResponseFormat::Png | ResponseFormat::Gif => app.pictures().threads(),
+        ResponseFormat::Png | ResponseFormat::Gif => app.render_cache().threads(),
     }
 }
 

@@ -9,7 +9,6 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
@@ -310,18 +309,11 @@ pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>,
 impl From<ServingError> for ApiError {
     fn from(error: ServingError) -> Self {
         match error {
-            ServingError::UnknownModel { .. } => Self::NotFound(error.to_string()),
-            ServingError::Input(_) => Self::Unprocessable(error.to_string()),
             ServingError::QueueFull { retry_after_s, .. } => Self::Unavailable {
                 detail: error.to_string(),
                 retry_after_s,
             },
-            ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
-            ServingError::Panicked
-            | ServingError::Model { .. }
-            | ServingError::Frame { .. }
-            | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
+            _ => Self::of(&error),
         }
     }
 }

@@ -46,8 +46,8 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
     let active = app.predictor().active(&model)?;
     let key = format!("model/{model}/{}", active.manifest.weights_sha256);
     // Many requests for the same picture compute one prediction.
-    let _turn = app.pictures().turn().await;
-    let png = match app.pictures().cached(&key) {
+    let _turn = app.render_cache().turn().await;
+    let png = match app.render_cache().cached(&key) {
         Some(png) => png,
         None => make(&app, active, key).await?,
     };
@@ -56,7 +56,7 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
 
 async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, ApiError> {
     let manifest = Arc::clone(&model.manifest);
-    let simulated = app.pictures().threads().run(move || simulate(&manifest)).await?;
+    let simulated = app.render_cache().threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
     let task = input.into_task(&model.manifest.name, &model.manifest.spec);
@@ -64,7 +64,7 @@ async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, 
     let mut rollouts = app.predictor().compute(&model, task, None).await?.rollouts;
     let predicted = rollouts.pop().unwrap_or_default().frames;
     let draw = move || Ok::<_, ApiError>(picture::png_file(prediction_sheet(&seen, &predicted, &truth))?);
-    app.pictures().get_or_make(key, draw).await
+    app.render_cache().get_or_make(key, draw).await
 }
 
 /// The model's input from the trial, and the true frames after it.

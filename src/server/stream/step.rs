@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings};
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
 use crate::nn::ModelSpec;
@@ -94,17 +95,21 @@ impl StepError {
         match self {
             Self::Gap { .. } => ErrorCode::Gap,
             Self::Image(ImageError::Encode(_)) | Self::Task(_) => ErrorCode::Internal,
-            Self::Serving(ServingError::QueueFull { .. } | ServingError::Deadline { .. } | ServingError::Stopped) => {
-                ErrorCode::Overloaded
-            }
-            Self::Serving(ServingError::Input(_))
-            | Self::Seq(_)
+            Self::Serving(error) => match error.kind() {
+                ErrorKind::Busy | ErrorKind::Away => ErrorCode::Overloaded,
+                ErrorKind::Usage => ErrorCode::Invalid,
+                ErrorKind::NotFound
+                | ErrorKind::Conflict
+                | ErrorKind::Unusable
+                | ErrorKind::Cancelled
+                | ErrorKind::Internal => ErrorCode::Internal,
+            },
+            Self::Seq(_)
             | Self::Steps { .. }
             | Self::Image(_)
             | Self::Value { .. }
             | Self::Input(_)
             | Self::NotOwner => ErrorCode::Invalid,
-            Self::Serving(_) => ErrorCode::Internal,
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::frame::FrameError;
 use crate::nn::NnError;
 
@@ -63,6 +64,19 @@ pub enum ServingError {
     /// The thread that owns the models could not be started.
     #[error("could not start the predictor's thread")]
     Thread(#[source] std::io::Error),
+}
+
+impl HasErrorKind for ServingError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::UnknownModel { .. } => ErrorKind::NotFound,
+            Self::Input(_) => ErrorKind::Usage,
+            Self::QueueFull { .. } | Self::Deadline { .. } | Self::Stopped => ErrorKind::Busy,
+            Self::Panicked | Self::Model { .. } | Self::Frame { .. } | Self::Tensor(_) | Self::Thread(_) => {
+                ErrorKind::Internal
+            }
+        }
+    }
 }
 
 /// Why an input does not fit a model. Names the field.
