@@ -15,7 +15,6 @@ use std::time::{Duration, SystemTime};
 use sha2::{Digest, Sha256};
 
 pub use self::positioned::PositionedFile;
-pub use ::hex::encode as hex;
 
 /// Extension of a file that is being written.
 const PARTIAL: &str = "partial";
@@ -185,6 +184,12 @@ pub fn none_if_missing<T>(found: io::Result<T>) -> io::Result<Option<T>> {
 #[must_use]
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
+}
+
+/// Lower-case hexadecimal digits of the bytes.
+#[must_use]
+pub fn hex(bytes: &[u8]) -> String {
+    ::hex::encode(bytes)
 }
 
 /// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.
