@@ -1,6 +1,10 @@
 //! The command line, one file for each subcommand. Exit code 2: the command cannot be carried out as it was given. Exit
 //! code 1: it failed. Exit code 130: it was interrupted.
+//!
+//! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `process` and
+//! `progress`, `interrupt`, `settings`, `output`, `admin_address`, `workspace`.
 
+mod admin_address;
 mod backup;
 mod calibrate;
 mod collect;
@@ -16,6 +20,7 @@ mod keys;
 mod models;
 mod output;
 mod predict;
+mod process;
 mod progress;
 mod publish;
 mod restore;
@@ -26,7 +31,6 @@ mod train;
 mod worker;
 mod workspace;
 
-use std::fmt::Display;
 use std::io::Write;
 use std::process::ExitCode;
 
@@ -112,25 +116,6 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }
-}
-
-/// Writes a line to standard output.
-fn print_line(line: impl Display) -> Result<(), CliError> {
-    writeln!(std::io::stdout(), "{}", printable(&line.to_string()))
-        .map_err(|error| CliError::Failed(format!("could not write to standard output: {error}")))
-}
-
-/// The command line as it was given; reports and manifests record it.
-fn command_line() -> String {
-    std::env::args()
-        .enumerate()
-        .map(|(index, argument)| match index {
-            0 => "foreframe".to_owned(),
-            _ if argument.contains([' ', '"', '\'']) => format!("'{}'", argument.replace('\'', r"'\''")),
-            _ => argument,
-        })
-        .collect::<Vec<_>>()
-        .join(" ")
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::server::ServerConfig;
 use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 use crate::telemetry::LogFormat;
@@ -64,6 +65,12 @@ pub enum ConfigError {
         /// What would be right.
         right: &'static str,
     },
+}
+
+impl HasErrorKind for ConfigError {
+    fn kind(&self) -> ErrorKind {
+        ErrorKind::Usage
+    }
 }
 
 /// All settings, checked.

@@ -36,7 +36,7 @@
 //! `foreframe-core`, `foreframe-sim`, `foreframe-data`, `foreframe-train` and `foreframe-jobs`.
 #![deny(unsafe_code)]
 
-pub use foreframe_core::{error_text, files, frame, metric_names, nn, registry, serving, types};
+pub use foreframe_core::{error_kind, error_text, files, frame, metric_names, nn, registry, serving, types};
 
 #[cfg(feature = "sim")]
 pub use foreframe_sim as sim;

@@ -2,7 +2,7 @@
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
-//! `config`, `http` (connections, limits, keys, problem details), `blocking`, `pictures`, `images`, `stream` (a session and its
+//! `config`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
 //! WebSocket), `environments`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
@@ -13,7 +13,7 @@ mod environments;
 mod http;
 mod images;
 mod openapi;
-mod pictures;
+mod render_cache;
 mod router;
 mod routes;
 mod serve;

@@ -8,6 +8,8 @@ mod prometheus;
 
 use serde::{Deserialize, Serialize};
 
+use crate::error_kind::{ErrorKind, HasErrorKind};
+
 pub use prometheus::{install_recorder, render, run_upkeep};
 
 /// Format of log lines.
@@ -31,6 +33,12 @@ pub enum TelemetryError {
     /// The exporter could not be created.
     #[error("could not create the exporter for otlp_endpoint: {0}")]
     Otlp(String),
+}
+
+impl HasErrorKind for TelemetryError {
+    fn kind(&self) -> ErrorKind {
+        ErrorKind::Usage
+    }
 }
 
 /// When it is dropped, it sends the traces that are still in memory.

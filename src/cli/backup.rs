@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use super::error::UsageError;
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::{CommonArgs, open_store, with_checked_directories};
 use super::workspace::block_on;
-use super::{CliError, print_line};
-use crate::store::backup::BackupError;
 
 /// Copy the data directory and its database into a new directory, also while a server runs.
 ///
@@ -52,17 +51,4 @@ pub(super) fn run(args: &BackupArgs) -> Result<(), CliError> {
         )?;
     }
     Ok(())
-}
-
-impl UsageError for BackupError {
-    fn is_usage(&self) -> bool {
-        matches!(
-            self,
-            Self::NotEmpty { .. }
-                | Self::Inside { .. }
-                | Self::NoBackup { .. }
-                | Self::Restoring { .. }
-                | Self::OtherDatabase
-        )
-    }
 }

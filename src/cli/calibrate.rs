@@ -2,11 +2,13 @@
 
 use std::path::PathBuf;
 
-use super::evaluate::trained_on;
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
-use super::workspace::Workspace;
-use super::{CliError, interrupt, print_line, progress::ProgressLine};
-use crate::evaluation::{self, EvaluateConfig, EvaluationError};
+use super::workspace::{Workspace, trained_on};
+use crate::evaluation::{self, EvaluateConfig};
 use crate::registry;
 
 /// Measure on the validation split which errors to expect of a model, and write it into the model's manifest.
@@ -49,19 +51,11 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CliError> {
         progress.update(now.done as u64, now.total as u64, || format!("{} split", now.split));
     });
     progress.finish();
-    let calibration = found.map_err(not_calibrated)?;
+    let calibration = found.map_err(CliError::not_calibrated)?;
     let windows = calibration.windows;
     registry::record_calibration(&model_dir, calibration)?;
     print_line(format!(
         "{}: calibrated on {windows} validation windows",
         model_dir.display()
     ))
-}
-
-/// An interruption is no failure.
-pub(super) fn not_calibrated(error: EvaluationError) -> CliError {
-    match error {
-        EvaluationError::Cancelled => CliError::Interrupted("stopped; the model has no new calibration".to_owned()),
-        other => other.into(),
-    }
 }

@@ -6,12 +6,15 @@ use std::str::FromStr;
 
 use clap::value_parser;
 
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::collect::{CollectConfig, CollectProgress, collect};
 use crate::dataset::moving_mnist::{DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits};
-use crate::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
+use crate::dataset::{Dataset, DatasetInfo, Split, Splits};
 use crate::jobs::spec::MAX_TRIALS;
 use crate::sim::{Look, Scenario, SimError, WorldConfig};
 use crate::training::TrainConfig;
@@ -141,22 +144,17 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
         }
     };
     progress.finish();
-    match collected {
-        Ok(info) => {
-            print_line(format!(
-                "{}: {} trials, {} frames of {}×{} px, content {}",
-                out.display(),
-                info.episode_count,
-                info.frame_count,
-                info.frame_width_px,
-                info.frame_height_px,
-                info.content_hash,
-            ))?;
-            print_line(format!("next: {}", next_step(args, &out, &info)?))
-        }
-        Err(stopped @ DatasetError::Cancelled { .. }) => Err(CliError::Interrupted(stopped.to_string())),
-        Err(error) => Err(error.into()),
-    }
+    let info = collected?;
+    print_line(format!(
+        "{}: {} trials, {} frames of {}×{} px, content {}",
+        out.display(),
+        info.episode_count,
+        info.frame_count,
+        info.frame_width_px,
+        info.frame_height_px,
+        info.content_hash,
+    ))?;
+    print_line(format!("next: {}", next_step(args, &out, &info)?))
 }
 
 /// The collection of a simulated scenario.

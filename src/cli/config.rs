@@ -1,7 +1,8 @@
 //! `foreframe config`
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::ServerArgs;
-use super::{CliError, print_line};
 
 /// Print every setting with its meaning, its range, and where its value comes from.
 ///

@@ -1,19 +1,14 @@
-//! Why a subcommand ended: the user's input cannot be carried out, or something failed.
+//! Why a subcommand ended: the user's input cannot be carried out, or something failed. The exit code follows from the kind
+//! of the error.
 
 use std::error::Error;
-use std::io::{self, ErrorKind};
+use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
-use crate::dataset::DatasetError;
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text;
 use crate::evaluation::EvaluationError;
-use crate::nn::NnError;
-use crate::registry::RegistryError;
-use crate::serving::ServingError;
-use crate::sim::SimError;
-use crate::telemetry::TelemetryError;
-use crate::training::TrainError;
 
 /// Why a subcommand ended, as a sentence for the user.
 pub(super) enum CliError {
@@ -31,13 +26,22 @@ impl CliError {
         Self::Failed(error_text::with_causes(&error))
     }
 
+    /// The calibration failed, or was interrupted, which is no failure.
+    pub(super) fn not_calibrated(error: EvaluationError) -> Self {
+        match error {
+            EvaluationError::Cancelled => Self::Interrupted("stopped; the model has no new calibration".to_owned()),
+            other => other.into(),
+        }
+    }
+
     /// A file that cannot be used: `Usage` if the path leads to nothing of the right kind.
     pub(super) fn io(action: &str, path: &Path, source: &io::Error) -> Self {
         let sentence = format!("could not {action} {}: {source}", path.display());
         match source.kind() {
-            ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory | ErrorKind::AlreadyExists => {
-                Self::Usage(sentence)
-            }
+            io::ErrorKind::NotFound
+            | io::ErrorKind::NotADirectory
+            | io::ErrorKind::IsADirectory
+            | io::ErrorKind::AlreadyExists => Self::Usage(sentence),
             _ => Self::Failed(sentence),
         }
     }
@@ -52,106 +56,45 @@ impl CliError {
     }
 }
 
-/// An error that knows whether the user's input caused it.
-pub(super) trait UsageError: Error {
-    /// Whether the arguments are wrong, or what they name does not fit together.
-    fn is_usage(&self) -> bool;
-}
-
-impl<E: UsageError> From<E> for CliError {
+impl<E: HasErrorKind> From<E> for CliError {
     fn from(error: E) -> Self {
         let sentence = error_text::with_causes(&error);
-        if error.is_usage() {
-            Self::Usage(sentence)
-        } else {
-            Self::Failed(sentence)
+        match error.kind() {
+            ErrorKind::Usage | ErrorKind::NotFound | ErrorKind::Conflict => Self::Usage(sentence),
+            ErrorKind::Cancelled => Self::Interrupted(sentence),
+            ErrorKind::Unusable | ErrorKind::Busy | ErrorKind::Away | ErrorKind::Internal => Self::Failed(sentence),
         }
     }
 }
 
-impl UsageError for TelemetryError {
-    fn is_usage(&self) -> bool {
-        true
-    }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-impl UsageError for SimError {
-    fn is_usage(&self) -> bool {
-        matches!(
-            self,
-            Self::UnknownScenario { .. } | Self::UnknownLook { .. } | Self::FrameSize { .. } | Self::Setting { .. }
-        )
-    }
-}
+    #[derive(Debug, thiserror::Error)]
+    #[error("an error")]
+    struct ErrorOfKind(ErrorKind);
 
-impl UsageError for DatasetError {
-    fn is_usage(&self) -> bool {
-        match self {
-            Self::World(error) => error.is_usage(),
-            Self::Zero { .. }
-            | Self::OutExists { .. }
-            | Self::OtherArguments { .. }
-            | Self::Unknown { .. }
-            | Self::NotADataset { .. }
-            | Self::OtherTool { .. }
-            | Self::Unfinished { .. }
-            | Self::FrameSize { .. }
-            | Self::OddFrames { .. }
-            | Self::Channels { .. }
-            | Self::WindowTooLong { .. }
-            | Self::TooFewWindows { .. } => true,
-            _ => false,
+    impl HasErrorKind for ErrorOfKind {
+        fn kind(&self) -> ErrorKind {
+            self.0
         }
     }
-}
 
-impl UsageError for RegistryError {
-    fn is_usage(&self) -> bool {
-        matches!(self, Self::Unknown { .. } | Self::Name(_) | Self::NotAModel(_))
-    }
-}
-
-impl UsageError for TrainError {
-    fn is_usage(&self) -> bool {
-        match self {
-            Self::UnknownPreset(_)
-            | Self::Config(_)
-            | Self::NotARun(_)
-            | Self::OtherRun { .. }
-            | Self::ConstantActions { .. }
-            | Self::OtherUnits { .. }
-            | Self::NoWindows { .. } => true,
-            Self::Dataset(error) => error.is_usage(),
-            Self::Registry(error) => error.is_usage(),
-            // The network's sizes come from the settings.
-            Self::Network(error) => matches!(error, NnError::OutOfRange { .. } | NnError::NoChannels { .. }),
-            _ => false,
+    #[test]
+    fn the_way_a_command_ends_follows_from_the_kind() {
+        for kind in [ErrorKind::Usage, ErrorKind::NotFound, ErrorKind::Conflict] {
+            assert!(matches!(CliError::from(ErrorOfKind(kind)), CliError::Usage(_)));
         }
-    }
-}
-
-impl UsageError for EvaluationError {
-    fn is_usage(&self) -> bool {
-        match self {
-            Self::FrameSize { .. }
-            | Self::FramePeriod { .. }
-            | Self::Channels { .. }
-            | Self::SplitSeed { .. }
-            | Self::Twin { .. }
-            | Self::Setting { .. }
-            | Self::NothingHeldOut { .. }
-            | Self::NotCalibrated { .. }
-            | Self::NoContext { .. }
-            | Self::OutputExists(_) => true,
-            Self::Dataset(error) => error.is_usage(),
-            Self::Registry(error) => error.is_usage(),
-            _ => false,
+        for kind in [
+            ErrorKind::Unusable,
+            ErrorKind::Busy,
+            ErrorKind::Away,
+            ErrorKind::Internal,
+        ] {
+            assert!(matches!(CliError::from(ErrorOfKind(kind)), CliError::Failed(_)));
         }
-    }
-}
-
-impl UsageError for ServingError {
-    fn is_usage(&self) -> bool {
-        matches!(self, Self::Input(_))
+        let cancelled = CliError::from(ErrorOfKind(ErrorKind::Cancelled));
+        assert!(matches!(cancelled, CliError::Interrupted(_)));
     }
 }

@@ -4,10 +4,12 @@ use std::path::PathBuf;
 
 use clap::value_parser;
 
+use super::error::CliError;
 use super::output::OutputDirectory;
+use super::process::{command_line, print_line};
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
-use super::workspace::Workspace;
-use super::{CliError, command_line, print_line, progress::ProgressLine};
+use super::workspace::{Workspace, trained_on};
 use crate::dataset::Dataset;
 use crate::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, Purpose};
 use crate::jobs::spec::MAX_RESAMPLES;
@@ -164,15 +166,4 @@ fn require_skill(report: &EvaluationReport, least: f64) -> Result<(), CliError> 
         }
     }
     Ok(())
-}
-
-/// The scenario that the model was trained on: the default name of its data set.
-pub(super) fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
-    let manifest = &loaded.manifest;
-    manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
-        CliError::Usage(format!(
-            "--dataset is missing; model {:?} was trained on {:?}, which is not a simulated scenario",
-            manifest.name, manifest.dataset.name
-        ))
-    })
 }

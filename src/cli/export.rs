@@ -6,10 +6,11 @@ use std::path::PathBuf;
 use clap::value_parser;
 use serde_json::json;
 
+use super::error::CliError;
 use super::output::OutputDirectory;
+use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, print_line};
 use crate::dataset::export::{
     ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_lerobot_images, to_lerobot_videos, to_mcap, to_mp4,
 };

@@ -4,8 +4,9 @@ use std::io::{Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::ServerArgs;
-use super::{CliError, print_line};
 use crate::config::LoadedConfig;
 
 /// Longer than a healthy server takes, even while it trains.

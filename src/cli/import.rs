@@ -1,29 +1,20 @@
 //! `foreframe import`
 
-use std::io::ErrorKind;
 use std::path::PathBuf;
 
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, interrupt, print_line, progress::ProgressLine};
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
 use crate::dataset::{DatasetInfo, is_finished};
-use crate::error_text::with_causes;
 use crate::frame::fit::Fit;
 use crate::registry::is_valid_name;
 
 /// How many left-out items are printed.
 const LISTED_ITEMS: usize = 10;
-
-/// Errors of reading that say something about the recording, not about the machine.
-const DAMAGED_INPUT: [ErrorKind; 6] = [
-    ErrorKind::NotFound,
-    ErrorKind::NotADirectory,
-    ErrorKind::IsADirectory,
-    ErrorKind::InvalidInput,
-    ErrorKind::InvalidData,
-    ErrorKind::UnexpectedEof,
-];
 
 /// Turn a recording into a data set.
 ///
@@ -197,24 +188,4 @@ fn name(args: &ImportArgs) -> Result<String, CliError> {
     let name: String = stem.chars().map(allowed).take(64).collect();
     let name = name.trim_matches('-');
     Ok(if name.is_empty() { "recording" } else { name }.to_owned())
-}
-
-impl From<ImportError> for CliError {
-    fn from(error: ImportError) -> Self {
-        let text = with_causes(&error);
-        match error {
-            ImportError::Cancelled { .. } | ImportError::Stopped => Self::Interrupted(text),
-            ImportError::UnknownSource(_)
-            | ImportError::Option(_)
-            | ImportError::OptionValue { .. }
-            | ImportError::Record { .. }
-            | ImportError::Image { .. }
-            | ImportError::Disk { .. }
-            | ImportError::Empty(_)
-            | ImportError::OutExists { .. } => Self::Usage(text),
-            ImportError::Dataset(error) => error.into(),
-            ImportError::Io { ref source, .. } if DAMAGED_INPUT.contains(&source.kind()) => Self::Usage(text),
-            _ => Self::Failed(text),
-        }
-    }
 }

@@ -5,7 +5,7 @@ mod model;
 
 use std::path::{Path, PathBuf};
 
-use super::CliError;
+use super::error::CliError;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use crate::dataset;
@@ -57,7 +57,7 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
         return workspace.load_model(name).map(drop);
     }
     if let Ok(dir) = workspace.find_dataset(path) {
-        return data_set::describe(&dir, &workspace.read_dataset(&dir)?, args);
+        return data_set::describe(&dir, &workspace.read_dataset(&dir)?, args.html.as_deref(), args.json);
     }
     let datasets_dir = workspace.datasets_dir();
     Err(CliError::Usage(format!(

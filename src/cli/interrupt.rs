@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::CliError;
+use super::error::CliError;
 
 /// A flag that the first Ctrl-C (or SIGTERM) sets.
 pub(super) fn flag() -> Result<Arc<AtomicBool>, CliError> {

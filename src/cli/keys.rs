@@ -1,8 +1,9 @@
 //! `foreframe keys`
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::{CommonArgs, open_store};
 use super::workspace::block_on;
-use super::{CliError, print_line};
 use crate::server::keys::NewKey;
 use crate::store::{Author, KeyRow, KeyScope, Store};
 

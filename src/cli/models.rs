@@ -1,8 +1,9 @@
 //! `foreframe models`
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on, split_version};
-use super::{CliError, print_line};
 use crate::registry::{self, RegistryError};
 use crate::versions::Versions;
 

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::CliError;
+use super::error::CliError;
 use crate::files::write_atomically;
 
 /// The beginning of the name of the directory in which the files are written first.

@@ -7,10 +7,11 @@ use std::path::PathBuf;
 
 use self::actions::ActionsFile;
 use self::images::ImageFiles;
+use super::error::CliError;
 use super::output::OutputDirectory;
+use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use super::{CliError, print_line};
 use crate::error_text;
 use crate::evaluation::figures::{animation, montage};
 use crate::frame::fit::Fit;

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on};
-use super::{CliError, print_line};
 use crate::registry::{self, MANIFEST_FILE, RegistryError};
 
 /// The directory of the model in a run's directory.

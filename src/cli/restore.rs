@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::CommonArgs;
-use super::{CliError, print_line};
 use crate::store::restore;
 
 /// Restore a backup into a new data directory.

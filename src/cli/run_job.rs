@@ -1,6 +1,6 @@
 //! `foreframe run-job`: the child process of a server or worker that runs one job.
 
-use super::CliError;
+use super::error::CliError;
 use crate::jobs::child;
 use crate::telemetry::{self, LogFormat};
 

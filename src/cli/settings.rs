@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::CliError;
-use crate::config::{Config, ConfigError, LoadedConfig};
-use crate::settings::{SettingsError, SettingsLayer};
-use crate::store::{Store, StoreError};
+use super::error::CliError;
+use crate::config::{Config, LoadedConfig};
+use crate::settings::SettingsLayer;
+use crate::store::Store;
 use crate::telemetry;
 
 /// The heading of these flags in every help text.
@@ -145,25 +145,4 @@ pub(super) async fn open_store(config: &Config) -> Result<Store, CliError> {
 pub(super) async fn open_store_waiting(config: &Config) -> Result<Store, CliError> {
     let limit = Duration::from_secs(config.server.database_wait_s);
     Ok(Store::open_waiting(&config.server.store(), limit).await?)
-}
-
-impl From<ConfigError> for CliError {
-    fn from(error: ConfigError) -> Self {
-        Self::Usage(error.to_string())
-    }
-}
-
-impl From<SettingsError> for CliError {
-    fn from(error: SettingsError) -> Self {
-        Self::Usage(error.to_string())
-    }
-}
-
-impl From<StoreError> for CliError {
-    fn from(error: StoreError) -> Self {
-        match error {
-            StoreError::Url { .. } | StoreError::NoTls => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
 }

@@ -2,10 +2,12 @@
 
 use std::path::PathBuf;
 
-use super::calibrate::not_calibrated;
+use super::error::CliError;
+use super::interrupt;
+use super::process::{command_line, print_line};
+use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
-use super::{CliError, command_line, interrupt, print_line, progress::ProgressLine};
 use crate::evaluation;
 use crate::registry::StoredWeights;
 use crate::settings::SettingsLayer;
@@ -92,7 +94,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     progress.finish();
     match outcome? {
         TrainingOutcome::Finished { model_dir, manifest } => {
-            evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(not_calibrated)?;
+            evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(CliError::not_calibrated)?;
             print_line(format!(
                 "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
                 model_dir.display(),

@@ -5,9 +5,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use super::serve::AdminAddress;
+use super::admin_address::AdminAddress;
+use super::error::CliError;
+use super::process::print_line;
 use super::settings::{CommonArgs, open_store_waiting, with_checked_directories};
-use super::{CliError, print_line};
 use crate::config::Config;
 use crate::jobs::pipeline::Pipeline;
 use crate::jobs::{Jobs, child};

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 
-use super::CliError;
+use super::error::CliError;
 use super::settings::open_store;
 use crate::config::Config;
 use crate::dataset::{self, Dataset};
-use crate::jobs::{self, JobError};
+use crate::jobs;
 use crate::registry::{self, LoadedModel, RegistryError, StoredWeights};
 use crate::server::ServerConfig;
 use crate::versions::{VersionError, Versions};
@@ -146,6 +146,17 @@ impl Workspace {
     }
 }
 
+/// The scenario that the model was trained on: the default name of its data set.
+pub(super) fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
+    let manifest = &loaded.manifest;
+    manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
+        CliError::Usage(format!(
+            "--dataset is missing; model {:?} was trained on {:?}, which is not a simulated scenario",
+            manifest.name, manifest.dataset.name
+        ))
+    })
+}
+
 /// A model's name and, after an `@`, its version.
 pub(super) fn split_version(model: &str) -> Result<(&str, Option<u32>), CliError> {
     let Some((name, version)) = model.split_once('@') else {
@@ -166,26 +177,4 @@ pub(super) fn block_on<T>(task: impl Future<Output = Result<T, CliError>>) -> Re
         .build()
         .map_err(CliError::failed)?;
     runtime.block_on(task)
-}
-
-impl From<JobError> for CliError {
-    fn from(error: JobError) -> Self {
-        match error {
-            JobError::NotFound { .. } => Self::Usage(error.to_string()),
-            other => Self::failed(other),
-        }
-    }
-}
-
-impl From<VersionError> for CliError {
-    fn from(error: VersionError) -> Self {
-        match error {
-            VersionError::Unknown { .. } | VersionError::Active { .. } | VersionError::Shipped { .. } => {
-                Self::Usage(error.to_string())
-            }
-            VersionError::Registry(error) => error.into(),
-            VersionError::Store(error) => error.into(),
-            other => Self::failed(other),
-        }
-    }
 }

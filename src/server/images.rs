@@ -184,6 +184,17 @@ pub(in crate::server) fn encode(frames: &[Frame], format: ImageFormat) -> Result
     frames.iter().map(|frame| encode_one(frame, format)).collect()
 }
 
+/// As [`encode`]; raw pixels are not copied.
+pub(in crate::server) fn encode_owned(frames: Vec<Frame>, format: ImageFormat) -> Result<Vec<ImageBytes>, ImageError> {
+    match format {
+        ImageFormat::Raw => Ok(frames
+            .into_iter()
+            .map(|frame| ImageBytes(frame.into_pixels()))
+            .collect()),
+        ImageFormat::Png | ImageFormat::Jpeg => encode(&frames, format),
+    }
+}
+
 /// The frame in that format.
 pub(in crate::server) fn encode_one(frame: &Frame, format: ImageFormat) -> Result<ImageBytes, ImageError> {
     match format {

@@ -17,7 +17,7 @@ use super::http::keys::{Caller, Keys};
 use super::http::message_bytes::MessageBytes;
 use super::http::task_limit::{TaskLimit, stop_requested};
 use super::http::tls::ServerTls;
-use super::pictures::Pictures;
+use super::render_cache::RenderCache;
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
 use crate::jobs::child;
@@ -86,7 +86,7 @@ struct AppState {
     admission: Admission,
     body_budget: BodyBudget,
     predictions: BlockingWork,
-    pictures: Pictures,
+    render_cache: RenderCache,
     blocking: BlockingWork,
     environments: Environments,
     draining: Arc<AtomicBool>,
@@ -155,7 +155,7 @@ impl App {
                 admission: Admission::new(&config),
                 body_budget: BodyBudget::new(&config),
                 predictions: BlockingWork::new("predictions", config.request_threads),
-                pictures: Pictures::new(&config),
+                render_cache: RenderCache::new(&config),
                 blocking: BlockingWork::new("requests", config.request_threads),
                 environments: Environments::new(&config),
                 draining: Arc::default(),
@@ -248,8 +248,8 @@ impl App {
         &self.shared.predictions
     }
 
-    pub(super) fn pictures(&self) -> &Pictures {
-        &self.shared.pictures
+    pub(super) fn render_cache(&self) -> &RenderCache {
+        &self.shared.render_cache
     }
 
     /// The threads for simulations and for what is neither a prediction nor a picture.

@@ -6,7 +6,6 @@ mod positioned;
 use std::cmp::Ordering;
 use std::error::Error;
 use std::ffi::OsString;
-use std::fmt::Write as _;
 use std::fs::File;
 use std::fs::TryLockError;
 use std::io::{self, Write as _};
@@ -188,12 +187,9 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
 }
 
 /// Lower-case hexadecimal digits of the bytes.
+#[must_use]
 pub fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut hex, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(hex, "{byte:02x}");
-        hex
-    })
+    ::hex::encode(bytes)
 }
 
 /// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.

@@ -113,6 +113,12 @@ impl Frame {
         &self.pixels
     }
 
+    /// The intensities, without a copy.
+    #[must_use]
+    pub fn into_pixels(self) -> Vec<u8> {
+        self.pixels
+    }
+
     /// The intensities, to change them.
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.pixels

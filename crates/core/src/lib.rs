@@ -7,6 +7,7 @@ pub mod types;
 
 pub mod vectorized;
 
+pub mod error_kind;
 pub mod error_text;
 pub mod files;
 pub mod metric_names;

@@ -47,6 +47,8 @@ pub mod spec;
 pub mod ssim_loss;
 pub mod tensors;
 
+use crate::error_kind::{ErrorKind, HasErrorKind};
+
 pub use autoencoder::Feedback;
 pub use conditioned::ConditioningTensors;
 pub use flow::FlowPrediction;
@@ -192,6 +194,28 @@ pub enum NnError {
     /// The tensor library failed.
     #[error("tensor computation failed")]
     Tensor(#[from] candle_core::Error),
+}
+
+impl HasErrorKind for NnError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            // A training takes these from its settings.
+            Self::OutOfRange { .. } | Self::NoChannels { .. } => ErrorKind::Usage,
+            Self::ChannelScale { .. }
+            | Self::FrameSides { .. }
+            | Self::RecurrentActions { .. }
+            | Self::Camera(_)
+            | Self::UnknownName { .. }
+            | Self::Shape { .. }
+            | Self::Missing { .. }
+            | Self::OtherArchitecture { .. }
+            | Self::TensorMissing { .. }
+            | Self::TensorUnknown { .. }
+            | Self::TensorShape { .. }
+            | Self::TensorNotFinite { .. } => ErrorKind::Unusable,
+            Self::Tensor(_) => ErrorKind::Internal,
+        }
+    }
 }
 
 impl NnError {

@@ -13,8 +13,9 @@ pub use self::calibration::Calibration;
 pub use self::embedded::{EmbeddedModel, embed};
 pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::existing;
-use crate::files::{sha256_hex, write_atomically};
+use crate::files::{may_pass, sha256_hex, write_atomically};
 use crate::nn::Parameters;
 
 /// Name of the weights file in a model's directory.
@@ -97,6 +98,24 @@ pub enum RegistryError {
         /// The reader's error.
         source: candle_core::Error,
     },
+}
+
+impl HasErrorKind for RegistryError {
+    fn kind(&self) -> ErrorKind {
+        if may_pass(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Unknown { .. } => ErrorKind::NotFound,
+            Self::Name(_) | Self::NotAModel(_) => ErrorKind::Usage,
+            Self::Manifest { .. }
+            | Self::ManifestValue { .. }
+            | Self::Hash { .. }
+            | Self::Weights { .. }
+            | Self::Safetensors { .. } => ErrorKind::Unusable,
+            Self::Io { .. } => ErrorKind::Internal,
+        }
+    }
 }
 
 /// Whether the name is safe as a directory name and in a URL: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.

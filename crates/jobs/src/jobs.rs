@@ -23,6 +23,7 @@ pub mod state;
 
 use crate::store::{StoreError, unix_s};
 use crate::versions::VersionError;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_data::dataset::DatasetError;
 
 pub use executor::{JobExecutor, JobFailure, JobResult};
@@ -141,6 +142,23 @@ pub enum JobError {
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
+}
+
+impl HasErrorKind for JobError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Unknown { .. } => ErrorKind::NotFound,
+            Self::Invalid { .. } | Self::NotFound { .. } => ErrorKind::Usage,
+            Self::IllegalTransition { .. } | Self::Taken { .. } | Self::Occupied { .. } | Self::InUse { .. } => {
+                ErrorKind::Conflict
+            }
+            Self::QueueFull { .. } | Self::ShareFull { .. } | Self::Stopping => ErrorKind::Busy,
+            Self::Dataset(error) => error.kind().of_own_data(),
+            Self::Versions(error) => error.kind().of_own_data(),
+            Self::Store(error) => error.kind().of_own_data(),
+            Self::Record { .. } | Self::Instance(_) | Self::Threads(_) => ErrorKind::Internal,
+        }
+    }
 }
 
 impl JobError {

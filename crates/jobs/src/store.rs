@@ -32,6 +32,7 @@ pub use self::models::{ModelMetrics, PublishedVersion, VersionRow};
 pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
 pub use self::restore::restore;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files;
 
 /// The embedded database's file in the data directory.
@@ -127,6 +128,24 @@ pub enum StoreError {
         /// The object store's reason.
         source: object_store::Error,
     },
+}
+
+impl HasErrorKind for StoreError {
+    fn kind(&self) -> ErrorKind {
+        if self.is_unavailable() {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Url { .. } | Self::NoTls => ErrorKind::Usage,
+            Self::Damaged { .. } | Self::Restoring { .. } => ErrorKind::Unusable,
+            Self::Open { .. }
+            | Self::Away { .. }
+            | Self::Migrate(_)
+            | Self::Query(_)
+            | Self::Io { .. }
+            | Self::Object { .. } => ErrorKind::Internal,
+        }
+    }
 }
 
 impl StoreError {

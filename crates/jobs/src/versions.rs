@@ -12,8 +12,9 @@ use tokio::sync::Mutex;
 use tracing::{info, warn};
 
 use crate::store::{Author, Lease, Store, StoreError, unix_s};
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
-use foreframe_core::files::write_atomically;
+use foreframe_core::files::{may_pass, write_atomically};
 use foreframe_core::metric_names;
 use foreframe_core::registry::{self, LoadedModel, Manifest, RegistryError};
 use foreframe_core::serving::{Predictor, ServingError};
@@ -81,6 +82,23 @@ pub enum VersionError {
     /// The predictor has stopped.
     #[error(transparent)]
     Serving(ServingError),
+}
+
+impl HasErrorKind for VersionError {
+    fn kind(&self) -> ErrorKind {
+        if may_pass(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Unknown { .. } => ErrorKind::NotFound,
+            Self::Active { .. } | Self::Shipped { .. } => ErrorKind::Conflict,
+            Self::Refused { .. } => ErrorKind::Unusable,
+            Self::Registry(error) => error.kind(),
+            Self::Store(error) => error.kind(),
+            Self::Serving(error) => error.kind(),
+            Self::Io { .. } => ErrorKind::Internal,
+        }
+    }
 }
 
 impl VersionError {

@@ -1,6 +1,7 @@
 //! Errors of the simulator.
 
 use super::scenario;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::frame::{FrameError, MAX_SIDE_PX};
 use foreframe_core::types::ValueError;
 
@@ -56,4 +57,19 @@ pub enum SimError {
     /// The camera's image is not a valid frame.
     #[error(transparent)]
     Frame(#[from] FrameError),
+}
+
+impl HasErrorKind for SimError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::UnknownScenario { .. }
+            | Self::UnknownLook { .. }
+            | Self::FrameSize { .. }
+            | Self::Setting { .. }
+            | Self::ActionLength { .. }
+            | Self::Value(_) => ErrorKind::Usage,
+            Self::Ended | Self::NotReset => ErrorKind::Conflict,
+            Self::Frame(_) => ErrorKind::Internal,
+        }
+    }
 }

@@ -7,6 +7,7 @@ use figment::error::Kind;
 use figment::util::nest;
 use figment::value::{Dict, Map, Value};
 use figment::{Figment, Metadata, Profile, Provider};
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -62,6 +63,12 @@ pub enum SettingsError {
         /// What would be right.
         expected: String,
     },
+}
+
+impl HasErrorKind for SettingsError {
+    fn kind(&self) -> ErrorKind {
+        ErrorKind::Usage
+    }
 }
 
 fn within(parent: &str) -> String {

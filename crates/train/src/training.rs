@@ -29,7 +29,8 @@ use self::config::{CodecStart, WindowBudget};
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::stage::{StageEnd, StageRunner};
 use self::state::TrainState;
-use foreframe_core::files::write_atomically;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::files::{may_pass, write_atomically};
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::nn::{Architecture, Conditioning, ModelSpec, NnError, Parameters};
@@ -171,6 +172,28 @@ pub enum TrainError {
     /// The model could not be published.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+}
+
+impl HasErrorKind for TrainError {
+    fn kind(&self) -> ErrorKind {
+        if may_pass(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Dataset(error) => error.kind(),
+            Self::Registry(error) => error.kind(),
+            Self::Network(error) => error.kind(),
+            Self::UnknownPreset(_)
+            | Self::Config(_)
+            | Self::ConstantActions { .. }
+            | Self::OtherUnits { .. }
+            | Self::NoWindows { .. } => ErrorKind::Usage,
+            Self::NotARun(_) | Self::OtherRun { .. } => ErrorKind::Conflict,
+            Self::OtherNetwork { .. } | Self::Checkpoint { .. } | Self::Frame(_) => ErrorKind::Unusable,
+            Self::Busy(_) => ErrorKind::Busy,
+            Self::Diverged { .. } | Self::Io { .. } | Self::Optimizer(_) => ErrorKind::Internal,
+        }
+    }
 }
 
 impl From<candle_core::Error> for TrainError {

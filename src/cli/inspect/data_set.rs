@@ -2,21 +2,21 @@
 
 use std::path::Path;
 
-use super::super::{CliError, print_line};
-use super::InspectArgs;
+use crate::cli::error::CliError;
+use crate::cli::process::print_line;
 use crate::dataset::{Dataset, DatasetInfo};
 use crate::error_text::comma_separated;
 use crate::files::write_atomically;
 use crate::inspection::{ActionDelay, ChannelSummary, Inspection, inspect, page};
 
-/// Looks through a data set and prints what was found.
-pub(super) fn describe(dir: &Path, dataset: &Dataset, args: &InspectArgs) -> Result<(), CliError> {
+/// Looks through a data set and prints what was found, also as a page into the file `html`.
+pub(super) fn describe(dir: &Path, dataset: &Dataset, html: Option<&Path>, is_json: bool) -> Result<(), CliError> {
     let inspection = inspect(dataset)?;
-    if let Some(path) = &args.html {
+    if let Some(path) = html {
         let page = page(&inspection, dataset).map_err(CliError::failed)?;
         write_atomically(path, page.as_bytes()).map_err(|error| CliError::io("write", path, &error))?;
     }
-    if args.json {
+    if is_json {
         return print_line(serde_json::to_string_pretty(&inspection).map_err(CliError::failed)?);
     }
     print_description(dir, dataset.info())?;
@@ -33,7 +33,7 @@ pub(super) fn describe(dir: &Path, dataset: &Dataset, args: &InspectArgs) -> Res
     }
     let mut warnings = inspection.warnings.iter();
     warnings.try_for_each(|warning| print_line(format!("warning: {warning}")))?;
-    match &args.html {
+    match html {
         Some(path) => print_line(format!("page: {}", path.display())),
         None => Ok(()),
     }

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use super::super::{CliError, print_line};
+use crate::cli::error::CliError;
+use crate::cli::process::print_line;
 use crate::error_text::comma_separated;
 use crate::nn::{Architecture, ChannelScale, ModelSpec, costs};
 use crate::registry::Manifest;

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use crate::cli::CliError;
+use crate::cli::error::CliError;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
 

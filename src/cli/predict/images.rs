@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use tracing::info;
 
-use crate::cli::CliError;
+use crate::cli::error::CliError;
 use crate::error_text;
 use crate::files::natural_order;
 use crate::frame::fit::{Fit, fit};

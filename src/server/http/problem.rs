@@ -1,12 +1,15 @@
 //! The HTTP status of an error, and the one shape that errors have: problem details (RFC 9457).
 
+use std::error::Error;
+
 use axum::body::Body;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::error;
 
-use crate::error_text::without_middle;
+use crate::error_kind::{ErrorKind, HasErrorKind};
+use crate::error_text::{with_causes, without_middle};
 
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -49,6 +52,27 @@ pub(in crate::server) enum ApiError {
 }
 
 impl ApiError {
+    /// The answer for an error of that kind.
+    pub(in crate::server) fn of(error: &impl HasErrorKind) -> Self {
+        Self::of_kind(error.kind(), error)
+    }
+
+    /// The answer for an error of our own data, which the client did not name: its text may name paths of this machine.
+    pub(in crate::server) fn of_own_data(error: &impl HasErrorKind) -> Self {
+        Self::of_kind(error.kind().of_own_data(), error)
+    }
+
+    fn of_kind(kind: ErrorKind, error: &dyn Error) -> Self {
+        match kind {
+            ErrorKind::NotFound => Self::NotFound(error.to_string()),
+            ErrorKind::Usage | ErrorKind::Unusable => Self::Unprocessable(error.to_string()),
+            ErrorKind::Conflict => Self::Conflict(error.to_string()),
+            ErrorKind::Busy => Self::unavailable(error.to_string()),
+            ErrorKind::Away => Self::unavailable(with_causes(error)),
+            ErrorKind::Cancelled | ErrorKind::Internal => Self::Internal(with_causes(error)),
+        }
+    }
+
     pub(in crate::server) fn unavailable(detail: impl Into<String>) -> Self {
         Self::Unavailable {
             detail: detail.into(),
@@ -204,4 +228,36 @@ pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
         body.len()
     );
     Some([head.as_bytes(), &body].concat())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("of a test")]
+    struct ClassifiedError(ErrorKind);
+
+    impl HasErrorKind for ClassifiedError {
+        fn kind(&self) -> ErrorKind {
+            self.0
+        }
+    }
+
+    #[test]
+    fn the_status_follows_from_the_kind() {
+        let status = |kind| ApiError::of(&ClassifiedError(kind)).status().0.as_u16();
+        assert_eq!(status(ErrorKind::NotFound), 404);
+        assert_eq!(status(ErrorKind::Conflict), 409);
+        assert_eq!([ErrorKind::Usage, ErrorKind::Unusable].map(status), [422; 2]);
+        assert_eq!([ErrorKind::Busy, ErrorKind::Away].map(status), [503; 2]);
+        assert_eq!([ErrorKind::Cancelled, ErrorKind::Internal].map(status), [500; 2]);
+    }
+
+    #[test]
+    fn an_error_of_our_own_data_is_not_described_to_the_client() {
+        let answer = |kind| ApiError::of_own_data(&ClassifiedError(kind));
+        assert_eq!(answer(ErrorKind::NotFound), ApiError::Internal("of a test".to_owned()));
+        assert_eq!(answer(ErrorKind::Away), ApiError::unavailable("of a test"));
+    }
 }

@@ -5,12 +5,10 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::error_text::with_causes;
 use crate::server::http::extract::Query;
 use crate::server::http::page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::StoreError;
 use crate::store::audit::AuditRow;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -87,17 +85,9 @@ async fn list(State(app): State<App>, Query(query): Query<AuditQuery>) -> Result
         .store()
         .audit(query.before, limit as i64 + 1)
         .await
-        .map_err(|error| failed(&error))?;
+        .map_err(|error| ApiError::of_own_data(&error))?;
     let has_more = rows.len() > limit;
     let entries: Vec<AuditEntry> = rows.into_iter().take(limit).map(AuditEntry::from).collect();
     let next = entries.last().filter(|_| has_more).map(|entry| entry.number);
     Ok(axum::Json(AuditList { entries, next }))
-}
-
-fn failed(error: &StoreError) -> ApiError {
-    if error.is_unavailable() {
-        ApiError::unavailable(with_causes(error))
-    } else {
-        ApiError::Internal(with_causes(error))
-    }
 }

@@ -11,7 +11,6 @@ use utoipa_axum::routes;
 
 use super::picture::PictureError;
 use crate::dataset::{Dataset, DatasetError, DatasetInfo};
-use crate::error_text::with_causes;
 use crate::evaluation::figures::animation::enlarged_gif;
 use crate::evaluation::figures::montage::{MontageRow, Style, montage};
 use crate::frame::{Frame, FrameError, codec};
@@ -105,7 +104,7 @@ impl DatasetDescription {
     responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
 )]
 async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
-    let _turn = app.pictures().turn().await;
+    let _turn = app.render_cache().turn().await;
     let names = datasets::names(app.store().objects()).await?;
     let (names, next) = page.of(names, |name| name)?;
     let mut datasets = Vec::new();
@@ -214,7 +213,7 @@ async fn picture(
 ) -> Result<Bytes, ApiError> {
     let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
     let key = format!("dataset/{name}/{}/{episode}.{kind}", info.content_hash);
-    if let Some(picture) = app.pictures().cached(&key) {
+    if let Some(picture) = app.render_cache().cached(&key) {
         return Ok(picture);
     }
     let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
@@ -222,7 +221,7 @@ async fn picture(
         let frames = Dataset::episode_frames(&dir, episode)?;
         Ok::<_, ApiError>(draw(frames, info.frame_period_s).map_err(PictureError::from)?)
     };
-    app.pictures().get_or_make(key, make).await
+    app.render_cache().get_or_make(key, make).await
 }
 
 /// Frames spread evenly over an episode, in rows, each with its number.
@@ -256,8 +255,8 @@ fn absent(error: JobError) -> ApiError {
 impl From<DatasetError> for ApiError {
     fn from(error: DatasetError) -> Self {
         match error {
-            DatasetError::NoEpisode { .. } => Self::NotFound(error.to_string()),
-            _ => Self::Internal(with_causes(&error)),
+            DatasetError::NoEpisode { .. } => Self::of(&error),
+            _ => Self::of_own_data(&error),
         }
     }
 }

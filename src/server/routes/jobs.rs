@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
 use utoipa_axum::routes;
 
-use crate::error_text::with_causes;
 use crate::jobs::pipeline::report_key;
 use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use crate::server::http::extract::{Json, Path, Query};
@@ -296,19 +295,19 @@ async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) 
 /// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.
 async fn report_file(app: &App, id: &str, file: &str) -> Result<Bytes, ApiError> {
     let key = format!("report/{id}/{file}");
-    if let Some(bytes) = app.pictures().cached(&key) {
+    if let Some(bytes) = app.render_cache().cached(&key) {
         return Ok(bytes);
     }
     let objects = app.store().objects();
     let path = objects.data_dir().join(report_key(id)).join(file);
     let local = path.clone();
-    if !app.pictures().threads().run(move || local.is_file()).await? {
+    if !app.render_cache().threads().run(move || local.is_file()).await? {
         let pulled = objects.pull(&report_key(id), file).await;
         pulled.map_err(JobError::Store)?;
     }
     let gone = format!("the file of job {id} no longer exists");
     let read = move || std::fs::read(path).map_err(|_| ApiError::NotFound(gone));
-    app.pictures().get_or_make(key, read).await
+    app.render_cache().get_or_make(key, read).await
 }
 
 fn media_type(file: &str) -> &'static str {
@@ -345,24 +344,11 @@ fn page(limit: Option<usize>, default: usize) -> Result<usize, ApiError> {
 impl From<JobError> for ApiError {
     fn from(error: JobError) -> Self {
         match error {
-            JobError::Unknown { .. } => Self::NotFound(error.to_string()),
-            JobError::Invalid { .. } | JobError::NotFound { .. } => Self::Unprocessable(error.to_string()),
-            JobError::IllegalTransition { .. }
-            | JobError::Taken { .. }
-            | JobError::Occupied { .. }
-            | JobError::InUse { .. } => Self::Conflict(error.to_string()),
             JobError::ShareFull { .. } => Self::TooMany {
                 detail: error.to_string(),
                 retry_after_s: SHARE_RETRY_AFTER_S,
             },
-            JobError::QueueFull { .. } | JobError::Stopping => Self::unavailable(error.to_string()),
-            _ if error.is_unavailable() => Self::unavailable(with_causes(&error)),
-            JobError::Record { .. }
-            | JobError::Instance(_)
-            | JobError::Threads(_)
-            | JobError::Dataset(_)
-            | JobError::Versions(_)
-            | JobError::Store(_) => Self::Internal(with_causes(&error)),
+            _ => Self::of(&error),
         }
     }
 }

@@ -7,7 +7,6 @@ use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::error_text::with_causes;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::http::extract::{Path, Query};
@@ -193,14 +192,9 @@ async fn delete(
 impl From<VersionError> for ApiError {
     fn from(error: VersionError) -> Self {
         match error {
-            VersionError::Unknown { .. } => Self::NotFound(error.to_string()),
-            VersionError::Active { .. } | VersionError::Shipped { .. } => Self::Conflict(error.to_string()),
-            VersionError::Refused { .. } => Self::Unprocessable(error.to_string()),
             VersionError::Serving(serving) => serving.into(),
-            VersionError::Store(ref store) if store.is_unavailable() => Self::unavailable(with_causes(&error)),
-            VersionError::Registry(_) | VersionError::Io { .. } | VersionError::Store(_) => {
-                Self::Internal(with_causes(&error))
-            }
+            VersionError::Registry(_) | VersionError::Store(_) => Self::of_own_data(&error),
+            _ => Self::of(&error),
         }
     }
 }

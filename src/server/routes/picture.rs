@@ -34,7 +34,15 @@ impl From<PictureError> for ApiError {
 pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
     match format {
         ResponseFormat::Json => app.predictions(),
-        ResponseFormat::Png | ResponseFormat::Gif => app.pictures().threads(),
+        ResponseFormat::Png | ResponseFormat::Gif => app.render_cache().threads(),
+    }
+}
+
+/// A copy of the context for an answer in that format: empty if the answer does not show it.
+pub(super) fn context_for(format: ResponseFormat, context: &[Frame]) -> Vec<Frame> {
+    match format {
+        ResponseFormat::Json => Vec::new(),
+        ResponseFormat::Png | ResponseFormat::Gif => context.to_vec(),
     }
 }
 

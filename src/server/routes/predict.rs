@@ -9,11 +9,9 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use crate::error_text::with_causes;
 use crate::evaluation::figures::montage::prediction_sheet;
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
-use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
@@ -21,8 +19,7 @@ use crate::server::http::multipart::{JsonOrForm, TooManyError, WithFrames, check
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::server::stream::protocol::{Timing, beyond_training};
-use crate::serving::{InputError, Prediction, PredictionInput, ServingError};
+use crate::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
 use crate::types::{Action, RobotState, ValueError};
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -174,21 +171,27 @@ async fn predict(
     let model = app.predictor().active(&model)?;
     let _place = app.admission().enter()?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
-    let decode = move || request.into_input(&manifest, &config);
-    let input = app.predictions().run(decode).await??;
-    let seen = input.frames.clone();
-    let prediction = app.predictor().predict_by(&model, input).await?;
-    let encode = move || answer(wanted, format, &seen, prediction, &model.manifest.spec);
+    let decode = move || request.into_task(wanted, &manifest, &config);
+    let (seen, task) = app.predictions().run(decode).await??;
+    let prediction = app.predictor().compute(&model, task, None).await?;
+    let encode = move || answer(wanted, format, &seen, prediction);
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
 impl PredictRequest {
-    fn into_input(self, manifest: &Manifest, config: &ServerConfig) -> Result<PredictionInput, PredictError> {
+    /// The task, and the context if the answer shows it.
+    fn into_task(
+        self,
+        wanted: ResponseFormat,
+        manifest: &Manifest,
+        config: &ServerConfig,
+    ) -> Result<(Vec<Frame>, Task), PredictError> {
         let (format, fit) = (self.format, self.fit);
         check_steps(self.steps, manifest, config)?;
         self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
         let frames = decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
-        Ok(PredictionInput {
+        let seen = picture::context_for(wanted, &frames);
+        let input = PredictionInput {
             state: last_state(self.state, self.states, frames.len())?,
             actions: actions("actions", self.actions)?,
             future_actions: self
@@ -197,7 +200,8 @@ impl PredictRequest {
                 .transpose()?,
             steps: self.steps,
             frames,
-        })
+        };
+        Ok((seen, input.into_task(&manifest.name, &manifest.spec)?))
     }
 }
 
@@ -305,18 +309,11 @@ pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>,
 impl From<ServingError> for ApiError {
     fn from(error: ServingError) -> Self {
         match error {
-            ServingError::UnknownModel { .. } => Self::NotFound(error.to_string()),
-            ServingError::Input(_) => Self::Unprocessable(error.to_string()),
             ServingError::QueueFull { retry_after_s, .. } => Self::Unavailable {
                 detail: error.to_string(),
                 retry_after_s,
             },
-            ServingError::Deadline { .. } | ServingError::Stopped => Self::unavailable(error.to_string()),
-            ServingError::Panicked
-            | ServingError::Model { .. }
-            | ServingError::Frame { .. }
-            | ServingError::Tensor(_)
-            | ServingError::Thread(_) => Self::Internal(with_causes(&error)),
+            _ => Self::of(&error),
         }
     }
 }
@@ -344,29 +341,30 @@ fn answer(
     wanted: ResponseFormat,
     format: ImageFormat,
     seen: &[Frame],
-    prediction: Prediction,
-    spec: &ModelSpec,
+    mut prediction: Prediction,
 ) -> Result<Response, ApiError> {
-    let predicted = &prediction.rollout.frames;
+    let beyond_training = prediction.beyond_training();
+    let rollout = prediction.rollouts.pop().unwrap_or_default();
+    let manifest = prediction.manifest;
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(prediction_sheet(seen, predicted, &[]))?),
-        ResponseFormat::Gif => Ok(picture::gif(picture::animation(seen, predicted, spec.frame_period_s))?),
+        ResponseFormat::Png => Ok(picture::png(prediction_sheet(seen, &rollout.frames, &[]))?),
+        ResponseFormat::Gif => {
+            let period_s = manifest.spec.frame_period_s;
+            Ok(picture::gif(picture::animation(seen, &rollout.frames, period_s))?)
+        }
         ResponseFormat::Json => {
             let format = format.answer();
             Ok(axum::Json(PredictResponse {
-                model: prediction.model,
-                version: prediction.version,
-                frames: images::encode(predicted, format)?,
+                model: manifest.name.clone(),
+                version: manifest.version,
+                expected_mse: rollout.expected_mse(),
+                mse_band_90: rollout.mse_bands(),
+                novelty: rollout.novelty,
+                frames: images::encode_owned(rollout.frames, format)?,
                 format,
-                expected_mse: prediction.rollout.expected_mse(),
-                mse_band_90: prediction.rollout.mse_bands(),
-                novelty: prediction.rollout.novelty,
-                beyond_training: beyond_training(predicted.len(), spec),
+                beyond_training,
                 warnings: prediction.warnings,
-                timing: Timing {
-                    queue_us: prediction.queue_us,
-                    compute_us: prediction.compute_us,
-                },
+                timing: prediction.timing,
             })
             .into_response())
         }

@@ -17,7 +17,7 @@ use crate::registry::{LoadedModel, Manifest};
 use crate::server::http::extract::Path;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::serving::PredictionInput;
+use crate::serving::{PredictionInput, ServingError};
 use crate::sim::{Scenario, SimError, World, WorldConfig};
 use crate::types::{Action, RobotState, Seed};
 
@@ -46,8 +46,8 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
     let active = app.predictor().active(&model)?;
     let key = format!("model/{model}/{}", active.manifest.weights_sha256);
     // Many requests for the same picture compute one prediction.
-    let _turn = app.pictures().turn().await;
-    let png = match app.pictures().cached(&key) {
+    let _turn = app.render_cache().turn().await;
+    let png = match app.render_cache().cached(&key) {
         Some(png) => png,
         None => make(&app, active, key).await?,
     };
@@ -56,12 +56,15 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
 
 async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, ApiError> {
     let manifest = Arc::clone(&model.manifest);
-    let simulated = app.pictures().threads().run(move || simulate(&manifest)).await?;
+    let simulated = app.render_cache().threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
-    let predicted = app.predictor().predict_by(&model, input).await?.rollout.frames;
+    let task = input.into_task(&model.manifest.name, &model.manifest.spec);
+    let task = task.map_err(ServingError::from)?;
+    let mut rollouts = app.predictor().compute(&model, task, None).await?.rollouts;
+    let predicted = rollouts.pop().unwrap_or_default().frames;
     let draw = move || Ok::<_, ApiError>(picture::png_file(prediction_sheet(&seen, &predicted, &truth))?);
-    app.pictures().get_or_make(key, draw).await
+    app.render_cache().get_or_make(key, draw).await
 }
 
 /// The model's input from the trial, and the true frames after it.

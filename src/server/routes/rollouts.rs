@@ -13,15 +13,14 @@ use super::predict::{self, PredictError};
 use super::sessions::AuthorizedSession;
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
-use crate::registry::{LoadedModel, Manifest};
+use crate::registry::Manifest;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Json, Path, ResponseFormat};
 use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::server::stream::protocol::{Timing, beyond_training};
-use crate::serving::{ConditioningInput, Rollout, Task, TaskOutput};
+use crate::serving::{ConditioningInput, Prediction, Rollout, Task, Timing};
 use crate::types::RobotState;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -135,10 +134,10 @@ async fn model_rollouts(
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
-    let decode = move || request.into_task(&manifest, &config);
+    let decode = move || request.into_task(wanted, &manifest, &config);
     let (seen, task) = app.predictions().run(decode).await??;
-    let computed = app.predictor().compute(&model, task, None).await?;
-    let encode = move || answer(wanted, format, &model, &seen, &computed);
+    let prediction = app.predictor().compute(&model, task, None).await?;
+    let encode = move || answer(wanted, format, &seen, prediction);
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
@@ -178,18 +177,25 @@ async fn session_rollouts(
     let robot_state = given.or_else(|| state.robot_state().cloned());
     let plans = (request.candidates, request.steps);
     let task = state.rollout_task(conditioning(plans, robot_state, &model.manifest, app.config())?);
-    let computed = app.predictor().compute(&model, task, Some(session.key())).await?;
-    let encode = move || answer(wanted, format, &model, &[], &computed);
+    let prediction = app.predictor().compute(&model, task, Some(session.key())).await?;
+    let encode = move || answer(wanted, format, &[], prediction);
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
 impl RolloutRequest {
-    fn into_task(self, manifest: &Manifest, config: &ServerConfig) -> Result<(Vec<Frame>, Task), PredictError> {
+    /// The task, and the context if the answer shows it.
+    fn into_task(
+        self,
+        wanted: ResponseFormat,
+        manifest: &Manifest,
+        config: &ServerConfig,
+    ) -> Result<(Vec<Frame>, Task), PredictError> {
         let (format, fit) = (self.format, self.fit);
-        let seen = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
-        let state = predict::last_state(self.state, self.states, seen.len())?;
+        let frames = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
+        let state = predict::last_state(self.state, self.states, frames.len())?;
         let conditioning = conditioning((self.candidates, self.steps), state, manifest, config)?;
-        let task = Task::rollout(seen.clone(), conditioning, &manifest.name, &manifest.spec)?;
+        let seen = picture::context_for(wanted, &frames);
+        let task = Task::rollout(frames, conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
     }
 }
@@ -230,47 +236,52 @@ fn conditioning(
 fn answer(
     wanted: ResponseFormat,
     format: ImageFormat,
-    model: &LoadedModel,
     seen: &[Frame],
-    computed: &TaskOutput,
+    prediction: Prediction,
 ) -> Result<Response, ApiError> {
-    let rollouts = &computed.predictions;
-    let futures: Vec<&[Frame]> = rollouts.iter().map(|rollout| rollout.frames.as_slice()).collect();
-    let is_calibrated = rollouts.iter().any(|rollout| !rollout.errors.is_empty());
-    let calibrated = || rollouts.iter().filter(|_| is_calibrated);
-    let encoded = |format| {
-        futures
-            .iter()
-            .map(|frames| images::encode(frames, format))
-            .collect::<Result<_, _>>()
-    };
+    let beyond_training = prediction.beyond_training();
+    let Prediction {
+        manifest,
+        rollouts,
+        warnings,
+        timing,
+        ..
+    } = prediction;
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &futures))?),
+        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &futures(&rollouts)))?),
         ResponseFormat::Gif => {
-            let period_s = model.manifest.spec.frame_period_s;
-            Ok(picture::gif(picture::rollout_animation(seen, &futures, period_s))?)
+            let period_s = manifest.spec.frame_period_s;
+            Ok(picture::gif(picture::rollout_animation(
+                seen,
+                &futures(&rollouts),
+                period_s,
+            ))?)
         }
         ResponseFormat::Json => {
             let format = format.answer();
+            let is_calibrated = rollouts.iter().any(|rollout| !rollout.errors.is_empty());
+            let calibrated = || rollouts.iter().filter(|_| is_calibrated);
             Ok(axum::Json(RolloutResponse {
-                model: model.manifest.name.clone(),
-                version: model.manifest.version,
-                futures: encoded(format)?,
-                format,
+                model: manifest.name.clone(),
+                version: manifest.version,
                 expected_mse: calibrated().map(Rollout::expected_mse).collect(),
                 mse_band_90: calibrated().map(Rollout::mse_bands).collect(),
                 novelty: rollouts.first().and_then(|rollout| rollout.novelty),
-                beyond_training: beyond_training(
-                    futures.first().map_or(0, |frames| frames.len()),
-                    &model.manifest.spec,
-                ),
-                warnings: computed.warnings.clone(),
-                timing: Timing {
-                    queue_us: computed.queue_us,
-                    compute_us: computed.compute_us,
-                },
+                futures: rollouts
+                    .into_iter()
+                    .map(|rollout| images::encode_owned(rollout.frames, format))
+                    .collect::<Result<_, _>>()?,
+                format,
+                beyond_training,
+                warnings,
+                timing,
             })
             .into_response())
         }
     }
+}
+
+/// The frames of each rollout.
+fn futures(rollouts: &[Rollout]) -> Vec<&[Frame]> {
+    rollouts.iter().map(|rollout| rollout.frames.as_slice()).collect()
 }

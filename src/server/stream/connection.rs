@@ -14,7 +14,7 @@ use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, trace};
 use tungstenite::error::ProtocolError;
 
-use super::outbox::{Next, Outbox};
+use super::outbox::Outbox;
 use super::protocol::{
     ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, StreamLimits,
     WarningCode,
@@ -50,9 +50,9 @@ impl PipelinedItem {
     }
 }
 
-/// What the socket gave.
-enum Received {
-    Message(Message),
+/// Why no message comes any more.
+enum InputEnd {
+    Gone,
     /// No message for too long.
     Idle,
     /// Bytes that are not a WebSocket message; nothing after them can be read.
@@ -178,10 +178,11 @@ impl StreamConnection {
         loop {
             // The message before this one was decoded: only its frame is left, in the model's size.
             self.services.messages.message_read();
-            let message = match self.receive(stream).await? {
-                Received::Message(message) => message,
-                Received::Idle => return Ok(ClosingReason::Idle),
-                Received::Unreadable(reason, code, detail) => {
+            let message = match self.receive(stream).await {
+                Ok(message) => message,
+                Err(InputEnd::Gone) => return Err(ClientGone),
+                Err(InputEnd::Idle) => return Ok(ClosingReason::Idle),
+                Err(InputEnd::Unreadable(reason, code, detail)) => {
                     inbox
                         .send(PipelinedItem::refused(code, &detail))
                         .await
@@ -215,7 +216,7 @@ impl StreamConnection {
     }
 
     /// The next message of the protocol. Sends a warning once if none comes for long.
-    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Received, ClientGone> {
+    async fn receive(&self, stream: &mut SplitStream<WebSocket>) -> Result<Message, InputEnd> {
         let quarter = Duration::from_millis(self.services.config.stream_idle_ms) / 4;
         let mut is_warned = false;
         let mut idle_since = Instant::now();
@@ -223,7 +224,7 @@ impl StreamConnection {
             let wait = if is_warned { 4 * quarter } else { 3 * quarter };
             match timeout_at(idle_since + wait, stream.next()).await {
                 Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
-                    return Ok(Received::Message(message));
+                    return Ok(message);
                 }
                 // The WebSocket library answers these; they show that the client is there, and do not extend the time for a
                 // message that has begun.
@@ -233,14 +234,14 @@ impl StreamConnection {
                         (is_warned, idle_since) = (false, Instant::now());
                     }
                 }
-                Ok(None) => return Err(ClientGone),
+                Ok(None) => return Err(InputEnd::Gone),
                 Ok(Some(Ok(Message::Close(_)))) => {
                     // The library answers a close with the next read.
                     discard_input(stream).await;
-                    return Err(ClientGone);
+                    return Err(InputEnd::Gone);
                 }
-                Ok(Some(Err(error))) => return unreadable(error),
-                Err(_) if is_warned => return Ok(Received::Idle),
+                Ok(Some(Err(error))) => return Err(unreadable(error)),
+                Err(_) if is_warned => return Err(InputEnd::Idle),
                 Err(_) => {
                     is_warned = true;
                     let detail = format!("no message came; in {} ms the stream is closed", quarter.as_millis());
@@ -309,15 +310,12 @@ impl StreamConnection {
     async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), ClientGone> {
         let limit = Duration::from_millis(self.services.config.stream_send_ms);
         loop {
-            let (message, reason) = match self.outbox.next().await {
-                Next::Message(message) => (message, None),
-                Next::Close(reason) => (ServerMessage::Closing { reason }, Some(reason)),
-            };
+            let message = self.outbox.next().await;
             match timeout(limit, sink.send(self.codec.encode(&message))).await {
                 Ok(sent) => sent.map_err(|_| ClientGone)?,
                 Err(_) => return self.close_slow(sink, limit).await,
             }
-            if let Some(reason) = reason {
+            if let ServerMessage::Closing { reason } = message {
                 return close(sink, code_of(reason), limit).await;
             }
         }
@@ -336,21 +334,21 @@ impl StreamConnection {
     }
 }
 
-/// Why the bytes could not be read, if the client is still there.
-fn unreadable(error: axum::Error) -> Result<Received, ClientGone> {
+/// Why the bytes could not be read.
+fn unreadable(error: axum::Error) -> InputEnd {
     let error = error.into_inner();
     if let Some(exceeded) = body_budget::cause(error.as_ref()) {
         let (reason, code) = (ClosingReason::Overloaded, ErrorCode::Overloaded);
-        return Ok(Received::Unreadable(reason, code, exceeded.to_string()));
+        return InputEnd::Unreadable(reason, code, exceeded.to_string());
     }
     let reason = match error.downcast_ref::<tungstenite::Error>() {
         Some(tungstenite::Error::Capacity(_)) => ClosingReason::TooLong,
         Some(tungstenite::Error::Utf8(_)) => ClosingReason::NotUtf8,
-        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return Err(ClientGone),
+        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return InputEnd::Gone,
         Some(tungstenite::Error::Protocol(_)) => ClosingReason::Malformed,
-        _ => return Err(ClientGone),
+        _ => return InputEnd::Gone,
     };
-    Ok(Received::Unreadable(reason, ErrorCode::Malformed, error.to_string()))
+    InputEnd::Unreadable(reason, ErrorCode::Malformed, error.to_string())
 }
 
 /// Discards input for a moment.

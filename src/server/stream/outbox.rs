@@ -13,15 +13,6 @@ use crate::metric_names;
 /// The assumed size of a message without its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;
 
-/// What the writer does next.
-#[derive(Debug, PartialEq)]
-pub(super) enum Next {
-    /// Send this.
-    Message(ServerMessage),
-    /// Send the reason, and close.
-    Close(ClosingReason),
-}
-
 pub(super) struct Outbox {
     state: Mutex<OutboxState>,
     changed: Notify,
@@ -77,7 +68,8 @@ impl Outbox {
         self.changed.notify_waiters();
     }
 
-    pub(super) async fn next(&self) -> Next {
+    /// The next message to send; `closing` is the last one.
+    pub(super) async fn next(&self) -> ServerMessage {
         loop {
             let changed = self.changed.notified();
             tokio::pin!(changed);
@@ -124,15 +116,15 @@ impl OutboxState {
         true
     }
 
-    fn pop(&mut self) -> Option<Next> {
+    fn pop(&mut self) -> Option<ServerMessage> {
         let Some(mut message) = self.waiting.pop_front() else {
-            return self.closing.map(Next::Close);
+            return self.closing.map(|reason| ServerMessage::Closing { reason });
         };
         self.bytes -= bytes(&message);
         if let ServerMessage::Prediction { dropped, .. } = &mut message {
             *dropped = std::mem::take(&mut self.dropped);
         }
-        Some(Next::Message(message))
+        Some(message)
     }
 }
 
@@ -190,7 +182,7 @@ mod tests {
             state.push_prediction(prediction(seq, 1000), 4000);
         }
         let mut sent = Vec::new();
-        while let Some(Next::Message(message)) = state.pop() {
+        while let Some(message) = state.pop() {
             sent.push(message);
         }
         let kinds: Vec<String> = sent
@@ -214,11 +206,12 @@ mod tests {
         let mut third = Box::pin(outbox.push(pong(2)));
         assert!(third.as_mut().now_or_never().is_none());
         outbox.close(ClosingReason::Asked);
-        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(0))));
+        assert_eq!(outbox.next().now_or_never(), Some(pong(0)));
         assert!(third.now_or_never().is_some());
-        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(1))));
-        assert_eq!(outbox.next().now_or_never(), Some(Next::Message(pong(2))));
-        assert_eq!(outbox.next().now_or_never(), Some(Next::Close(ClosingReason::Asked)));
+        assert_eq!(outbox.next().now_or_never(), Some(pong(1)));
+        assert_eq!(outbox.next().now_or_never(), Some(pong(2)));
+        let reason = ClosingReason::Asked;
+        assert_eq!(outbox.next().now_or_never(), Some(ServerMessage::Closing { reason }));
     }
 
     proptest! {
@@ -230,7 +223,7 @@ mod tests {
             let (mut pushed, mut accounted) = (0, 0);
             let mut count = |state: &mut OutboxState| {
                 let next = state.pop();
-                if let Some(Next::Message(ServerMessage::Prediction { dropped, .. })) = next {
+                if let Some(ServerMessage::Prediction { dropped, .. }) = next {
                     accounted += dropped + 1;
                 }
                 next.is_some()

@@ -12,6 +12,7 @@ use crate::nn::ModelSpec;
 use crate::server::config::ServerConfig;
 use crate::server::images::{ImageBytes, ImageFormat};
 
+pub use crate::serving::Timing;
 pub use codec::Codec;
 
 /// What a client sends.
@@ -258,24 +259,6 @@ impl StreamLimits {
             grace_ms: if is_kept { config.session_grace_ms } else { 0 },
         }
     }
-}
-
-/// For each of so many predicted frames, whether it is beyond the model's horizon; empty if none is.
-pub(in crate::server) fn beyond_training(frames: usize, spec: &ModelSpec) -> Vec<bool> {
-    if frames <= spec.horizon {
-        return Vec::new();
-    }
-    (0..frames).map(|step| step >= spec.horizon).collect()
-}
-
-/// How long a prediction took.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Timing {
-    /// Microseconds in the queue.
-    pub queue_us: u64,
-    /// Microseconds of computation, of the whole batch.
-    pub compute_us: u64,
 }
 
 /// The kinds of warnings of a stream.

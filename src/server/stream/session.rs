@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 use super::protocol::{ConfigureMessage, ServerMessage, SessionSettings};
-use super::step::{FrameStep, PendingStep, SessionCore, StepError};
+use super::step::{FrameStep, SessionCore, StepError};
 use crate::registry::LoadedModel;
 use crate::server::blocking::BlockingWork;
 use crate::server::http::keys::Caller;
@@ -195,21 +195,25 @@ impl Ownership {
     ) -> Result<ServerMessage, StepError> {
         let (key, model) = (self.session.key, &self.session.model);
         let spec = model.model.spec();
-        let (format, pending) = {
+        let (format, missing, task) = {
             let inner = self.inner()?;
-            let format = inner.core.settings.format.unwrap_or(step.format);
-            (format, inner.core.begin(&step, spec)?)
+            let core = &inner.core;
+            let missing = core.missing_before(step.seq)?;
+            let task = match missing {
+                Some(_) => Some(core.task(step.frame, &step.conditioning, step.is_overtaken, spec)),
+                None => core.repeat_task(spec),
+            };
+            (core.settings.format.unwrap_or(step.format), missing, task)
         };
-        let answer = match pending {
-            PendingStep::Answered(answer) => answer,
-            PendingStep::New { task, skipped } => {
-                let computed = predictor.compute(model, task, Some(key)).await?;
-                self.inner()?.core.commit(step, computed, skipped, spec)
+        let answer = if let Some(task) = task {
+            let mut prediction = predictor.compute(model, task, Some(key)).await?;
+            let core = &mut self.inner()?.core;
+            if missing.is_some() {
+                core.advance(step.seq, step.conditioning, &mut prediction, spec);
             }
-            PendingStep::Again(task) => {
-                let computed = predictor.compute(model, task, Some(key)).await?;
-                self.inner()?.core.cache(step.timestamp_us, 0, computed)
-            }
+            core.keep(step.timestamp_us, missing.unwrap_or(0), prediction)
+        } else {
+            self.inner()?.core.last_answer(step.timestamp_us)
         };
         if answer.must_compress(format) {
             let model = Arc::clone(model);

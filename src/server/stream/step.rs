@@ -2,9 +2,8 @@
 
 use std::sync::Arc;
 
-use super::protocol::{
-    ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings, Timing, beyond_training,
-};
+use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings};
+use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::frame::Frame;
 use crate::frame::fit::Fit;
 use crate::nn::ModelSpec;
@@ -12,7 +11,7 @@ use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
 use crate::serving::{
-    ConditioningInput, InputError, RawConditioning, Rollout, STEP_FIELDS, ServingError, SessionState, Task, TaskOutput,
+    ConditioningInput, InputError, Prediction, RawConditioning, STEP_FIELDS, ServingError, SessionState, Task,
 };
 use crate::types::{Action, RobotState, ValueError};
 
@@ -96,17 +95,21 @@ impl StepError {
         match self {
             Self::Gap { .. } => ErrorCode::Gap,
             Self::Image(ImageError::Encode(_)) | Self::Task(_) => ErrorCode::Internal,
-            Self::Serving(ServingError::QueueFull { .. } | ServingError::Deadline { .. } | ServingError::Stopped) => {
-                ErrorCode::Overloaded
-            }
-            Self::Serving(ServingError::Input(_))
-            | Self::Seq(_)
+            Self::Serving(error) => match error.kind() {
+                ErrorKind::Busy | ErrorKind::Away => ErrorCode::Overloaded,
+                ErrorKind::Usage => ErrorCode::Invalid,
+                ErrorKind::NotFound
+                | ErrorKind::Conflict
+                | ErrorKind::Unusable
+                | ErrorKind::Cancelled
+                | ErrorKind::Internal => ErrorCode::Internal,
+            },
+            Self::Seq(_)
             | Self::Steps { .. }
             | Self::Image(_)
             | Self::Value { .. }
             | Self::Input(_)
             | Self::NotOwner => ErrorCode::Invalid,
-            Self::Serving(_) => ErrorCode::Internal,
         }
     }
 }
@@ -116,35 +119,18 @@ pub(super) struct SessionCore {
     pub(super) state: SessionState,
     pub(super) settings: SessionSettings,
     /// `None` before the first frame, and after an import: then the last answer is computed again on request.
-    last_answer: Option<CachedAnswer>,
+    last_answer: Option<StepAnswer>,
 }
 
-/// The answer to the last frame.
+/// The answer to a frame.
 #[derive(Clone)]
-pub(super) struct CachedAnswer {
+pub(super) struct StepAnswer {
     seq: u64,
     timestamp_us: i64,
     skipped: u64,
     have: usize,
     /// `None` while the context is not full, and for a frame that was overtaken.
-    prediction: Option<Arc<StepPrediction>>,
-}
-
-/// A prediction, and how long it took.
-pub(super) struct StepPrediction {
-    rollout: Rollout,
-    warnings: Vec<String>,
-    timing: Timing,
-}
-
-/// What a frame needs.
-pub(super) enum PendingStep {
-    /// Nothing: it was answered before.
-    Answered(CachedAnswer),
-    /// Compute this, then [`SessionCore::commit`].
-    New { task: Task, skipped: u64 },
-    /// Compute this, then [`SessionCore::cache`].
-    Again(Task),
+    prediction: Option<Arc<Prediction>>,
 }
 
 impl SessionCore {
@@ -156,73 +142,68 @@ impl SessionCore {
         }
     }
 
-    /// What the step needs. Changes nothing; [`SessionCore::commit`] does, once the result is there.
-    pub(super) fn begin(&self, step: &FrameStep, spec: &ModelSpec) -> Result<PendingStep, StepError> {
-        let next = self.state.next_seq();
-        if step.seq == u64::MAX {
-            return Err(StepError::Seq(step.seq));
+    /// How many frames are missing before this one; `None` if it was answered before. Errors: `Seq`, `Gap`.
+    pub(super) fn missing_before(&self, seq: u64) -> Result<Option<u64>, StepError> {
+        let expected = self.state.next_seq();
+        if seq == u64::MAX {
+            return Err(StepError::Seq(seq));
         }
-        if step.seq < next {
-            return Ok(match (&self.last_answer, self.state.repeat_task(spec)) {
-                (Some(answer), _) => PendingStep::Answered(answer.clone()),
-                (None, Some(task)) => PendingStep::Again(task),
-                (None, None) => PendingStep::Answered(self.answer(step.timestamp_us, 0, None)),
-            });
+        if seq > expected && self.settings.on_gap == OnGap::Error {
+            return Err(StepError::Gap { found: seq, expected });
         }
-        if step.seq > next && self.settings.on_gap == OnGap::Error {
-            return Err(StepError::Gap {
-                found: step.seq,
-                expected: next,
-            });
-        }
-        let conditioning = (!self.is_skipped(step)).then(|| step.conditioning.clone());
-        Ok(PendingStep::New {
-            task: self.state.step(step.frame.clone(), conditioning, spec),
-            skipped: step.seq - next,
-        })
+        Ok(seq.checked_sub(expected))
     }
 
-    /// Whether the step gets no prediction.
-    fn is_skipped(&self, step: &FrameStep) -> bool {
-        step.is_overtaken && self.settings.on_late == OnLate::Skip
-    }
-
-    /// Advances the session by the step, of which this is the result.
-    pub(super) fn commit(
-        &mut self,
-        step: FrameStep,
-        mut computed: TaskOutput,
-        skipped: u64,
+    /// The task of the next frame. `is_overtaken`: newer frames wait behind it, so it may go without a prediction.
+    pub(super) fn task(
+        &self,
+        frame: Frame,
+        conditioning: &ConditioningInput,
+        is_overtaken: bool,
         spec: &ModelSpec,
-    ) -> CachedAnswer {
-        if let Some(features) = computed.features.pop() {
-            self.state.advance(step.seq, features, step.conditioning, spec);
-        }
-        self.cache(step.timestamp_us, skipped, computed)
+    ) -> Task {
+        let is_skipped = is_overtaken && self.settings.on_late == OnLate::Skip;
+        let conditioning = (!is_skipped).then(|| conditioning.clone());
+        self.state.step(frame, conditioning, spec)
     }
 
-    /// Caches the result as the answer to the last frame.
-    pub(super) fn cache(&mut self, timestamp_us: i64, skipped: u64, computed: TaskOutput) -> CachedAnswer {
-        let timing = Timing {
-            queue_us: computed.queue_us,
-            compute_us: computed.compute_us,
-        };
-        let warnings = computed.warnings;
-        let rollout = computed.predictions.into_iter().next();
-        let prediction = rollout.map(|rollout| {
-            Arc::new(StepPrediction {
-                rollout,
-                warnings,
-                timing,
-            })
-        });
+    /// The task that computes the last answer again; `None` if [`SessionCore::last_answer`] gives it.
+    pub(super) fn repeat_task(&self, spec: &ModelSpec) -> Option<Task> {
+        match self.last_answer {
+            Some(_) => None,
+            None => self.state.repeat_task(spec),
+        }
+    }
+
+    /// The answer to the last frame. `timestamp_us`: the time of the frame that asks for it again.
+    pub(super) fn last_answer(&self, timestamp_us: i64) -> StepAnswer {
+        let last = self.last_answer.clone();
+        last.unwrap_or_else(|| self.answer(timestamp_us, 0, None))
+    }
+
+    /// Advances the session by frame `seq`, of which this is the prediction.
+    pub(super) fn advance(
+        &mut self,
+        seq: u64,
+        conditioning: ConditioningInput,
+        prediction: &mut Prediction,
+        spec: &ModelSpec,
+    ) {
+        if let Some(features) = prediction.features.pop() {
+            self.state.advance(seq, features, conditioning, spec);
+        }
+    }
+
+    /// Keeps the prediction as the answer to the last frame.
+    pub(super) fn keep(&mut self, timestamp_us: i64, skipped: u64, prediction: Prediction) -> StepAnswer {
+        let prediction = (!prediction.rollouts.is_empty()).then(|| Arc::new(prediction));
         let answer = self.answer(timestamp_us, skipped, prediction);
         self.last_answer = Some(answer.clone());
         answer
     }
 
-    fn answer(&self, timestamp_us: i64, skipped: u64, prediction: Option<Arc<StepPrediction>>) -> CachedAnswer {
-        CachedAnswer {
+    fn answer(&self, timestamp_us: i64, skipped: u64, prediction: Option<Arc<Prediction>>) -> StepAnswer {
+        StepAnswer {
             seq: self.state.next_seq().saturating_sub(1),
             timestamp_us,
             skipped,
@@ -232,8 +213,8 @@ impl SessionCore {
     }
 }
 
-impl CachedAnswer {
-    /// Whether [`CachedAnswer::message`] has to compress images, which takes long.
+impl StepAnswer {
+    /// Whether [`StepAnswer::message`] has to compress images, which takes long.
     pub(super) fn must_compress(&self, format: ImageFormat) -> bool {
         self.prediction.is_some() && format.answer() != ImageFormat::Raw
     }
@@ -247,7 +228,7 @@ impl CachedAnswer {
             have,
             prediction,
         } = self;
-        let Some(prediction) = prediction else {
+        let Some((prediction, rollout)) = prediction.as_ref().and_then(|all| Some((all, all.rollouts.first()?))) else {
             if have == spec.context {
                 return Ok(ServerMessage::Overtaken {
                     seq,
@@ -267,12 +248,12 @@ impl CachedAnswer {
         Ok(ServerMessage::Prediction {
             seq,
             timestamp_us,
-            frames: images::encode(&prediction.rollout.frames, format)?,
+            frames: images::encode(&rollout.frames, format)?,
             format,
-            expected_mse: prediction.rollout.expected_mse(),
-            mse_band_90: prediction.rollout.mse_bands(),
-            novelty: prediction.rollout.novelty,
-            beyond_training: beyond_training(prediction.rollout.frames.len(), spec),
+            expected_mse: rollout.expected_mse(),
+            mse_band_90: rollout.mse_bands(),
+            novelty: rollout.novelty,
+            beyond_training: prediction.beyond_training(),
             warnings: prediction.warnings.clone(),
             timing: prediction.timing,
             dropped: 0,

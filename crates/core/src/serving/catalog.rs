@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
-use super::ServingError;
+use super::error::ServingError;
 use crate::registry::LoadedModel;
 
 /// After so many panics in a row the predictor is not ready.

@@ -5,94 +5,47 @@ use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 
-use super::{ConditioningInput, PredictionInput, ServingError, Task};
+use super::conditioning::ConditioningInput;
+use super::error::ServingError;
+use super::prediction::{Prediction, Rollout, Timing};
+use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::LoadedModel;
-use crate::registry::calibration::{ContextStatistics, ExpectedError, PredictedFuture};
+use crate::registry::calibration::{ContextStatistics, PredictedFuture};
 use crate::types::{Action, RobotState};
-
-/// The features of one frame, `[F]`.
-pub type Features = Arc<[f32]>;
 
 /// How many frames are decoded together at most. This bounds the memory that many rollouts need.
 const DECODED_FRAMES: usize = 1024;
 
-/// The output of one [`Task`] of a batch.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct BatchOutput {
-    /// The features of the task's frames, in order.
-    pub(super) features: Vec<Features>,
-    /// The rollouts, one for each conditioning input of the task, in order.
-    pub(super) predictions: Vec<Rollout>,
-}
-
-/// One predicted future.
-#[derive(Clone, Debug, Default, PartialEq)]
-#[non_exhaustive]
-pub struct Rollout {
-    /// t+1, t+2, …
-    pub frames: Vec<Frame>,
-    /// The errors to expect of the frames up to the model's horizon; empty if the model is not calibrated.
-    pub errors: Vec<ExpectedError>,
-    /// How unlike the training data the context is, 0…1: the share of validation contexts that are nearer to it; `None` if the
-    /// model is not calibrated.
-    pub novelty: Option<f32>,
-}
-
-impl Rollout {
-    /// The error to expect of each frame that the calibration covers.
-    #[must_use]
-    pub fn expected_mse(&self) -> Vec<f32> {
-        self.errors.iter().map(|error| error.mse).collect()
-    }
-
-    /// The lower and the upper end of each 90 % band.
-    #[must_use]
-    pub fn mse_bands(&self) -> Vec<[f32; 2]> {
-        self.errors.iter().map(|error| [error.low, error.high]).collect()
-    }
-}
-
-/// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
-/// `Model`, `Tensor`, `Frame`.
-pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
-    let tasks = inputs
-        .iter()
-        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
-        .collect::<Result<Vec<Task>, ServingError>>()?;
-    let computed = run(loaded, &tasks.iter().collect::<Vec<_>>())?;
-    Ok(computed
-        .into_iter()
-        .flat_map(|computation| computation.predictions)
-        .collect())
-}
-
-/// Computes the tasks as one batch: one matrix product encodes all new frames, and one predicts all rollouts.
+/// Computes the tasks as one batch, without warnings and timing: one matrix product encodes all new frames, and one predicts all rollouts.
 /// Errors: `Model` if a task does not fit the model, `Tensor`, `Frame`.
-pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<BatchOutput>, ServingError> {
+pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Prediction>, ServingError> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
-    let mut computations: Vec<BatchOutput> = tasks
+    let mut predictions: Vec<Prediction> = tasks
         .iter()
-        .map(|task| BatchOutput {
+        .map(|task| Prediction {
+            manifest: Arc::clone(&loaded.manifest),
             features: encoded.by_ref().take(task.frames.len()).collect(),
-            predictions: Vec::with_capacity(task.conditioning_inputs.len()),
+            rollouts: Vec::with_capacity(task.conditioning_inputs.len()),
+            warnings: Vec::new(),
+            timing: Timing::default(),
         })
         .collect();
     let (mut windows, mut window_of) = (Vec::new(), Vec::new());
-    for (task, computation) in tasks
+    for (task, prediction) in tasks
         .iter()
-        .zip(&computations)
+        .zip(&predictions)
         .filter(|(task, _)| !task.conditioning_inputs.is_empty())
     {
         window_of.extend(vec![windows.len() as u32; task.conditioning_inputs.len()]);
-        windows.push(task.past_features.iter().chain(&computation.features));
+        windows.push(task.past_features.iter().chain(&prediction.features));
     }
     let conditioning_inputs: Vec<&ConditioningInput> =
         tasks.iter().flat_map(|task| &task.conditioning_inputs).collect();
     if conditioning_inputs.is_empty() {
-        return Ok(computations);
+        return Ok(predictions);
     }
     let values = windows
         .into_iter()
@@ -100,13 +53,13 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<BatchOutp
         .map(AsRef::as_ref)
         .collect::<Vec<&[f32]>>()
         .concat();
-    let mut predictions = predict_windows(loaded, values, &window_of, &conditioning_inputs)?.into_iter();
-    for (task, computation) in tasks.iter().zip(&mut computations) {
-        computation
-            .predictions
-            .extend(predictions.by_ref().take(task.conditioning_inputs.len()));
+    let mut rollouts = predict_windows(loaded, values, &window_of, &conditioning_inputs)?.into_iter();
+    for (task, prediction) in tasks.iter().zip(&mut predictions) {
+        prediction
+            .rollouts
+            .extend(rollouts.by_ref().take(task.conditioning_inputs.len()));
     }
-    Ok(computations)
+    Ok(predictions)
 }
 
 /// The features of all the tasks' frames, in order.
@@ -145,10 +98,15 @@ fn predict_windows(
             .map_err(|source| model_error(loaded, source))?,
         None => Vec::new(),
     };
+    let shape = (
+        values.len() / (spec.context * spec.code_len()),
+        spec.context,
+        spec.code_len(),
+    );
     let windows = Windows {
         loaded,
         contexts,
-        values,
+        features: Tensor::from_vec(values, shape, &Device::Cpu).map_err(tensor_error)?,
     };
     let mut rollouts = vec![Rollout::default(); conditioning_inputs.len()];
     let steps: BTreeSet<usize> = conditioning_inputs.iter().map(|input| input.steps(spec)).collect();
@@ -172,37 +130,43 @@ struct Windows<'a> {
     /// Empty if the model is not calibrated.
     contexts: Vec<ContextStatistics>,
     /// The features of all windows `[windows, context, F]`.
-    values: Vec<f32>,
+    features: Tensor,
 }
 
 impl Windows<'_> {
     /// Rollouts of so many steps: the window and the conditioning input of each.
     fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
         let (loaded, spec) = (self.loaded, self.loaded.model.spec());
-        let (context, code) = (spec.context, spec.code_len());
-        let count = self.values.len() / (context * code);
-        let features = Tensor::from_slice(&self.values, (count, context, code), &Device::Cpu).map_err(tensor_error)?;
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
         let codes = loaded
             .model
-            .predict_steps(&features, &window_of, &condition(spec, &inputs, steps)?, steps)
+            .predict_steps(&self.features, &window_of, &condition(spec, &inputs, steps)?, steps)
             .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
             .map_err(|source| model_error(loaded, source))?;
         let mut frames = decode(loaded, &codes, rows.len() * steps)?.into_iter();
         let frames = rows.iter().map(|_| frames.by_ref().take(steps).collect());
         let frames: Vec<Vec<Frame>> = frames.collect();
-        with_values(&codes, |codes| {
-            let codes = codes.chunks_exact(steps * code);
-            let futures = rows.iter().zip(codes).zip(frames);
-            futures
-                .map(|((row, codes), frames)| self.rollout(*row, codes, frames))
-                .collect()
+        with_values(&self.features, |seen| {
+            with_values(&codes, |codes| {
+                let codes = codes.chunks_exact(steps * spec.code_len());
+                let futures = rows.iter().zip(codes).zip(frames);
+                futures
+                    .map(|((row, codes), frames)| self.rollout(*row, seen, codes, frames))
+                    .collect()
+            })
         })
+        .and_then(|rollouts| rollouts)
         .map_err(tensor_error)
     }
 
-    /// A rollout with what its calibration says of it.
-    fn rollout(&self, (window, input): (u32, &ConditioningInput), codes: &[f32], frames: Vec<Frame>) -> Rollout {
+    /// A rollout with what its calibration says of it. `seen`: the features of all windows.
+    fn rollout(
+        &self,
+        (window, input): (u32, &ConditioningInput),
+        seen: &[f32],
+        codes: &[f32],
+        frames: Vec<Frame>,
+    ) -> Rollout {
         let spec = self.loaded.model.spec();
         let (Some(calibration), Some(context)) =
             (&self.loaded.manifest.calibration, self.contexts.get(window as usize))
@@ -214,7 +178,7 @@ impl Windows<'_> {
         };
         let code = |back: usize| {
             let place = window as usize * spec.context + spec.context - back.min(spec.context);
-            &self.values[place * spec.code_len()..(place + 1) * spec.code_len()]
+            &seen[place * spec.code_len()..(place + 1) * spec.code_len()]
         };
         let actions: Vec<f32> = input.actions.iter().flat_map(Action::as_slice).copied().collect();
         let future = PredictedFuture {

@@ -1,12 +1,30 @@
 //! Predictions on the caller's own thread, for a program that has one camera and one model and needs no [`super::Predictor`].
 
-use super::input::check_size;
+use super::compute;
+use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning};
+use super::error::{InputError, ServingError};
+use super::input::PredictionInput;
+use super::prediction::Rollout;
 use super::ranges::range_warnings;
-use super::task::{REQUEST_FIELDS, RawConditioning};
-use super::{ConditioningInput, InputError, Rollout, ServingError, SessionState, compute};
+use super::session::SessionState;
+use super::task::{Task, check_size};
 use crate::frame::Frame;
 use crate::registry::{LoadedModel, Manifest};
 use crate::types::{Action, RobotState};
+
+/// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
+/// `Model`, `Tensor`, `Frame`.
+pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
+    let tasks = inputs
+        .iter()
+        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
+        .collect::<Result<Vec<Task>, ServingError>>()?;
+    let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
+    Ok(predictions
+        .into_iter()
+        .flat_map(|prediction| prediction.rollouts)
+        .collect())
+}
 
 impl ConditioningInput {
     /// The conditioning input of one prediction. `future_actions` holds one action for each predicted frame; the first
@@ -46,20 +64,20 @@ impl SessionState {
         let spec = loaded.model.spec();
         check_size("frame", &loaded.manifest.name, spec, (frame.width(), frame.height()))?;
         let task = self.step(frame, Some(conditioning.clone()), spec);
-        let mut outputs = compute::run(loaded, &[&task])?;
-        let output = outputs.pop().expect("a task without an output is a bug");
+        let mut predictions = compute::run(loaded, &[&task])?;
+        let prediction = predictions.pop().expect("a task without a prediction is a bug");
         let seq = self.next_seq();
-        for features in output.features {
+        for features in prediction.features {
             self.advance(seq, features, conditioning.clone(), spec);
         }
-        Ok(output.predictions.into_iter().next())
+        Ok(prediction.rollouts.into_iter().next())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serving::{PredictionInput, predict, test_model};
+    use crate::serving::{test_flow_model, test_model};
 
     #[test]
     fn a_session_predicts_the_same_as_a_window() {
@@ -83,6 +101,64 @@ mod tests {
             ..PredictionInput::default()
         };
         assert_eq!(predicted.unwrap(), predict(&model, &[&input]).unwrap().remove(0));
+    }
+
+    fn frame(seed: u8, width: u32) -> Frame {
+        Frame::new(width, 4, (0..4 * width as u8).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
+    }
+
+    fn action(value: f32) -> Action {
+        Action::try_from(vec![value]).unwrap()
+    }
+
+    fn conditioning(value: f32) -> ConditioningInput {
+        ConditioningInput {
+            actions: vec![action(value); 2],
+            state: RobotState::try_from(vec![value]).ok(),
+            steps: None,
+        }
+    }
+
+    #[test]
+    fn steps_predict_the_same_as_whole_windows() {
+        for model in [test_model(), test_flow_model()] {
+            check_steps(&model);
+        }
+    }
+
+    fn check_steps(model: &LoadedModel) {
+        let width = model.model.spec().frame_width_px;
+        let spec = model.model.spec();
+        let (mut state, mut seen) = (SessionState::default(), Vec::new());
+        for seq in 0..8u8 {
+            let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
+            let computed = compute::run(model, &[&task]).unwrap().remove(0);
+            state.advance(
+                u64::from(seq),
+                computed.features[0].clone(),
+                conditioning(f32::from(seq)),
+                spec,
+            );
+            seen.push(frame(seq, width));
+            let Some(start) = seen.len().checked_sub(3) else {
+                assert!(computed.rollouts.is_empty());
+                continue;
+            };
+            let input = PredictionInput {
+                frames: seen[start..].to_vec(),
+                actions: vec![action(f32::from(seq))],
+                state: RobotState::try_from(vec![f32::from(seq)]).ok(),
+                future_actions: None,
+                steps: None,
+            };
+            assert_eq!(computed.rollouts, predict(model, &[&input]).unwrap());
+            let repeated = state.repeat_task(spec).unwrap();
+            assert_eq!(
+                compute::run(model, &[&repeated]).unwrap()[0].rollouts,
+                computed.rollouts
+            );
+        }
+        assert_eq!((state.next_seq(), state.frame_count()), (8, 3));
     }
 
     #[test]

@@ -8,7 +8,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
 use super::batch::{self, Candidate};
-use super::{ServingError, Task, TaskOutput, meter};
+use super::error::ServingError;
+use super::meter;
+use super::prediction::Prediction;
+use super::task::Task;
 use crate::registry::LoadedModel;
 
 /// A full queue of the reference model's predictions is computed well within this time.
@@ -24,7 +27,7 @@ pub(super) struct QueuedTask {
     pub(super) deadline: Instant,
     /// The whole time limit of the request, for the error message.
     pub(super) limit: Duration,
-    pub(super) reply: oneshot::Sender<Result<TaskOutput, ServingError>>,
+    pub(super) reply: oneshot::Sender<Result<Prediction, ServingError>>,
 }
 
 /// A model to load.
@@ -175,7 +178,7 @@ mod tests {
     use super::*;
     use crate::serving::test_model;
 
-    type Answer = oneshot::Receiver<Result<TaskOutput, ServingError>>;
+    type Answer = oneshot::Receiver<Result<Prediction, ServingError>>;
 
     fn request(model: &Arc<LoadedModel>) -> (QueuedTask, Answer) {
         let (reply, answer) = oneshot::channel();

@@ -1,6 +1,6 @@
 //! Warnings about actions and states that the model never saw in training.
 
-use super::ConditioningInput;
+use super::conditioning::ConditioningInput;
 use crate::nn::ChannelScale;
 use crate::registry::Manifest;
 use crate::registry::calibration::ValueRange;

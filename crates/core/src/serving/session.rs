@@ -5,9 +5,9 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::compute::Features;
-use super::input::InputError;
-use super::task::{ConditioningInput, FieldNames, RawConditioning, Task};
+use super::conditioning::{ConditioningInput, FieldNames, RawConditioning};
+use super::error::InputError;
+use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::types::{Action, RobotState};
@@ -225,65 +225,10 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::serving::compute;
-    use crate::serving::{PredictionInput, predict, test_flow_model, test_model};
-
-    fn frame(seed: u8, width: u32) -> Frame {
-        Frame::new(width, 4, (0..4 * width as u8).map(|pixel| (pixel * 7) ^ seed).collect()).unwrap()
-    }
+    use crate::serving::test_model;
 
     fn action(value: f32) -> Action {
         Action::try_from(vec![value]).unwrap()
-    }
-
-    fn conditioning(value: f32) -> ConditioningInput {
-        ConditioningInput {
-            actions: vec![action(value); 2],
-            state: RobotState::try_from(vec![value]).ok(),
-            steps: None,
-        }
-    }
-
-    #[test]
-    fn steps_predict_the_same_as_whole_windows() {
-        for model in [test_model(), test_flow_model()] {
-            check_steps(&model);
-        }
-    }
-
-    fn check_steps(model: &crate::registry::LoadedModel) {
-        let width = model.model.spec().frame_width_px;
-        let spec = model.model.spec();
-        let (mut state, mut seen) = (SessionState::default(), Vec::new());
-        for seq in 0..8u8 {
-            let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
-            let computed = compute::run(model, &[&task]).unwrap().remove(0);
-            state.advance(
-                u64::from(seq),
-                computed.features[0].clone(),
-                conditioning(f32::from(seq)),
-                spec,
-            );
-            seen.push(frame(seq, width));
-            let Some(start) = seen.len().checked_sub(3) else {
-                assert!(computed.predictions.is_empty());
-                continue;
-            };
-            let input = PredictionInput {
-                frames: seen[start..].to_vec(),
-                actions: vec![action(f32::from(seq))],
-                state: RobotState::try_from(vec![f32::from(seq)]).ok(),
-                future_actions: None,
-                steps: None,
-            };
-            assert_eq!(computed.predictions, predict(model, &[&input]).unwrap());
-            let repeated = state.repeat_task(spec).unwrap();
-            assert_eq!(
-                compute::run(model, &[&repeated]).unwrap()[0].predictions,
-                computed.predictions
-            );
-        }
-        assert_eq!((state.next_seq(), state.frame_count()), (8, 3));
     }
 
     proptest! {

@@ -1,127 +1,14 @@
 //! A task for the inference thread, checked before it is queued.
 
-use super::compute::Features;
-use super::input::{InputError, PredictionInput};
+use std::sync::Arc;
+
+use super::conditioning::ConditioningInput;
+use super::error::InputError;
 use crate::frame::Frame;
-use crate::nn::spec::MAX_STEPS;
-use crate::nn::{ChannelScale, Conditioning, ModelSpec};
-use crate::types::{Action, RobotState};
+use crate::nn::ModelSpec;
 
-/// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ConditioningInput {
-    pub(super) actions: Vec<Action>,
-    pub(super) state: Option<RobotState>,
-    /// Frames to predict; the model's horizon if absent.
-    pub(super) steps: Option<usize>,
-}
-
-/// Actions and state as the client sent them.
-#[derive(Clone, Copy)]
-pub struct RawConditioning<'a> {
-    /// The past actions; the last one acts from the last frame on.
-    pub past: &'a [Action],
-    /// The plan; without one, the last past action is held.
-    pub future: Option<&'a [Action]>,
-    /// The robot's state at the last frame.
-    pub state: Option<&'a RobotState>,
-    /// Frames to predict; the model's horizon if absent.
-    pub steps: Option<usize>,
-}
-
-/// The names of the fields in error messages.
-pub struct FieldNames {
-    pub(super) past: fn(usize) -> String,
-    pub(super) future: &'static str,
-    pub(super) missing: &'static str,
-}
-
-/// The fields of a request.
-pub(super) const REQUEST_FIELDS: FieldNames = FieldNames {
-    past: |index| format!("actions[{index}]"),
-    future: "future_actions",
-    missing: "future_actions",
-};
-/// The fields of a stream's frame.
-pub const STEP_FIELDS: FieldNames = FieldNames {
-    past: |_| "action".to_owned(),
-    future: "plan",
-    missing: "action",
-};
-
-impl ConditioningInput {
-    /// Checks the input and keeps what the model takes. Errors name the field, its value and the expected value.
-    pub fn new(
-        raw: RawConditioning<'_>,
-        fields: &FieldNames,
-        model: &str,
-        spec: &ModelSpec,
-    ) -> Result<Self, InputError> {
-        let steps = raw.steps.unwrap_or(spec.horizon);
-        if !(1..=MAX_STEPS).contains(&steps) {
-            return Err(InputError::Steps { found: steps });
-        }
-        if spec.conditioning == Conditioning::None {
-            return Ok(Self {
-                steps: raw.steps,
-                ..Self::default()
-            });
-        }
-        for (index, action) in raw.past.iter().enumerate() {
-            check_length(|| (fields.past)(index), model, action.as_slice(), &spec.actions)?;
-        }
-        let actions = match (raw.future, raw.past.last()) {
-            _ if spec.action_inputs().is_none() => Vec::new(),
-            (Some(actions), _) => {
-                check_actions(fields.future, (model, steps), spec, actions)?;
-                actions.to_vec()
-            }
-            (None, Some(held)) => vec![held.clone(); steps],
-            (None, None) => {
-                return Err(InputError::Missing {
-                    field: fields.missing,
-                    model: model.to_owned(),
-                    channels: channels_of(&spec.actions).join(", "),
-                });
-            }
-        };
-        Ok(Self {
-            actions,
-            state: check_state(model, spec, raw.state.cloned())?,
-            steps: raw.steps,
-        })
-    }
-
-    /// One conditioning input for each plan, all from the same state. Errors call the plans `candidates[i]`.
-    /// Errors: `Unconditioned` if the model takes no actions, and the errors of the values.
-    pub fn candidates(
-        candidates: Vec<Vec<Action>>,
-        (state, steps): (Option<RobotState>, Option<usize>),
-        model: &str,
-        spec: &ModelSpec,
-    ) -> Result<Vec<Self>, InputError> {
-        if spec.action_inputs().is_none() {
-            return Err(InputError::Unconditioned {
-                model: model.to_owned(),
-            });
-        }
-        let state = check_state(model, spec, state)?;
-        let conditioning = |(index, actions): (usize, Vec<Action>)| {
-            let wanted = (model, steps.unwrap_or(spec.horizon));
-            check_actions(&format!("candidates[{index}]"), wanted, spec, &actions)?;
-            let state = state.clone();
-            Ok(Self { actions, state, steps })
-        };
-        candidates.into_iter().enumerate().map(conditioning).collect()
-    }
-}
-
-impl ConditioningInput {
-    /// Frames to predict.
-    pub(super) fn steps(&self, spec: &ModelSpec) -> usize {
-        self.steps.unwrap_or(spec.horizon)
-    }
-}
+/// The features of one frame, `[F]`.
+pub type Features = Arc<[f32]>;
 
 /// A unit of work for the inference thread. It carries all the state that it needs.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -142,13 +29,9 @@ impl Task {
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {
-        let input = PredictionInput {
-            frames,
-            ..PredictionInput::default()
-        };
-        input.check_frames(model, spec)?;
+        check_frames(&frames, model, spec)?;
         Ok(Self {
-            frames: input.frames,
+            frames,
             conditioning_inputs,
             ..Self::default()
         })
@@ -156,9 +39,10 @@ impl Task {
 
     /// Splits off what is computed next: the frames, and the first rollouts up to a limit.
     pub(super) fn next_part(&mut self, limit: usize) -> Self {
-        let later = self
-            .conditioning_inputs
-            .split_off(limit.min(self.conditioning_inputs.len()));
+        if self.conditioning_inputs.len() <= limit {
+            return std::mem::take(self);
+        }
+        let later = self.conditioning_inputs.split_off(limit);
         Self {
             past_features: self.past_features.clone(),
             frames: std::mem::take(&mut self.frames),
@@ -167,64 +51,37 @@ impl Task {
     }
 }
 
-/// Checks that there are as many actions as steps and that each action has all channels.
-fn check_actions(
-    field: &str,
-    (model, steps): (&str, usize),
-    spec: &ModelSpec,
-    actions: &[Action],
-) -> Result<(), InputError> {
-    if actions.len() != steps {
-        return Err(InputError::FutureActionCount {
-            field: field.to_owned(),
+/// Checks that the frames fill the model's context and have its size.
+pub(super) fn check_frames(frames: &[Frame], model: &str, spec: &ModelSpec) -> Result<(), InputError> {
+    if frames.len() != spec.context {
+        return Err(InputError::FrameCount {
             model: model.to_owned(),
-            found: actions.len(),
-            expected: steps,
+            found: frames.len(),
+            expected: spec.context,
         });
     }
-    for (index, action) in actions.iter().enumerate() {
-        check_length(|| format!("{field}[{index}]"), model, action.as_slice(), &spec.actions)?;
+    for (index, frame) in frames.iter().enumerate() {
+        check_size(
+            &format!("frames[{index}]"),
+            model,
+            spec,
+            (frame.width(), frame.height()),
+        )?;
     }
     Ok(())
 }
 
-/// Checks the state; `None` if the model takes none.
-fn check_state(model: &str, spec: &ModelSpec, state: Option<RobotState>) -> Result<Option<RobotState>, InputError> {
-    if spec.state_inputs().is_none() {
-        return Ok(None);
-    }
-    let Some(state) = state else {
-        return Err(InputError::Missing {
-            field: "state",
-            model: model.to_owned(),
-            channels: channels_of(&spec.states).join(", "),
-        });
-    };
-    check_length(|| "state".to_owned(), model, state.as_slice(), &spec.states)?;
-    Ok(Some(state))
-}
-
-fn check_length(
-    field: impl Fn() -> String,
-    model: &str,
-    values: &[f32],
-    scales: &[ChannelScale],
-) -> Result<(), InputError> {
-    if values.len() == scales.len() {
+/// Checks that the frame in `field` has the model's width and height in pixels.
+pub fn check_size(field: &str, model: &str, spec: &ModelSpec, (width, height): (u32, u32)) -> Result<(), InputError> {
+    if (width, height) == (spec.frame_width_px, spec.frame_height_px) {
         return Ok(());
     }
-    Err(InputError::Dimension {
-        field: field(),
+    Err(InputError::FrameSize {
+        field: field.to_owned(),
         model: model.to_owned(),
-        found: values.len(),
-        expected: scales.len(),
-        channels: channels_of(scales).join(", "),
+        width,
+        height,
+        model_width: spec.frame_width_px,
+        model_height: spec.frame_height_px,
     })
-}
-
-fn channels_of(scales: &[ChannelScale]) -> Vec<String> {
-    scales
-        .iter()
-        .map(|scale| format!("{} {}", scale.name, scale.unit).trim_end().to_owned())
-        .collect()
 }

@@ -9,8 +9,12 @@ use rayon::ThreadPool;
 use tracing::{error, info};
 
 use super::catalog::Catalog;
+use super::error::ServingError;
+use super::input::PredictionInput;
+use super::prediction::Timing;
 use super::queue::{ModelLoad, Queue, QueuedTask, WorkItem};
-use super::{PredictionInput, ServingError, Task, TaskOutput, compute, meter};
+use super::task::Task;
+use super::{compute, local, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::LoadedModel;
@@ -82,13 +86,14 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
 /// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
     let started = Instant::now();
-    compute::predict(model, &[&blank_input(model.model.spec())?])?;
+    local::predict(model, &[&blank_input(model.model.spec())?])?;
     let warm_up_us = micros_since(started);
     info!(model.id = %model.manifest.name, warm_up_us, "first prediction made");
     Ok(())
 }
 
-fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
+/// Black frames, with actions and a state of zeros.
+pub(super) fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
     let pixels = vec![0; spec.frame_width_px as usize * spec.frame_height_px as usize];
     let frame =
         Frame::new(spec.frame_width_px, spec.frame_height_px, pixels).map_err(|source| ServingError::Frame {
@@ -111,19 +116,16 @@ fn answer(batch: Vec<QueuedTask>) {
     let started = Instant::now();
     let tasks: Vec<&Task> = batch.iter().map(|waiting| &waiting.task).collect();
     match compute::run(&model, &tasks) {
-        Ok(computations) => {
+        Ok(predictions) => {
             let compute_us = micros_since(started);
             let accepted: Vec<Instant> = batch.iter().map(|waiting| waiting.accepted).collect();
-            for (waiting, computation) in batch.into_iter().zip(computations) {
-                let computed = TaskOutput {
-                    features: computation.features,
-                    predictions: computation.predictions,
-                    warnings: Vec::new(),
+            for (waiting, mut prediction) in batch.into_iter().zip(predictions) {
+                prediction.timing = Timing {
                     queue_us: micros(started.saturating_duration_since(waiting.accepted)),
                     compute_us,
                 };
                 // The receiver is gone if the client has disconnected.
-                let _ = waiting.reply.send(Ok(computed));
+                let _ = waiting.reply.send(Ok(prediction));
             }
             // After the answers, so that no client waits for the metrics.
             meter::record_batch(&model.manifest.name, &accepted, started, compute_us);
@@ -145,64 +147,4 @@ fn micros_since(started: Instant) -> u64 {
 
 fn micros(duration: std::time::Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use crate::nn::{Model, ModelSpec, Parameters};
-    use crate::registry::LoadedModel;
-    use crate::serving::{Predictor, PredictorConfig, ServingError, Task, test_model};
-    use crate::types::Seed;
-
-    /// A model without context: its computation divides by zero.
-    fn panicking_model() -> LoadedModel {
-        let model = test_model();
-        let parameters = Parameters::initialize(model.model.spec(), Seed(1)).unwrap();
-        let spec = ModelSpec {
-            context: 0,
-            ..model.model.spec().clone()
-        };
-        LoadedModel {
-            model: Model::detached(model.model.spec().clone(), &parameters)
-                .unwrap()
-                .with_spec(spec),
-            ..model
-        }
-    }
-
-    fn task(model: &LoadedModel) -> Task {
-        let input = super::blank_input(model.model.spec()).unwrap();
-        Task {
-            conditioning_inputs: vec![input.conditioning("test", model.model.spec()).unwrap()],
-            frames: input.frames,
-            ..Task::default()
-        }
-    }
-
-    #[tokio::test]
-    async fn a_panic_fails_its_batch_and_the_thread_restarts() {
-        let config = PredictorConfig {
-            deadline: Duration::from_mins(1),
-            ..PredictorConfig::default()
-        };
-        let predictor = Predictor::start(vec![test_model()], config).unwrap();
-        let (good, bad) = (
-            predictor.active("test").unwrap(),
-            std::sync::Arc::new(panicking_model()),
-        );
-        for _ in 0..3 {
-            let failed = predictor.compute(&bad, task(&bad), None).await;
-            assert!(matches!(failed, Err(ServingError::Panicked)), "{failed:?}");
-        }
-        while predictor.is_ready() {
-            tokio::time::sleep(Duration::from_millis(1)).await;
-        }
-        let computed = predictor.compute(&good, task(&good), None).await.unwrap();
-        assert_eq!(computed.predictions.len(), 1);
-        while !predictor.is_ready() {
-            tokio::time::sleep(Duration::from_millis(1)).await;
-        }
-    }
 }

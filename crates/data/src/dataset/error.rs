@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::files::may_pass;
 use foreframe_core::frame::FrameError;
 use foreframe_sim::SimError;
 
@@ -310,6 +312,44 @@ pub enum DatasetError {
         /// Number of episodes.
         count: usize,
     },
+}
+
+impl HasErrorKind for DatasetError {
+    fn kind(&self) -> ErrorKind {
+        if may_pass(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::World(error) => error.kind(),
+            Self::Unknown { .. } | Self::NotADataset { .. } | Self::NoEpisode { .. } => ErrorKind::NotFound,
+            Self::Zero { .. }
+            | Self::OtherTool { .. }
+            | Self::FrameSize { .. }
+            | Self::OddFrames { .. }
+            | Self::Channels { .. }
+            | Self::WindowTooLong { .. }
+            | Self::TooFewWindows { .. } => ErrorKind::Usage,
+            Self::OutExists { .. } | Self::OtherArguments { .. } | Self::Unfinished { .. } => ErrorKind::Conflict,
+            Self::PartLength { .. }
+            | Self::NotFinite { .. }
+            | Self::TimeOrder { .. }
+            | Self::MixedMasks { .. }
+            | Self::Empty { .. }
+            | Self::Description(_)
+            | Self::Corrupt { .. }
+            | Self::CorruptFrame { .. }
+            | Self::HashDiffers { .. }
+            | Self::Digits { .. } => ErrorKind::Unusable,
+            Self::Busy { .. } => ErrorKind::Busy,
+            Self::Cancelled { .. } => ErrorKind::Cancelled,
+            Self::Io { .. }
+            | Self::FrameFile { .. }
+            | Self::Encode(_)
+            | Self::Build(_)
+            | Self::Simulation { .. }
+            | Self::Program(_) => ErrorKind::Internal,
+        }
+    }
 }
 
 impl DatasetError {

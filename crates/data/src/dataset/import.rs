@@ -7,6 +7,7 @@
 mod bag;
 mod donkeycar;
 mod images;
+mod kind;
 mod lerobot;
 mod npz;
 mod numpy;

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use super::{DATABASE_FILE, Store, StoreError, WRITE_PROBE, unix_s};
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
@@ -88,6 +89,20 @@ pub enum BackupError {
     /// The database could not be copied.
     #[error(transparent)]
     Store(#[from] StoreError),
+}
+
+impl HasErrorKind for BackupError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::NoBackup { .. } => ErrorKind::NotFound,
+            Self::Inside { .. } | Self::OtherDatabase => ErrorKind::Usage,
+            Self::NotEmpty { .. } | Self::Restoring { .. } => ErrorKind::Conflict,
+            Self::Damaged { .. } => ErrorKind::Unusable,
+            Self::Unstable { .. } => ErrorKind::Busy,
+            Self::Store(error) => error.kind().of_own_data(),
+            Self::Io { .. } => ErrorKind::Internal,
+        }
+    }
 }
 
 impl BackupError {

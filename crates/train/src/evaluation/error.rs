@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::files::may_pass;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::NnError;
 use foreframe_core::registry::RegistryError;
@@ -173,6 +175,33 @@ pub enum EvaluationError {
     /// The network refused its input.
     #[error(transparent)]
     Network(#[from] NnError),
+}
+
+impl HasErrorKind for EvaluationError {
+    fn kind(&self) -> ErrorKind {
+        if may_pass(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Dataset(error) => error.kind(),
+            Self::Registry(error) => error.kind(),
+            Self::FrameSize { .. }
+            | Self::FramePeriod { .. }
+            | Self::Channels { .. }
+            | Self::SplitSeed { .. }
+            | Self::Twin { .. }
+            | Self::Setting { .. }
+            | Self::NothingHeldOut { .. }
+            | Self::NotCalibrated { .. }
+            | Self::NoContext { .. } => ErrorKind::Usage,
+            Self::OutputExists(_) => ErrorKind::Conflict,
+            Self::TrainedOn { .. } | Self::NotFinite { .. } | Self::Frame(_) | Self::Replay(_) | Self::Action(_) => {
+                ErrorKind::Unusable
+            }
+            Self::Cancelled => ErrorKind::Cancelled,
+            Self::Io { .. } | Self::Chart { .. } | Self::Network(_) => ErrorKind::Internal,
+        }
+    }
 }
 
 impl From<candle_core::Error> for EvaluationError {

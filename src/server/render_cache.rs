@@ -12,17 +12,17 @@ use super::config::ServerConfig;
 
 /// The threads and the cache of pictures; clones share them.
 #[derive(Clone)]
-pub(super) struct Pictures {
+pub(super) struct RenderCache {
     threads: BlockingWork,
-    cache: Arc<PictureCache>,
+    cache: Arc<RenderedFiles>,
     turns: Arc<Semaphore>,
 }
 
-impl Pictures {
+impl RenderCache {
     pub(super) fn new(config: &ServerConfig) -> Self {
         Self {
             threads: BlockingWork::with_low_priority("pictures", config.picture_threads),
-            cache: Arc::new(PictureCache::new(config.max_cached_bytes)),
+            cache: Arc::new(RenderedFiles::new(config.max_cached_bytes)),
             turns: Arc::new(Semaphore::new(config.picture_threads)),
         }
     }
@@ -68,13 +68,13 @@ impl Pictures {
 }
 
 /// Results by key. If they take more than the limit, those that were not used for the longest time are dropped.
-struct PictureCache {
+struct RenderedFiles {
     limit: usize,
-    entries: Mutex<CachedPictures>,
+    entries: Mutex<RenderedEntries>,
 }
 
 #[derive(Default)]
-struct CachedPictures {
+struct RenderedEntries {
     by_key: HashMap<String, (Bytes, u64)>,
     /// Keys in the order of their last use.
     by_use: BTreeMap<u64, String>,
@@ -82,7 +82,7 @@ struct CachedPictures {
     uses: u64,
 }
 
-impl PictureCache {
+impl RenderedFiles {
     fn new(limit: usize) -> Self {
         Self {
             limit,
@@ -112,12 +112,12 @@ impl PictureCache {
         }
     }
 
-    fn entries(&self) -> MutexGuard<'_, CachedPictures> {
+    fn entries(&self) -> MutexGuard<'_, RenderedEntries> {
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl CachedPictures {
+impl RenderedEntries {
     fn add(&mut self, key: String, bytes: Bytes) {
         self.uses += 1;
         self.bytes += size(&key, &bytes);
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn the_cache_drops_what_was_not_used_for_the_longest_time() {
-        let cache = PictureCache::new(100);
+        let cache = RenderedFiles::new(100);
         cache.insert("a".to_owned(), bytes(40));
         cache.insert("b".to_owned(), bytes(40));
         assert!(cache.get("a").is_some());
@@ -158,10 +158,10 @@ mod tests {
 
     #[test]
     fn the_cache_keeps_nothing_that_exceeds_it() {
-        let cache = PictureCache::new(100);
+        let cache = RenderedFiles::new(100);
         cache.insert("a".to_owned(), bytes(50));
         cache.insert("b".to_owned(), bytes(100));
         assert!(cache.get("b").is_none() && cache.get("a").is_some());
-        PictureCache::new(0).insert("a".to_owned(), bytes(0));
+        RenderedFiles::new(0).insert("a".to_owned(), bytes(0));
     }
 }

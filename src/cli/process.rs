@@ -1,0 +1,26 @@
+//! The process as its user sees it: how it was started, and what it prints.
+
+use std::fmt::Display;
+use std::io::Write as _;
+
+use super::error::CliError;
+use crate::error_text::printable;
+
+/// Writes a line to standard output.
+pub(super) fn print_line(line: impl Display) -> Result<(), CliError> {
+    writeln!(std::io::stdout(), "{}", printable(&line.to_string()))
+        .map_err(|error| CliError::Failed(format!("could not write to standard output: {error}")))
+}
+
+/// The command line as it was given; reports and manifests record it.
+pub(super) fn command_line() -> String {
+    std::env::args()
+        .enumerate()
+        .map(|(index, argument)| match index {
+            0 => "foreframe".to_owned(),
+            _ if argument.contains([' ', '"', '\'']) => format!("'{}'", argument.replace('\'', r"'\''")),
+            _ => argument,
+        })
+        .collect::<Vec<_>>()
+        .join(" ")
+}
