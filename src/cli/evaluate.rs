@@ -11,7 +11,7 @@ use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
 use crate::dataset::Dataset;
-use crate::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, Purpose};
+use crate::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
 use crate::jobs::spec::MAX_RESAMPLES;
 use crate::registry::{self, LoadedModel};
 use crate::types::Seed;
@@ -113,9 +113,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
         purpose: match args.split {
-            SplitChoice::Validation => Purpose::Validation,
-            SplitChoice::Test => Purpose::Test,
-            SplitChoice::All => Purpose::WholeSet,
+            SplitChoice::Validation => ScoredSplit::Validation,
+            SplitChoice::Test => ScoredSplit::Test,
+            SplitChoice::All => ScoredSplit::WholeSet,
         },
         max_windows: args.windows,
         nearest_windows: args.nearest_windows as usize,
@@ -138,7 +138,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     output.finish()?;
     if args.record {
         let mut scores = report.headline();
-        if config.purpose == Purpose::Test {
+        if config.purpose == ScoredSplit::Test {
             // Earlier versions scored unseen pairs and gains as one set.
             scores["test-unseen"] = serde_json::Value::Null;
         }

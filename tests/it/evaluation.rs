@@ -5,10 +5,10 @@ use std::sync::atomic::AtomicBool;
 
 use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
 use foreframe::evaluation::actions::Variant;
-use foreframe::evaluation::baselines::Method;
+use foreframe::evaluation::method::Method;
 use foreframe::evaluation::plans::PlanOutcome;
 use foreframe::evaluation::report::{EvaluationReport, SetOutcome};
-use foreframe::evaluation::{self, EvaluateConfig, EvaluationError, Purpose};
+use foreframe::evaluation::{self, EvaluateConfig, EvaluationError, ScoredSplit};
 use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe::registry::LoadedModel;
 use foreframe::sim::{Scenario, WorldConfig};
@@ -133,7 +133,7 @@ fn validation_scores_are_of_the_validation_split_alone() {
     let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let validation = EvaluateConfig {
-        purpose: Purpose::Validation,
+        purpose: ScoredSplit::Validation,
         ..config()
     };
     let report = evaluate(&model, &dataset, &validation).unwrap();

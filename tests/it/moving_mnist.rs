@@ -9,8 +9,8 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use foreframe::dataset::moving_mnist::{MovingMnistConfig, collect_digits};
 use foreframe::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
-use foreframe::evaluation::baselines::Method;
-use foreframe::evaluation::{self, EvaluateConfig, Purpose};
+use foreframe::evaluation::method::Method;
+use foreframe::evaluation::{self, EvaluateConfig, ScoredSplit};
 use foreframe::frame::quality::ssim_even;
 use foreframe::frame::{Frame, codec};
 use foreframe::registry;
@@ -284,7 +284,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     .unwrap();
     let loaded = registry::load(&dir.path().join("run/model")).unwrap();
     let whole = EvaluateConfig {
-        purpose: Purpose::WholeSet,
+        purpose: ScoredSplit::WholeSet,
         bootstrap_samples: 100,
         ..EvaluateConfig::default()
     };

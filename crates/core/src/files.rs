@@ -155,7 +155,7 @@ pub fn remove_dir(dir: &Path) -> io::Result<()> {
 
 /// Whether an error comes from a file system that cannot be written or read for now, but may be later: it is full, was made
 /// read-only, or its device failed.
-pub fn may_pass(error: &(dyn Error + 'static)) -> bool {
+pub fn is_transient(error: &(dyn Error + 'static)) -> bool {
     /// Linux's number of an I/O error, which has no `ErrorKind`.
     const EIO: i32 = 5;
     let mut cause = Some(error);

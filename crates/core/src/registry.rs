@@ -15,7 +15,7 @@ pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::existing;
-use crate::files::{may_pass, sha256_hex, write_atomically};
+use crate::files::{is_transient, sha256_hex, write_atomically};
 use crate::nn::Parameters;
 
 /// Name of the weights file in a model's directory.
@@ -102,7 +102,7 @@ pub enum RegistryError {
 
 impl HasErrorKind for RegistryError {
     fn kind(&self) -> ErrorKind {
-        if may_pass(self) {
+        if is_transient(self) {
             return ErrorKind::Away;
         }
         match self {

@@ -10,12 +10,12 @@ mod executor;
 mod instance;
 pub mod job;
 pub mod memory;
-mod patience;
 pub mod pipeline;
 pub mod priority;
 mod progress;
 pub mod queue;
 mod report;
+mod retry_policy;
 mod runner;
 mod shared;
 pub mod spec;
@@ -157,18 +157,6 @@ impl HasErrorKind for JobError {
             Self::Versions(error) => error.kind().of_own_data(),
             Self::Store(error) => error.kind().of_own_data(),
             Self::Record { .. } | Self::Instance(_) | Self::Threads(_) => ErrorKind::Internal,
-        }
-    }
-}
-
-impl JobError {
-    /// Whether a store cannot be reached or written now, but may be later.
-    #[must_use]
-    pub fn is_unavailable(&self) -> bool {
-        match self {
-            Self::Store(error) => error.is_unavailable(),
-            Self::Versions(error) => matches!(&**error, VersionError::Store(error) if error.is_unavailable()),
-            _ => false,
         }
     }
 }

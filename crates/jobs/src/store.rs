@@ -154,7 +154,7 @@ impl StoreError {
     pub fn is_unavailable(&self) -> bool {
         match self {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
-            Self::Io { source, .. } => files::may_pass(source),
+            Self::Io { source, .. } => files::is_transient(source),
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
             Self::Away { .. } => true,
             Self::Migrate(error) => {

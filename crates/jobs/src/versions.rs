@@ -14,7 +14,7 @@ use tracing::{info, warn};
 use crate::store::{Author, Lease, Store, StoreError, unix_s};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
-use foreframe_core::files::{may_pass, write_atomically};
+use foreframe_core::files::{is_transient, write_atomically};
 use foreframe_core::metric_names;
 use foreframe_core::registry::{self, LoadedModel, Manifest, RegistryError};
 use foreframe_core::serving::{Predictor, ServingError};
@@ -86,7 +86,7 @@ pub enum VersionError {
 
 impl HasErrorKind for VersionError {
     fn kind(&self) -> ErrorKind {
-        if may_pass(self) {
+        if is_transient(self) {
             return ErrorKind::Away;
         }
         match self {
@@ -98,14 +98,6 @@ impl HasErrorKind for VersionError {
             Self::Serving(error) => error.kind(),
             Self::Io { .. } => ErrorKind::Internal,
         }
-    }
-}
-
-impl VersionError {
-    /// Whether the store is away, so that the same request may succeed later.
-    #[must_use]
-    pub fn is_unavailable(&self) -> bool {
-        matches!(self, Self::Store(store) if store.is_unavailable())
     }
 }
 

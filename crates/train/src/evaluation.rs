@@ -31,7 +31,7 @@ mod windows;
 use std::time::Instant;
 
 pub use self::calibrate::{calibrate, calibrate_trained};
-pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, Purpose};
+pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 pub use self::error::EvaluationError;
 pub use self::output::{prepare, write};
 pub use self::progress::{EvaluationContext, EvaluationProgress, EvaluationStage};
@@ -67,7 +67,7 @@ pub fn run(
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
-    if config.purpose == Purpose::WholeSet {
+    if config.purpose == ScoredSplit::WholeSet {
         compatible::check_untrained(loaded, dataset)?;
     }
     let splits = config.purpose.divide(dataset, split_seed);
@@ -115,7 +115,7 @@ fn fitted_baselines(
 ) -> Result<Baselines, EvaluationError> {
     let shape = window_shape(loaded.model.spec());
     let mut baselines = match config.purpose {
-        Purpose::WholeSet => {
+        ScoredSplit::WholeSet => {
             let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
             Baselines::fit(dataset, &own, shape, config.nearest_windows)?.without(Method::NearestWindow)
         }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files::may_pass;
+use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
 use foreframe_sim::SimError;
 
@@ -316,7 +316,7 @@ pub enum DatasetError {
 
 impl HasErrorKind for DatasetError {
     fn kind(&self) -> ErrorKind {
-        if may_pass(self) {
+        if is_transient(self) {
             return ErrorKind::Away;
         }
         match self {

@@ -14,9 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
-use super::patience::Patience;
 use super::pipeline::Pipeline;
 use super::report::{JobReporter, ReportEvent};
+use super::retry_policy::RetryPolicy;
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};
 use crate::versions::Versions;
@@ -248,12 +248,12 @@ fn work(
         .thread_name(|index| format!("jobs-{index}"))
         .build()
         .map_err(|error| error.to_string())?;
-    let patience = Patience {
+    let retry = RetryPolicy {
         runtime: runtime.handle(),
         report,
         cancelled,
     };
-    let store = match patience.run(async || Store::open_existing(&order.store).await) {
+    let store = match retry.run(async || Store::open_existing(&order.store).await) {
         Ok(store) => store,
         Err(JobFailure::Failed(reason)) => return Err(reason),
         Err(failure) => return Ok(Err(failure)),

@@ -16,8 +16,8 @@ use self::training_report::TrainingReporter;
 use super::checkpoints::{self, CheckpointSync};
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
-use super::patience::{Patience, retry_while_busy};
 use super::report::JobReporter;
+use super::retry_policy::{RetryPolicy, retry_while_busy};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
 use crate::store::{ModelMetrics, PublishedVersion, Store, StoreError};
@@ -142,8 +142,8 @@ impl Pipeline {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
         config.threads = self.threads;
-        let patience = self.patience(report, cancelled);
-        patience.run(async || datasets::clear_stale(self.store.objects(), &spec.name, &config).await)?;
+        let retry = self.retry_policy(report, cancelled);
+        retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, &config).await)?;
         let on_progress =
             |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
         // Whole shards are saved; a new attempt continues after them.
@@ -153,8 +153,8 @@ impl Pipeline {
         let collect = || dataset::collect(&config, &on_progress, cancelled);
         let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
         // After an error it continues with the shards that are finished.
-        let info = patience.repeat(|| retry_while_busy(collect, is_busy, cancelled))?;
-        self.push_dataset(&spec.name, &patience)?;
+        let info = retry.repeat(|| retry_while_busy(collect, is_busy, cancelled))?;
+        self.push_dataset(&spec.name, &retry)?;
         Ok(JobResult {
             result: json!({
                 "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
@@ -169,9 +169,9 @@ impl Pipeline {
         let config = spec.config().map_err(|error| failed(&error))?;
         let run = format!("runs/{}", report.id());
         report.progress(0, 0, "reading the data set");
-        let patience = self.patience(report, cancelled);
-        patience.run(async || self.prepare_run(&run, report).await)?;
-        let dataset = self.dataset(&spec.dataset, &patience)?;
+        let retry = self.retry_policy(report, cancelled);
+        retry.run(async || self.prepare_run(&run, report).await)?;
+        let dataset = self.dataset(&spec.dataset, &retry)?;
         let training = Training {
             config: &config,
             dataset: &dataset,
@@ -195,15 +195,14 @@ impl Pipeline {
         let mut train = || training::run(&training, &mut observer, cancelled);
         let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
         // After an error it continues from the last checkpoint.
-        match patience.repeat(|| retry_while_busy(&mut train, is_busy, cancelled))? {
+        match retry.repeat(|| retry_while_busy(&mut train, is_busy, cancelled))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.fit.steps) as u64;
                 report.progress(steps, steps, "calibrating");
-                patience.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
+                retry.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
                 report.progress(steps, steps, "publishing");
-                let written =
-                    patience.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
+                let written = retry.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
                 let (version, activates) = written.ok_or(JobFailure::Cancelled)?;
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
                 Ok(JobResult {
@@ -234,12 +233,12 @@ impl Pipeline {
         report: &JobReporter,
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
-        let patience = self.patience(report, cancelled);
-        let model = |name: &str, version| patience.run(async || self.model(name, version).await);
+        let retry = self.retry_policy(report, cancelled);
+        let model = |name: &str, version| retry.run(async || self.model(name, version).await);
         let loaded = model(&spec.model, spec.version)?;
         let twin = spec.twin.as_deref().map(|twin| model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
-        let dataset = self.dataset(&spec.dataset, &patience)?;
+        let dataset = self.dataset(&spec.dataset, &retry)?;
         let config = EvaluateConfig {
             max_windows: spec.windows,
             bootstrap_samples: spec.resamples,
@@ -257,9 +256,9 @@ impl Pipeline {
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let dir = report_key(&report.id());
         // An earlier attempt may have left an incomplete report.
-        patience.run(async || self.store.objects().delete(&dir).await)?;
+        retry.run(async || self.store.objects().delete(&dir).await)?;
         let out = self.store.objects().data_dir().join(&dir);
-        patience.repeat(|| {
+        retry.repeat(|| {
             // So may a write that failed.
             remove_dir(&out).map_err(|source| EvaluationError::Io {
                 path: out.clone(),
@@ -268,7 +267,7 @@ impl Pipeline {
             evaluation::prepare(&out)?;
             evaluation::write(&out, &mut found, &figures)
         })?;
-        patience.run(async || self.store.objects().push(&dir, REPORT_FILE).await)?;
+        retry.run(async || self.store.objects().push(&dir, REPORT_FILE).await)?;
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .map_err(|error| failed(&error))?
             .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
@@ -295,19 +294,19 @@ impl Pipeline {
         }
     }
 
-    fn dataset(&self, name: &str, patience: &Patience<'_>) -> Result<Dataset, JobFailure> {
-        let fetched = patience.run(async || datasets::fetch(self.store.objects(), name).await)?;
+    fn dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
+        let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
         Dataset::open_within(&fetched, self.memory.held_mb()).map_err(|error| failed(&error))
     }
 
     /// Copies a finished data set to the object store, if there is a shared one.
-    fn push_dataset(&self, name: &str, patience: &Patience<'_>) -> Result<(), JobFailure> {
+    fn push_dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
         let objects = self.store.objects();
-        patience.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)
+        retry.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)
     }
 
-    fn patience<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> Patience<'a> {
-        Patience {
+    fn retry_policy<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> RetryPolicy<'a> {
+        RetryPolicy {
             runtime: &self.runtime,
             report,
             cancelled,

@@ -3,7 +3,6 @@
 //! A lease expires unless it is renewed. Each claim increments the row's fencing token, and every write names the token of
 //! its claim. So a worker whose lease expired cannot write any more.
 
-
 use super::audit::Author;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::lease::Lease;

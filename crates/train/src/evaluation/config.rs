@@ -15,7 +15,7 @@ use foreframe_data::dataset::sampler::{Split, Splits};
 /// What a model is scored on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Purpose {
+pub enum ScoredSplit {
     /// To choose between models and settings: the validation split.
     Validation,
     /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
@@ -25,7 +25,7 @@ pub enum Purpose {
     WholeSet,
 }
 
-impl Purpose {
+impl ScoredSplit {
     /// The splits that are scored, in the order of the report.
     #[must_use]
     pub fn splits(self) -> &'static [Split] {
@@ -52,7 +52,7 @@ pub const NEAREST_WINDOWS: usize = 15_000;
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
     /// Which part of the data set.
-    pub purpose: Purpose,
+    pub purpose: ScoredSplit,
     /// Seed of the split; that of the model's training if none is given.
     pub split_seed: Option<Seed>,
     /// Frames from the start of one window to that of the next.
@@ -80,7 +80,7 @@ pub struct EvaluateConfig<'a> {
 impl Default for EvaluateConfig<'_> {
     fn default() -> Self {
         Self {
-            purpose: Purpose::default(),
+            purpose: ScoredSplit::default(),
             split_seed: None,
             stride: 1,
             max_windows: 2000,

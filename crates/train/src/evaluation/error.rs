@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files::may_pass;
+use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::NnError;
 use foreframe_core::registry::RegistryError;
@@ -179,7 +179,7 @@ pub enum EvaluationError {
 
 impl HasErrorKind for EvaluationError {
     fn kind(&self) -> ErrorKind {
-        if may_pass(self) {
+        if is_transient(self) {
             return ErrorKind::Away;
         }
         match self {

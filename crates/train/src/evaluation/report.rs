@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
 use super::bootstrap::{Bootstrap, TrialSums};
-use super::config::{EvaluateConfig, NEAREST_WINDOWS, Purpose};
+use super::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 use super::figures::FigureFile;
 use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
@@ -91,7 +91,7 @@ pub struct ReportStamp {
     pub twins: Vec<(String, String)>,
     /// Whether the validation split or the test sets were scored.
     #[serde(default)]
-    pub purpose: Purpose,
+    pub purpose: ScoredSplit,
     /// The program's version and the commit it was built from.
     pub program: ProgramStamp,
     /// The command line.

@@ -4,7 +4,7 @@ use std::io;
 
 use super::ImportError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files::may_pass;
+use foreframe_core::files::is_transient;
 
 /// Errors of reading that say something about the recording, not about the machine.
 const DAMAGED_INPUT: [io::ErrorKind; 6] = [
@@ -18,7 +18,7 @@ const DAMAGED_INPUT: [io::ErrorKind; 6] = [
 
 impl HasErrorKind for ImportError {
     fn kind(&self) -> ErrorKind {
-        if may_pass(self) {
+        if is_transient(self) {
             return ErrorKind::Away;
         }
         match self {

@@ -12,7 +12,7 @@ use super::bag::BagImages;
 use super::lerobot::ImageTable;
 use super::video::VideoFrames;
 use super::{ImportError, SkippedList, read_file};
-use foreframe_core::files::may_pass;
+use foreframe_core::files::is_transient;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::types::Channel;
@@ -143,7 +143,7 @@ pub(super) fn read_image(path: &Path, place: &str) -> Result<Vec<u8>, ImportErro
         ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
             ImportError::record(place, format!("the image {} is missing", path.display()))
         }
-        ImportError::Io { source, .. } if !may_pass(&source) => {
+        ImportError::Io { source, .. } if !is_transient(&source) => {
             ImportError::record(place, format!("the image {} cannot be read: {source}", path.display()))
         }
         other => other,

@@ -5,8 +5,8 @@ use std::sync::atomic::AtomicBool;
 use serde_json::json;
 
 use super::super::datasets;
-use super::super::patience::retry_while_busy;
 use super::super::report::JobReporter;
+use super::super::retry_policy::retry_while_busy;
 use super::super::spec::ImportSpec;
 use super::{Pipeline, failed};
 use crate::jobs::executor::{JobFailure, JobResult};
@@ -32,17 +32,17 @@ impl Pipeline {
             ..config
         };
         report.progress(0, 0, "reading the recording");
-        let patience = self.patience(report, cancelled);
-        patience.run(async || datasets::clear_stale_import(self.store.objects(), &spec.name, &config).await)?;
+        let retry = self.retry_policy(report, cancelled);
+        retry.run(async || datasets::clear_stale_import(self.store.objects(), &spec.name, &config).await)?;
         // Whole shards are saved; a new attempt continues after them.
         report.checkpoint(saved_shards(&config.out) as u64);
         let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
         let work = || import(&config, &on_progress, cancelled);
         let is_busy = |error: &ImportError| matches!(error, ImportError::Dataset(DatasetError::Busy { .. }));
         // After an error it continues with the shards that are finished.
-        let imported = patience.repeat(|| retry_while_busy(work, is_busy, cancelled))?;
+        let imported = retry.repeat(|| retry_while_busy(work, is_busy, cancelled))?;
         log_skipped(&imported, report);
-        self.push_dataset(&spec.name, &patience)?;
+        self.push_dataset(&spec.name, &retry)?;
         let info = &imported.info;
         Ok(JobResult {
             result: json!({

@@ -1,24 +1,16 @@
 //! Waits for a store that is away: a database that is being restarted, an object store that answers with errors, a file
 //! system that is full or read-only.
 
-use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use tokio::runtime::Handle;
 use tracing::warn;
 
-use super::JobError;
 use super::executor::JobFailure;
 use super::report::JobReporter;
-use crate::store::StoreError;
-use crate::versions::VersionError;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
-use foreframe_core::files::may_pass;
-use foreframe_data::dataset::DatasetError;
-use foreframe_data::dataset::import::ImportError;
-use foreframe_train::evaluation::EvaluationError;
-use foreframe_train::training::TrainError;
 
 /// How long a job waits for a store before it fails. It can be resumed.
 const LIMIT: Duration = Duration::from_hours(1);
@@ -32,69 +24,21 @@ const BUSY_TIMEOUT: Duration = Duration::from_mins(1);
 /// How often it tries.
 const BUSY_POLL: Duration = Duration::from_millis(200);
 
-/// An error that may come from a store that is away.
-pub(super) trait MayBeAway: Error {
-    /// Whether the store cannot be reached or written now, but may be later.
-    fn is_away(&self) -> bool;
-}
-
-impl MayBeAway for StoreError {
-    fn is_away(&self) -> bool {
-        self.is_unavailable()
-    }
-}
-
-impl MayBeAway for VersionError {
-    fn is_away(&self) -> bool {
-        matches!(self, Self::Store(error) if error.is_unavailable()) || may_pass(self)
-    }
-}
-
-impl MayBeAway for DatasetError {
-    fn is_away(&self) -> bool {
-        may_pass(self)
-    }
-}
-
-impl MayBeAway for ImportError {
-    fn is_away(&self) -> bool {
-        may_pass(self)
-    }
-}
-
-impl MayBeAway for TrainError {
-    fn is_away(&self) -> bool {
-        may_pass(self)
-    }
-}
-
-impl MayBeAway for EvaluationError {
-    fn is_away(&self) -> bool {
-        may_pass(self)
-    }
-}
-
-impl MayBeAway for JobError {
-    fn is_away(&self) -> bool {
-        self.is_unavailable()
-    }
-}
-
 /// How a running job asks the stores.
-pub(super) struct Patience<'a> {
+pub(super) struct RetryPolicy<'a> {
     pub(super) runtime: &'a Handle,
     pub(super) report: &'a JobReporter,
     pub(super) cancelled: &'a AtomicBool,
 }
 
-impl Patience<'_> {
+impl RetryPolicy<'_> {
     /// Does the work again and again while the store is away. Errors: `Failed` after an hour or for any other reason, `Cancelled`.
-    pub(super) fn run<T, E: MayBeAway>(&self, mut work: impl AsyncFnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+    pub(super) fn run<T, E: HasErrorKind>(&self, mut work: impl AsyncFnMut() -> Result<T, E>) -> Result<T, JobFailure> {
         self.repeat(|| self.runtime.block_on(work()))
     }
 
     /// The same for work that blocks.
-    pub(super) fn repeat<T, E: MayBeAway>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+    pub(super) fn repeat<T, E: HasErrorKind>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
         let (began, mut is_told) = (Instant::now(), false);
         loop {
             let error = match work() {
@@ -102,7 +46,7 @@ impl Patience<'_> {
                 Err(error) => error,
             };
             let reason = error_text::with_causes(&error);
-            if !error.is_away() || began.elapsed() >= LIMIT {
+            if error.kind() != ErrorKind::Away || began.elapsed() >= LIMIT {
                 return Err(JobFailure::Failed(reason));
             }
             if !is_told {
@@ -141,7 +85,7 @@ pub(super) fn retry_while_busy<T, E>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::Lease;
+    use crate::store::{Lease, StoreError};
 
     fn away() -> StoreError {
         StoreError::Io {
@@ -155,13 +99,13 @@ mod tests {
     fn tried(times: u32, other: Option<StoreError>, cancelled: bool) -> (Result<u32, JobFailure>, u32) {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let lease = Lease { number: 1, token: 1 };
-        let patience = Patience {
+        let retry = RetryPolicy {
             runtime: runtime.handle(),
             report: &JobReporter::to_writer(lease, |_, _| Ok(())),
             cancelled: &AtomicBool::new(cancelled),
         };
         let (mut tries, mut other) = (0, other);
-        let done = patience.run(async || {
+        let done = retry.run(async || {
             tries += 1;
             match other.take() {
                 Some(error) => Err(error),
