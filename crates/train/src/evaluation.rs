@@ -38,7 +38,7 @@ use self::baselines::{Baselines, Method};
 use self::bootstrap::Bootstrap;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::uncertainty::NoveltyScores;
-use foreframe_core::nn::{Architecture, ModelSpec};
+use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::LoadedModel;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
@@ -260,7 +260,7 @@ pub fn run(
     }
     let spec = loaded.model.spec();
     let mut baselines = fitted_baselines(loaded, (dataset, &splits), config)?;
-    if spec.architecture == Architecture::Flow {
+    if spec.flow().is_some() {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
     }

@@ -30,7 +30,7 @@ use self::stage::{StageEnd, StageRunner, TrainState};
 use foreframe_core::files::write_atomically;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
-use foreframe_core::nn::{Architecture, Conditioning, ModelSpec, NnError, Parameters};
+use foreframe_core::nn::{Conditioning, ModelSpec, NnError, Parameters};
 use foreframe_core::registry::{self, DatasetStamp, Manifest, ProgramStamp, RegistryError, StoredWeights};
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, DatasetError, Window};
@@ -298,7 +298,7 @@ fn initial_parameters(
         return start::parameters(plan, start).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
-    if plan.spec.architecture == Architecture::Flow {
+    if plan.spec.flow().is_some() {
         return Ok(Some(parameters));
     }
     let frames = window_frames(&plan.train, config.model.context + config.model.horizon);
