@@ -8,7 +8,7 @@
 //! one LSTM decoder that predicts the next frames and one that reconstructs the context), and [`flow`], which moves the
 //! pixels of the last frame. Neither uses the other. [`model`] is the type that the rest of the program uses for both.
 //!
-//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → [`ops`]
+//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `ops`
 //! (operations with their gradients) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and meaning of a model) → `tensor_source`,
 //! `conditioning` (actions and state) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`model`]. [`costs`] compares the model's cost with other networks.
@@ -24,7 +24,7 @@ mod init;
 pub mod loss;
 pub mod model;
 mod model_size;
-pub mod ops;
+mod ops;
 mod options;
 pub mod parameters;
 pub mod spec;

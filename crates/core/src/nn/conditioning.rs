@@ -6,6 +6,14 @@ use candle_core::{Device, Tensor};
 use super::error::NnError;
 use super::spec::{ChannelScale, MIN_CHANNEL_STD, ModelSpec};
 
+/// Conditioning inputs as plain values in the channels' units, empty where the conditioning does not include them.
+pub(super) struct ConditioningValues {
+    /// `[B, horizon, A]`.
+    pub(super) actions: Vec<f32>,
+    /// `[B, S]`.
+    pub(super) states: Vec<f32>,
+}
+
 /// The conditioning inputs of a batch, in the units of the channels. An input that the model does not use is ignored; an
 /// input that the model needs but that is missing is an error.
 #[derive(Clone, Debug, Default)]
@@ -44,10 +52,9 @@ impl ConditioningTensors {
         })
     }
 
-    /// Actions `[B, horizon, A]` and state `[B, S]` as plain values in the channels' units, empty if the conditioning does
-    /// not include them. Values far outside the training's are limited, so that no prediction is NaN. Errors: `Missing`,
-    /// `Shape`.
-    pub(super) fn raw(&self, spec: &ModelSpec, batch: usize) -> Result<(Vec<f32>, Vec<f32>), NnError> {
+    /// The inputs as plain values. Values far outside the training's are limited, so that no prediction is NaN. Errors:
+    /// `Missing`, `Shape`.
+    pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
         let values = |tensor: &Tensor, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
             let values = tensor.flatten_all()?.to_vec1::<f32>()?;
             let channels = channels.iter().cycle();
@@ -64,14 +71,14 @@ impl ConditioningTensors {
             }
             None => Vec::new(),
         };
-        let state = match spec.state_inputs() {
+        let states = match spec.state_inputs() {
             Some(count) => {
                 let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
                 values(state, &spec.states)?
             }
             None => Vec::new(),
         };
-        Ok((actions, state))
+        Ok(ConditioningValues { actions, states })
     }
 }
 

@@ -14,4 +14,4 @@ pub(super) use autoencoder::DenseModel;
 pub use autoencoder::Feedback;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub use lstm::unroll;
-pub use lstm_cell::{Decoder, LstmState, PeepholeCell};
+pub use lstm_cell::{LstmState, PeepholeCell};

@@ -3,7 +3,7 @@
 pub(super) mod activation;
 pub(super) mod compose;
 pub(super) mod convolution;
-pub mod linear;
+pub(super) mod linear;
 pub(super) mod modulation;
 pub(super) mod pixel_shuffle;
 pub(super) mod sampling;

@@ -1,5 +1,5 @@
 //! The specification of a model: its dimensions and what its numbers mean. What follows from it, and whether it is valid, is
-//! in [`super::model_size`].
+//! in the module `model_size`.
 
 mod channels;
 mod dense;

@@ -310,7 +310,10 @@ mod tests {
     #[test]
     fn a_calibration_that_cannot_be_right_is_refused() {
         type Change = fn(&mut Calibration);
-        let manifest = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/moving/manifest.json"));
+        let manifest = include_str!(concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../models/moving/manifest.json"
+        ));
         let mut manifest: serde_json::Value = serde_json::from_str(manifest).unwrap();
         let spec: ModelSpec = serde_json::from_value(manifest["spec"].take()).unwrap();
         let right: Calibration = serde_json::from_value(manifest["calibration"].take()).unwrap();

@@ -26,7 +26,7 @@ fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result
 
 impl Decoder<'_> {
     /// Features `[B, steps, F]` that follow `first` `[B, F]`. Step k also gets `conditions` `[B, steps, A + S]` at k.
-    pub fn run(
+    pub(super) fn run(
         &self,
         steps: usize,
         first: &Tensor,

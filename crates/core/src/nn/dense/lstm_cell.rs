@@ -56,11 +56,11 @@ impl PeepholeCell {
 
 /// An autoregressive LSTM decoder: each step gets the output of the step before.
 #[derive(Clone, Copy, Debug)]
-pub struct Decoder<'a> {
+pub(super) struct Decoder<'a> {
     /// The cell. Its inputs are the features, then the conditioning inputs.
-    pub cell: &'a PeepholeCell,
+    pub(super) cell: &'a PeepholeCell,
     /// The layer from the cell's output to features.
-    pub output: &'a Linear,
+    pub(super) output: &'a Linear,
     /// Whether the output is added to the previous features, instead of replacing them.
-    pub residual: bool,
+    pub(super) residual: bool,
 }

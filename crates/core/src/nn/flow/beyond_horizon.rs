@@ -5,7 +5,7 @@ use candle_core::{Device, Tensor};
 
 use super::network::FlowModel;
 use super::state_channels::StateChannels;
-use crate::nn::conditioning::ConditioningTensors;
+use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
 
@@ -22,7 +22,7 @@ pub(in crate::nn) fn predict_beyond_horizon(
         horizon: steps,
         ..spec.clone()
     };
-    let (actions, mut states) = conditioning.raw(&asked, count)?;
+    let ConditioningValues { actions, mut states } = conditioning.values(&asked, count)?;
     let mut context = frames.index_select(&Tensor::new(windows, frames.device())?, 0)?;
     let each: Vec<u32> = (0..count as u32).collect();
     let (mut parts, mut done) = (Vec::new(), 0);

@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use super::encoder_views::EncoderViews;
 use super::rays::CameraPose;
 use super::state_channels::StateChannels;
-use crate::nn::conditioning::ConditioningTensors;
+use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
@@ -39,7 +39,7 @@ impl FutureRows {
         if let Some(window) = windows.iter().find(|&&window| window as usize >= count) {
             return Err(candle_core::Error::Msg(format!("there is no window {window}; there are {count}")).into());
         }
-        let (actions, states) = conditioning.raw(spec, windows.len())?;
+        let ConditioningValues { actions, states } = conditioning.values(spec, windows.len())?;
         Ok(Self {
             frames: Arc::new(with_values(frames, <[f32]>::to_vec)?),
             windows: windows.to_vec(),

@@ -111,7 +111,7 @@ impl Scene {
         poses: &[CameraPose],
     ) -> Result<Tensor, NnError> {
         match self.kind {
-            SceneKind::Room(scale, camera) => self.room_seen(spec, (scale, camera), poses),
+            SceneKind::Room(scale, camera) => self.room_seen(spec, scale, camera, poses),
             SceneKind::Places => {
                 let scaled = rows.scaled_states(spec);
                 let items: Vec<&[f32]> = (0..poses.len())
@@ -127,7 +127,7 @@ impl Scene {
     pub(super) fn content_now(&self, spec: &ModelSpec, contexts: &EncoderViews) -> Result<Vec<f32>, NnError> {
         let count = contexts.count();
         let scene = match self.kind {
-            SceneKind::Room(scale, camera) => self.room_seen(spec, (scale, camera), &contexts.poses)?,
+            SceneKind::Room(scale, camera) => self.room_seen(spec, scale, camera, &contexts.poses)?,
             SceneKind::Places => {
                 let states: Vec<Vec<f32>> = contexts.states.iter().map(|state| spec.scaled_state(state)).collect();
                 let states: Vec<&[f32]> = states.iter().map(Vec::as_slice).collect();
@@ -161,7 +161,8 @@ impl Scene {
     fn room_seen(
         &self,
         spec: &ModelSpec,
-        (scale, camera): (RoomScale, CameraModel),
+        scale: RoomScale,
+        camera: CameraModel,
         poses: &[CameraPose],
     ) -> Result<Tensor, NnError> {
         let half = spec.image_size().shrunk(2);

@@ -13,7 +13,7 @@ use crate::vectorized::vectorized;
 
 /// The activation function of a linear layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Activation {
+pub(in crate::nn) enum Activation {
     /// No activation function.
     None,
     /// tanh.
@@ -22,7 +22,7 @@ pub enum Activation {
 
 /// y = activation(x · weight + bias); weight `[D, O]`, bias `[O]`.
 #[derive(Clone, Debug)]
-pub struct Linear {
+pub(in crate::nn) struct Linear {
     pub(in crate::nn) weight: Tensor,
     pub(in crate::nn) bias: Tensor,
     activation: Activation,
@@ -30,8 +30,7 @@ pub struct Linear {
 
 impl Linear {
     /// A layer of weight `[D, O]` and bias `[O]`.
-    #[must_use]
-    pub fn new(weight: Tensor, bias: Tensor, activation: Activation) -> Self {
+    pub(in crate::nn) fn new(weight: Tensor, bias: Tensor, activation: Activation) -> Self {
         Self {
             weight,
             bias,
@@ -40,7 +39,7 @@ impl Linear {
     }
 
     /// The layer's output `[N, O]` for x `[N, D]`, all f32.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
+    pub(in crate::nn) fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
         let fused = FusedLinear {
             activation: self.activation,
             wants_input_gradient: x.track_op(),
