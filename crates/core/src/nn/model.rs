@@ -82,7 +82,7 @@ impl Model {
 
     /// The same network with a description that may not fit it, to test failures.
     #[cfg(test)]
-    pub fn with_spec(self, spec: ModelSpec) -> Self {
+    pub(crate) fn with_spec(self, spec: ModelSpec) -> Self {
         Self { spec, ..self }
     }
 
