@@ -6,7 +6,8 @@ use candle_core::{DType, Device, Tensor};
 use criterion::{Criterion, criterion_group};
 use foreframe::frame::warp::CameraModel;
 use foreframe::nn::{
-    Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters,
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, FlowSpec, Loss, Model, ModelSpec,
+    Parameters,
 };
 use foreframe::training::TrainConfig;
 use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig};
@@ -41,12 +42,17 @@ fn specs() -> [(&'static str, ModelSpec); 2] {
         channel("angular", "rad/s"),
     ];
     let flow = ModelSpec {
-        architecture: Architecture::Flow,
+        architecture: Architecture::Flow(FlowSpec {
+            layers: TrainConfig::preset("moving-flow")
+                .unwrap()
+                .model
+                .flow
+                .unwrap_or_default(),
+            camera: CameraModel::new(1.0, 0.2).ok(),
+        }),
         conditioning: Conditioning::StateAction,
         actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
         states: states.to_vec(),
-        flow: TrainConfig::preset("moving-flow").unwrap().model.flow,
-        camera: CameraModel::new(1.0, 0.2).ok(),
         ..ModelSpec::default()
     };
     [("dense", ModelSpec::default()), ("flow", flow)]
@@ -75,7 +81,7 @@ fn training(c: &mut Criterion) {
     let spec = ModelSpec::default();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let model = Model::new(spec.clone(), &parameters).unwrap();
-    let (context, horizon, pixels, features) = (spec.context, spec.horizon, spec.pixels(), spec.features);
+    let (context, horizon, pixels, features) = (spec.context, spec.horizon, spec.pixels(), spec.code_len());
     let (seen, ahead) = (values((WINDOWS, context, pixels)), values((WINDOWS, horizon, pixels)));
     let mut adam = Optimizer::new(OptimizerConfig::default());
     let mut update = |loss: &Tensor| {

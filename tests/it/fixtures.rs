@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec, Parameters};
+use foreframe::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec, Parameters};
 use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
 use foreframe::types::{Channel, Seed};
 
@@ -59,8 +59,11 @@ pub(crate) fn squares_spec(side: u32) -> ModelSpec {
     ModelSpec {
         frame_width_px: side,
         frame_height_px: side,
-        features: 8,
-        hidden: 12,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 8,
+            hidden: 12,
+            ..DenseSpec::default()
+        }),
         conditioning: Conditioning::StateAction,
         actions: vec![channel("speed", "px/frame")],
         states: vec![channel("phase", "")],

@@ -55,6 +55,7 @@ mod nn_fixtures;
 mod nn_flow;
 mod nn_model;
 mod nn_optimizer;
+mod nn_reference;
 mod nn_spec;
 #[cfg(feature = "otlp")]
 mod otlp;

@@ -1,7 +1,10 @@
 //! Small models and inputs for the tests of the network.
 
-use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{ChannelScale, Conditioning, ConditioningTensors, ModelSpec, PredictorOutput, Reconstruction};
+use candle_core::{Device, Tensor};
+use foreframe::nn::{
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, ModelSpec, PredictorOutput,
+    Reconstruction,
+};
 
 pub(crate) fn channel(name: &str, mean: f32, std: f32) -> ChannelScale {
     ChannelScale {
@@ -18,10 +21,13 @@ pub(crate) fn tiny(conditioning: Conditioning, reconstruction: Reconstruction) -
         frame_height_px: 4,
         context: 3,
         horizon: 4,
-        features: 6,
-        hidden: 7,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 6,
+            hidden: 7,
+            reconstruction,
+            ..DenseSpec::default()
+        }),
         conditioning,
-        reconstruction,
         actions: vec![channel("linear", 0.3, 0.2), channel("angular", -0.1, 0.9)],
         states: vec![
             channel("x", 1.0, 2.0),
@@ -46,14 +52,6 @@ pub(crate) fn condition(spec: &ModelSpec, batch: usize) -> ConditioningTensors {
     }
 }
 
-pub(crate) fn in_f64(condition: &ConditioningTensors) -> ConditioningTensors {
-    let cast = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.to_dtype(DType::F64).unwrap());
-    ConditioningTensors {
-        actions: cast(&condition.actions),
-        state: cast(&condition.state),
-    }
-}
-
 pub(crate) fn all_kinds() -> Vec<(ModelSpec, bool)> {
     let mut kinds = Vec::new();
     for conditioning in [
@@ -69,10 +67,10 @@ pub(crate) fn all_kinds() -> Vec<(ModelSpec, bool)> {
         }
     }
     for truth in [false, true] {
-        let absolute = ModelSpec {
-            predictor_output: PredictorOutput::Absolute,
-            ..tiny(Conditioning::StateAction, Reconstruction::Sequence)
-        };
+        let mut absolute = tiny(Conditioning::StateAction, Reconstruction::Sequence);
+        if let Architecture::Dense(dense) = &mut absolute.architecture {
+            dense.predictor_output = PredictorOutput::Absolute;
+        }
         kinds.push((absolute, truth));
     }
     kinds

@@ -3,7 +3,8 @@
 use candle_core::{Device, Tensor};
 use foreframe::frame::warp::CameraModel;
 use foreframe::nn::{
-    Architecture, ChannelScale, Conditioning, ConditioningTensors, FlowLayers, Model, ModelSpec, NnError, Parameters,
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, FlowLayers, FlowSpec, Model, ModelSpec,
+    NnError, Parameters,
 };
 use foreframe::types::Seed;
 
@@ -26,7 +27,17 @@ fn channel(name: &str, unit: &str) -> ChannelScale {
 /// A small network for frames of 12×8 px.
 fn small(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
     ModelSpec {
-        architecture: Architecture::Flow,
+        architecture: Architecture::Flow(FlowSpec {
+            layers: FlowLayers {
+                channels: 8,
+                stem_channels: 6,
+                enlarged_channels: 3,
+                fine_channels: 5,
+                scene_hidden: 8,
+                ..FlowLayers::default()
+            },
+            camera,
+        }),
         frame_width_px: 12,
         frame_height_px: 8,
         context: 3,
@@ -40,30 +51,25 @@ fn small(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
             channel("heading_sin", ""),
             channel("angular", "rad/s"),
         ],
-        flow: Some(FlowLayers {
-            channels: 8,
-            stem_channels: 6,
-            enlarged_channels: 3,
-            fine_channels: 5,
-            scene_hidden: 8,
-            ..FlowLayers::default()
-        }),
-        camera,
         ..ModelSpec::default()
+    }
+}
+
+/// The sizes of a flow network, to change them.
+fn flow(spec: &mut ModelSpec) -> &mut FlowSpec {
+    match &mut spec.architecture {
+        Architecture::Flow(flow) => flow,
+        Architecture::Dense(_) => panic!("the specification is not that of a flow network"),
     }
 }
 
 /// The same in the recurrent form, whose encoder reads one frame more than the context has.
 fn recurrent(conditioning: Conditioning) -> ModelSpec {
-    let spec = small(conditioning, None);
-    ModelSpec {
-        flow: Some(FlowLayers {
-            frames_read: 4,
-            recurrent: true,
-            ..spec.flow_layers()
-        }),
-        ..spec
-    }
+    let mut spec = small(conditioning, None);
+    let flow = flow(&mut spec);
+    flow.layers.frames_read = 4;
+    flow.layers.recurrent = true;
+    spec
 }
 
 fn kinds() -> Vec<ModelSpec> {
@@ -224,13 +230,13 @@ fn what_does_not_suit_the_network_is_refused_in_one_sentence() {
         horizontal_fov_rad: 4.0,
         ..CAMERA
     };
-    assert!(refused(&|spec| spec.camera = Some(camera)).starts_with("model specification: the camera model has"));
-    let flow = small(Conditioning::None, None);
+    assert!(refused(&|spec| flow(spec).camera = Some(camera)).starts_with("model specification: the camera model has"));
+    let moving = small(Conditioning::None, None);
     let dense = ModelSpec {
-        architecture: Architecture::Dense,
-        ..flow.clone()
+        architecture: Architecture::Dense(DenseSpec::default()),
+        ..moving.clone()
     };
-    let weights = Parameters::initialize(&flow, Seed(1)).unwrap().snapshot().unwrap();
+    let weights = Parameters::initialize(&moving, Seed(1)).unwrap().snapshot().unwrap();
     let error = Parameters::from_tensors(&dense, weights).unwrap_err();
     assert!(matches!(error, NnError::OtherArchitecture { .. }), "{error}");
 }
@@ -242,7 +248,45 @@ fn a_dense_specification_is_written_as_before() {
         !text.contains("architecture") && !text.contains("flow") && !text.contains("camera"),
         "{text}"
     );
+}
+
+#[test]
+fn a_flow_specification_is_written_without_the_fields_of_the_dense_network() {
     let spec = small(Conditioning::StateAction, Some(CAMERA));
-    let back: ModelSpec = serde_json::from_str(&serde_json::to_string(&spec).unwrap()).unwrap();
-    assert_eq!(back, spec);
+    let text = serde_json::to_string(&spec).unwrap();
+    assert!(
+        !text.contains("features") && !text.contains("\"hidden\"") && !text.contains("reconstruction"),
+        "{text}"
+    );
+    assert_eq!(serde_json::from_str::<ModelSpec>(&text).unwrap(), spec);
+    // Manifests written before had them; they are ignored.
+    let mut older: serde_json::Value = serde_json::from_str(&text).unwrap();
+    older["features"] = 128.into();
+    older["hidden"] = 256.into();
+    older["reconstruction"] = "sequence".into();
+    assert_eq!(serde_json::from_value::<ModelSpec>(older.clone()).unwrap(), spec);
+    // A dense specification must have them.
+    older["architecture"] = "dense".into();
+    older["features"].take();
+    let error = serde_json::from_value::<ModelSpec>(older).unwrap_err().to_string();
+    assert_eq!(error, "missing field `features`");
+}
+
+#[test]
+fn every_size_of_the_layers_has_its_least_value() {
+    let refused = |change: &dyn Fn(&mut FlowLayers)| {
+        let mut spec = small(Conditioning::None, None);
+        change(&mut flow(&mut spec).layers);
+        spec.validate().map_err(|error| error.to_string())
+    };
+    assert_eq!(refused(&|layers| layers.encoder_blocks = 0), Ok(()));
+    assert_eq!(refused(&|layers| layers.decoder_blocks = 0), Ok(()));
+    assert_eq!(
+        refused(&|layers| layers.channels = 0),
+        Err("model specification: flow.channels is 0; it must be 1 to 512".to_owned())
+    );
+    assert_eq!(
+        refused(&|layers| layers.encoder_blocks = 17),
+        Err("model specification: flow.encoder_blocks is 17; it must be 0 to 16".to_owned())
+    );
 }

@@ -4,7 +4,8 @@ use candle_core::{DType, Device, Tensor};
 use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
-use crate::nn_fixtures::{all_kinds, bits, condition, in_f64, largest_difference, tiny, values};
+use crate::nn_fixtures::{all_kinds, bits, condition, largest_difference, tiny, values};
+use crate::nn_reference::{Reference, in_f64};
 
 /// A loss that depends on every tensor of the model.
 fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
@@ -12,102 +13,68 @@ fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, t
     let batch = frames.dim(0).unwrap();
     let flat = frames.flatten(0, 1).unwrap();
     let features = model.encode_frames(&flat).unwrap();
-    let features = features.reshape((batch, spec.context, spec.features)).unwrap();
+    let features = features.reshape((batch, spec.context, spec.code_len())).unwrap();
     let feedback = truth.map_or(Feedback::Prediction, Feedback::TeacherForcing);
     let predicted = model.predict(&features, condition, feedback).unwrap();
     let again = model.reconstruct(&features).unwrap().unwrap();
     let predicted = model.decode_frames(&predicted.flatten(0, 1).unwrap()).unwrap();
     let again = model.decode_frames(&again.flatten(0, 1).unwrap()).unwrap();
-    let ahead = values(predicted.dims(), 0.5).to_dtype(frames.dtype()).unwrap();
+    let ahead = values(predicted.dims(), 0.5);
     let first = Loss::Mse.between(&predicted, &ahead).unwrap();
     let second = Loss::Mse.between(&again, &flat).unwrap();
     (first + second).unwrap()
 }
 
-#[test]
-fn gradients_agree_with_finite_differences() {
-    for (spec, with_truth) in all_kinds() {
-        let parameters = Parameters::initialize(&spec, Seed(3))
-            .unwrap()
-            .to_dtype(DType::F64)
-            .unwrap();
-        let model = Model::new(spec.clone(), &parameters).unwrap();
-        let frames = values(&[2, spec.context, spec.pixels()], 0.0)
-            .to_dtype(DType::F64)
-            .unwrap();
-        let truth = values(&[2, spec.horizon, spec.features], 0.7)
-            .to_dtype(DType::F64)
-            .unwrap();
-        let truth = with_truth.then_some(&truth);
-        let condition = in_f64(&condition(&spec, 2));
-        let loss = || whole_loss(&model, &frames, &condition, truth);
-        let gradients = loss().backward().unwrap();
-        for (name, var) in parameters.iter() {
-            let gradient = gradients
-                .get(var.as_tensor())
-                .unwrap_or_else(|| panic!("{name} has no gradient"));
-            let gradient = gradient.flatten_all().unwrap().to_vec1::<f64>().unwrap();
-            let original = var.flatten_all().unwrap().to_vec1::<f64>().unwrap();
-            for place in [0, original.len() / 2, original.len() - 1] {
-                let at = |shift: f64| {
-                    let mut moved = original.clone();
-                    moved[place] += shift;
-                    var.set(&Tensor::from_vec(moved, var.dims(), &Device::Cpu).unwrap())
-                        .unwrap();
-                    loss().to_scalar::<f64>().unwrap()
-                };
-                let slope = (at(1e-5) - at(-1e-5)) / 2e-5;
-                at(0.0);
-                let error = (slope - gradient[place]).abs();
-                assert!(
-                    error < 1e-8 + 1e-5 * slope.abs(),
-                    "{name}[{place}]: {slope} against {}",
-                    gradient[place]
-                );
-            }
-        }
-    }
+/// The same loss of the reference.
+fn reference_loss(
+    reference: &Reference,
+    frames: &Tensor,
+    condition: &ConditioningTensors,
+    truth: Option<&Tensor>,
+) -> Tensor {
+    let [predicted, again] = reference.frames(frames, condition, truth).unwrap();
+    let ahead = values(&[predicted.elem_count()], 0.5);
+    let mse = |found: &Tensor, target: &Tensor| {
+        let difference = (found.flatten_all().unwrap() - in_f64(&target.flatten_all().unwrap())).unwrap();
+        difference.sqr().unwrap().mean_all().unwrap()
+    };
+    (mse(&predicted, &ahead) + mse(&again, frames)).unwrap()
 }
 
 #[test]
-fn fused_f32_training_agrees_with_composed_f64() {
+fn training_agrees_with_the_reference() {
     for (spec, with_truth) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(5)).unwrap();
-        let doubles = parameters.to_dtype(DType::F64).unwrap();
+        let reference = Reference::new(&spec, &parameters);
         let frames = values(&[3, spec.context, spec.pixels()], 0.0);
-        let truth = values(&[3, spec.horizon, spec.features], 0.7);
-        let (frames64, truth64) = (
-            frames.to_dtype(DType::F64).unwrap(),
-            truth.to_dtype(DType::F64).unwrap(),
-        );
+        let truth = values(&[3, spec.horizon, spec.code_len()], 0.7);
+        let truth = with_truth.then_some(&truth);
         let condition = condition(&spec, 3);
         let model = Model::new(spec.clone(), &parameters).unwrap();
-        let model64 = Model::new(spec.clone(), &doubles).unwrap();
-        let loss = whole_loss(&model, &frames, &condition, with_truth.then_some(&truth));
-        let loss64 = whole_loss(&model64, &frames64, &in_f64(&condition), with_truth.then_some(&truth64));
-        let (value, value64) = (loss.to_scalar::<f32>().unwrap(), loss64.to_scalar::<f64>().unwrap());
-        assert!((f64::from(value) - value64).abs() < 1e-6 * value64.max(1.0));
-        let (gradients, gradients64) = (loss.backward().unwrap(), loss64.backward().unwrap());
-        for ((name, var), (_, var64)) in parameters.iter().zip(doubles.iter()) {
-            let gradient = gradients.get(var.as_tensor()).unwrap().to_dtype(DType::F64).unwrap();
-            let gradient64 = gradients64.get(var64.as_tensor()).unwrap();
-            let error = (gradient - gradient64).unwrap().abs().unwrap().flatten_all().unwrap();
-            assert!(error.max(0).unwrap().to_scalar::<f64>().unwrap() < 1e-6, "{name}");
+        let loss = whole_loss(&model, &frames, &condition, truth);
+        let exact = reference_loss(&reference, &frames, &condition, truth);
+        let (value, exact_value) = (loss.to_scalar::<f32>().unwrap(), exact.to_scalar::<f64>().unwrap());
+        assert!((f64::from(value) - exact_value).abs() < 1e-6 * exact_value.max(1.0));
+        let (gradients, exact_gradients) = (loss.backward().unwrap(), exact.backward().unwrap());
+        for (name, var) in parameters.iter() {
+            let gradient = in_f64(gradients.get(var.as_tensor()).unwrap());
+            let exact_gradient = exact_gradients.get(reference.vars[name].as_tensor()).unwrap();
+            let error = (gradient - exact_gradient).unwrap().abs().unwrap().max_all().unwrap();
+            assert!(error.to_scalar::<f64>().unwrap() < 1e-6, "{name}");
         }
     }
 }
 
 #[test]
-fn fused_f32_prediction_agrees_with_composed_f64() {
+fn prediction_agrees_with_the_reference() {
     for (spec, _) in all_kinds() {
         let parameters = Parameters::initialize(&spec, Seed(6)).unwrap();
         let frames = values(&[2, spec.context, spec.pixels()], 0.2);
         let condition = condition(&spec, 2);
         let model = Model::detached(spec.clone(), &parameters).unwrap();
-        let doubles = Model::detached(spec, &parameters.to_dtype(DType::F64).unwrap()).unwrap();
         let predicted = model.predict_frames(&frames, &condition).unwrap();
-        let exact = doubles
-            .predict_frames(&frames.to_dtype(DType::F64).unwrap(), &in_f64(&condition))
+        let [exact, _] = Reference::new(&spec, &parameters)
+            .frames(&frames, &condition, None)
             .unwrap();
         assert!(!predicted.track_op());
         assert!(largest_difference(&predicted, &exact.to_dtype(DType::F32).unwrap()) < 1e-5);

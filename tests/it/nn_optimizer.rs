@@ -1,7 +1,7 @@
 //! Adam: the closed form, resuming, clipping, and errors.
 
 use candle_core::{Device, Tensor};
-use foreframe::nn::{ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe::nn::{Architecture, ConditioningTensors, DenseSpec, Feedback, Loss, Model, ModelSpec, Parameters};
 use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig, OptimizerError};
 use foreframe::types::Seed;
 
@@ -13,8 +13,11 @@ fn tiny() -> ModelSpec {
         frame_height_px: 3,
         context: 2,
         horizon: 2,
-        features: 3,
-        hidden: 5,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 3,
+            hidden: 5,
+            ..DenseSpec::default()
+        }),
         ..ModelSpec::default()
     }
 }
@@ -58,8 +61,8 @@ fn train(parameters: &Parameters, adam: &mut Optimizer, steps: std::ops::Range<u
     let spec = tiny();
     let model = Model::new(spec.clone(), parameters).unwrap();
     for step in steps {
-        let seen = values(&[2, spec.context, spec.features], step as f32);
-        let ahead = values(&[2, spec.horizon, spec.features], step as f32 + 0.5);
+        let seen = values(&[2, spec.context, spec.code_len()], step as f32);
+        let ahead = values(&[2, spec.horizon, spec.code_len()], step as f32 + 0.5);
         let predicted = model
             .predict(&seen, &ConditioningTensors::none(), Feedback::Prediction)
             .unwrap();

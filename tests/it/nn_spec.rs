@@ -3,10 +3,18 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Tensor};
-use foreframe::nn::{Conditioning, Loss, ModelSpec, NnError, Parameters, Reconstruction};
+use foreframe::nn::{Architecture, Conditioning, DenseSpec, Loss, ModelSpec, NnError, Parameters, Reconstruction};
 use foreframe::types::Seed;
 
 use crate::nn_fixtures::{all_kinds, bits, channel, tiny, values};
+
+/// The sizes of a dense network, to change them.
+fn dense(spec: &mut ModelSpec) -> &mut DenseSpec {
+    match &mut spec.architecture {
+        Architecture::Dense(dense) => dense,
+        Architecture::Flow(_) => panic!("the specification is not that of a dense network"),
+    }
+}
 
 #[test]
 fn specifications_out_of_bounds_are_refused() {
@@ -18,8 +26,8 @@ fn specifications_out_of_bounds_are_refused() {
         ("preprocess.blur_sigma_px", |spec| spec.preprocess.blur_sigma_px = -1.0),
         ("context", |spec| spec.context = 0),
         ("horizon", |spec| spec.horizon = 257),
-        ("features", |spec| spec.features = 0),
-        ("hidden", |spec| spec.hidden = 100_000),
+        ("features", |spec| dense(spec).features = 0),
+        ("hidden", |spec| dense(spec).hidden = 100_000),
         ("number of actions", |spec| {
             spec.actions = vec![channel("a", 0.0, 1.0); 65];
         }),
@@ -27,7 +35,7 @@ fn specifications_out_of_bounds_are_refused() {
             spec.states = vec![channel("a", 0.0, 1.0); 65];
         }),
         ("number of parameters", |spec| {
-            (spec.hidden, spec.features) = (4096, 4096);
+            (dense(spec).hidden, dense(spec).features) = (4096, 4096);
         }),
         ("conditioning", |spec| spec.states.clear()),
     ];

@@ -9,7 +9,7 @@ use axum::http::{HeaderMap, HeaderValue, Method, Request, StatusCode, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::frame::{Frame, codec};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
+use foreframe::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec};
 use foreframe::registry::{DatasetStamp, LoadedModel};
 use foreframe::server::{self, App, ServerConfig};
 use foreframe::store::{Store, StoreConfig};
@@ -41,8 +41,11 @@ pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
         frame_height_px: HEIGHT,
         context: CONTEXT,
         horizon: HORIZON,
-        features: 8,
-        hidden: 8,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 8,
+            hidden: 8,
+            ..DenseSpec::default()
+        }),
         conditioning,
         actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
         states: vec![channel("x", "m")],
@@ -53,8 +56,11 @@ pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
 /// A model so slow that requests queue behind one prediction.
 pub(crate) fn slow_spec() -> ModelSpec {
     ModelSpec {
-        features: 64,
-        hidden: 1024,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 64,
+            hidden: 1024,
+            ..DenseSpec::default()
+        }),
         ..spec(Conditioning::None)
     }
 }

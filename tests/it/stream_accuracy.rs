@@ -157,7 +157,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
                 .collect();
             Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
         };
-        let features = tensor(&[24, spec.context, spec.features]);
+        let features = tensor(&[24, spec.context, spec.code_len()]);
         let windows: Vec<u32> = (0..64).map(|future| future * 7 % 24).collect();
         let condition = foreframe::nn::ConditioningTensors {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),

@@ -37,7 +37,7 @@ use crate::registry::LoadedModel;
 /// A small model with random weights.
 #[cfg(test)]
 pub fn test_model() -> LoadedModel {
-    use crate::nn::{ChannelScale, Conditioning, ModelSpec};
+    use crate::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec};
     let channel = |name: &str| ChannelScale {
         name: name.to_owned(),
         unit: String::new(),
@@ -49,8 +49,11 @@ pub fn test_model() -> LoadedModel {
         frame_height_px: 4,
         context: 3,
         horizon: 2,
-        features: 5,
-        hidden: 4,
+        architecture: Architecture::Dense(DenseSpec {
+            features: 5,
+            hidden: 4,
+            ..DenseSpec::default()
+        }),
         conditioning: Conditioning::StateAction,
         actions: vec![channel("a")],
         states: vec![channel("s")],
@@ -62,18 +65,20 @@ pub fn test_model() -> LoadedModel {
 /// As [`test_model`], with the flow network, on frames of 8×4 px.
 #[cfg(test)]
 pub fn test_flow_model() -> LoadedModel {
-    use crate::nn::{Architecture, FlowLayers, ModelSpec};
+    use crate::nn::{Architecture, FlowLayers, FlowSpec, ModelSpec};
     loaded(ModelSpec {
-        architecture: Architecture::Flow,
-        frame_width_px: 8,
-        flow: Some(FlowLayers {
-            channels: 8,
-            stem_channels: 6,
-            enlarged_channels: 3,
-            fine_channels: 5,
-            scene_hidden: 8,
-            ..FlowLayers::default()
+        architecture: Architecture::Flow(FlowSpec {
+            layers: FlowLayers {
+                channels: 8,
+                stem_channels: 6,
+                enlarged_channels: 3,
+                fine_channels: 5,
+                scene_hidden: 8,
+                ..FlowLayers::default()
+            },
+            camera: None,
         }),
+        frame_width_px: 8,
         ..test_model().model.spec().clone()
     })
 }

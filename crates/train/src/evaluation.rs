@@ -43,7 +43,6 @@ use self::method::Method;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::uncertainty::NoveltyScores;
 use self::windows::{evenly, window_shape};
-use foreframe_core::nn::Architecture;
 use foreframe_core::registry::LoadedModel;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
@@ -80,7 +79,7 @@ pub fn run(
     }
     let spec = loaded.model.spec();
     let mut baselines = fitted_baselines(loaded, (dataset, &splits), config)?;
-    if spec.architecture == Architecture::Flow {
+    if spec.flow().is_some() {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
     }

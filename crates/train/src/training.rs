@@ -33,7 +33,7 @@ use self::stage::{StageEnd, StageRunner};
 use self::state::TrainState;
 use foreframe_core::files::write_atomically;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
-use foreframe_core::nn::{Architecture, ModelSpec, Parameters};
+use foreframe_core::nn::{ModelSpec, Parameters};
 use foreframe_core::registry::{self, DatasetStamp, Manifest, ProgramStamp, StoredWeights};
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
@@ -165,7 +165,7 @@ fn initial_parameters(
         return start::parameters(plan, start).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
-    if plan.spec.architecture == Architecture::Flow {
+    if plan.spec.flow().is_some() {
         return Ok(Some(parameters));
     }
     let frames = window_frames(&plan.train, config.model.context + config.model.horizon);

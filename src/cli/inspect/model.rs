@@ -50,14 +50,14 @@ fn network(spec: &ModelSpec) -> String {
         "not inverted"
     };
     let conditioning = spec.conditioning;
-    match spec.architecture {
-        Architecture::Dense => format!(
+    match &spec.architecture {
+        Architecture::Dense(dense) => format!(
             "dense {} → LSTM {} → dense {}; conditioning {conditioning}, reconstruction {}, {inverted}",
-            spec.features, spec.hidden, spec.features, spec.reconstruction
+            dense.features, dense.hidden, dense.features, dense.reconstruction
         ),
-        Architecture::Flow => {
-            let layers = spec.flow_layers();
-            let camera = if spec.camera.is_some() { "known" } else { "unknown" };
+        Architecture::Flow(flow) => {
+            let layers = &flow.layers;
+            let camera = if flow.camera.is_some() { "known" } else { "unknown" };
             format!(
                 "flow: {} channels, {} encoder and {} decoder blocks; conditioning {conditioning}, camera {camera}, {inverted}",
                 layers.channels, layers.encoder_blocks, layers.decoder_blocks

@@ -3,7 +3,7 @@
 //! Both are counted as in [`ModelSpec::multiply_adds_per_frame`]: only products with weights, with the cost of the context
 //! divided by the horizon. Frames are gray. Normalization layers are not counted.
 
-use super::ModelSpec;
+use super::spec::ModelSpec;
 
 /// Side of the kernels of every recurrent layer, in both networks.
 const LSTM_KERNEL: u64 = 5;
@@ -59,7 +59,7 @@ pub fn cdna(spec: &ModelSpec) -> Cost {
     const KERNELS: u64 = 10 * 5 * 5;
     const MASKS: u64 = 11;
     let [full, half, quarter, eighth] = [1, 2, 4, 8].map(|stride| positions(spec, stride));
-    let conditioning_inputs = (spec.predictor_inputs() - spec.features) as u64;
+    let conditioning_inputs = spec.conditioning_inputs() as u64;
     let mut step = LayerCosts::default();
     step.convolution(5, (1, 32), half);
     step.lstm(32, 32, half);

@@ -1,151 +1,17 @@
-//! Dense layers: the frame codec (paper, "pre-trained layers") and the output layers of the LSTMs.
-// `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
-#![allow(clippy::inline_always)]
+//! The dense network, the paper's: a codec of single frames, an LSTM that encodes the context, and two LSTM decoders.
+//!
+//! Reading order: `lstm_cell` (weights and state) → `gates` (equations 1–5) → `recurrence` (all steps as one operation) →
+//! `lstm` (sequences) → `autoencoder` (the network). `layers` lists its tensors.
 
-use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
+mod autoencoder;
+mod gates;
+mod layers;
+mod lstm;
+mod lstm_cell;
+mod recurrence;
 
-use super::NnError;
-use super::activation::tanh;
-use super::tensors::{add_columns, matrix, slice, with_values};
-use crate::vectorized::vectorized;
-
-/// The activation function of a dense layer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Activation {
-    /// No activation function.
-    Linear,
-    /// tanh.
-    Tanh,
-}
-
-/// y = activation(x · weight + bias); weight `[D, O]`, bias `[O]`.
-#[derive(Clone, Debug)]
-pub struct Dense {
-    pub(super) weight: Tensor,
-    pub(super) bias: Tensor,
-    activation: Activation,
-}
-
-impl Dense {
-    /// A layer of weight `[D, O]` and bias `[O]`.
-    #[must_use]
-    pub fn new(weight: Tensor, bias: Tensor, activation: Activation) -> Self {
-        Self {
-            weight,
-            bias,
-            activation,
-        }
-    }
-
-    /// The layer's output `[N, O]` for x `[N, D]`.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
-        if x.dtype() == DType::F32 {
-            let fused = FusedDense {
-                activation: self.activation,
-                wants_input_gradient: x.track_op(),
-            };
-            let x = x.contiguous()?;
-            return Ok(if x.track_op() || self.weight.track_op() || self.bias.track_op() {
-                x.apply_op3(&self.weight, &self.bias, fused)?
-            } else {
-                x.apply_op3_no_bwd(&self.weight, &self.bias, &fused)?
-            });
-        }
-        let sum = x.matmul(&self.weight)?.broadcast_add(&self.bias)?;
-        Ok(match self.activation {
-            Activation::Linear => sum,
-            Activation::Tanh => sum.tanh()?,
-        })
-    }
-}
-
-/// The f32 layer: sum, bias and activation in one pass. It computes the input's gradient only if it is needed.
-struct FusedDense {
-    activation: Activation,
-    wants_input_gradient: bool,
-}
-
-impl CustomOp3 for FusedDense {
-    fn name(&self) -> &'static str {
-        "dense"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        weight: &CpuStorage,
-        weight_layout: &Layout,
-        bias: &CpuStorage,
-        bias_layout: &Layout,
-    ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let ((rows, inputs), (_, outputs)) = (x_layout.shape().dims2()?, weight_layout.shape().dims2()?);
-        let mut sums = x.matmul(weight, (1, rows, outputs, inputs), x_layout, weight_layout)?;
-        let bias = slice(bias, bias_layout)?;
-        if let CpuStorage::F32(sums) = &mut sums {
-            vectorized(
-                #[inline(always)]
-                || {
-                    for row in sums.chunks_exact_mut(outputs) {
-                        add_columns(row, bias);
-                        if self.activation == Activation::Tanh {
-                            for value in row {
-                                *value = tanh(*value);
-                            }
-                        }
-                    }
-                },
-            );
-        }
-        Ok((sums, Shape::from((rows, outputs))))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        weight: &Tensor,
-        _bias: &Tensor,
-        y: &Tensor,
-        gradient: &Tensor,
-    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (x, weight) = (x.detach(), weight.detach());
-        let gradient = match self.activation {
-            Activation::Linear => gradient.contiguous()?,
-            Activation::Tanh => through_tanh(y, gradient)?,
-        };
-        let mut sums = vec![0.0; gradient.dim(1)?];
-        with_values(&gradient, |gradient| {
-            vectorized(
-                #[inline(always)]
-                || add_columns(&mut sums, gradient),
-            );
-        })?;
-        let for_bias = Tensor::from_vec(sums, gradient.dim(1)?, gradient.device())?;
-        let for_weight = x.t()?.matmul(&gradient)?;
-        let for_x = self
-            .wants_input_gradient
-            .then(|| gradient.matmul(&weight.t()?))
-            .transpose()?;
-        Ok((for_x, Some(for_weight), Some(for_bias)))
-    }
-}
-
-/// The gradient of y = tanh(sum) for the sum: gradient · (1 − y²).
-fn through_tanh(y: &Tensor, gradient: &Tensor) -> candle_core::Result<Tensor> {
-    let columns = y.dim(1)?;
-    let product = with_values(y, |y| {
-        with_values(gradient, |gradient| {
-            vectorized(
-                #[inline(always)]
-                || {
-                    y.iter()
-                        .zip(gradient)
-                        .map(|(y, gradient)| gradient * (1.0 - y * y))
-                        .collect()
-                },
-            )
-        })
-    })??;
-    matrix(product, columns)
-}
+pub(super) use autoencoder::DenseModel;
+pub use autoencoder::Feedback;
+pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
+pub use lstm::unroll;
+pub use lstm_cell::{LstmState, PeepholeCell};

@@ -1,15 +1,15 @@
 //! Initial weights from a seeded random generator. Each tensor has its own random stream, named after the tensor, so that
 //! its values do not depend on which other tensors a model has.
 //!
-//! - Dense weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
+//! - Linear weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
-//! - The flow network's weights: the dense range, or a share of it (`flow_gain`); its other tensors 0.
-//! - `predictor.output.weight`: a tenth of the dense range, so that an untrained model predicts almost no change.
+//! - The flow network's weights: the linear range, or a share of it (`flow_gain`); its other tensors 0.
+//! - `predictor.output.weight`: a tenth of the linear range, so that an untrained model predicts almost no change.
 
 use candle_core::{Device, Tensor};
 use rand::Rng;
 
-use super::NnError;
+use super::error::NnError;
 use crate::types::Seed;
 
 /// The initial tensor of this name and shape.
@@ -39,7 +39,7 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
     Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
 }
 
-/// The share of the dense range for a layer of the flow network. At first, the residual blocks and corrections change
+/// The share of the linear range for a layer of the flow network. At first, the residual blocks and corrections change
 /// nothing, and pixels hardly move.
 fn flow_gain(layer: &str) -> f32 {
     match layer {
@@ -50,7 +50,7 @@ fn flow_gain(layer: &str) -> f32 {
     }
 }
 
-/// Whether the tensor belongs to an LSTM cell, not to a dense layer.
+/// Whether the tensor belongs to an LSTM cell, not to a linear layer.
 fn is_lstm(name: &str) -> bool {
     matches!(name.split_once('.'), Some(("encoder" | "predictor" | "reconstructor", part)) if !part.contains('.'))
 }

@@ -5,11 +5,11 @@
 use std::fmt;
 use std::str::FromStr;
 
-use candle_core::{CpuStorage, CustomOp2, DType, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, Layout, Shape, Tensor};
 use serde::{Deserialize, Serialize};
 
-use super::NnError;
-use super::spec::named_enum;
+use super::error::NnError;
+use super::options::named_enum;
 use super::tensors::{slice, with_values};
 use crate::vectorized::vectorized;
 
@@ -27,16 +27,9 @@ impl Loss {
     /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
     pub fn between(self, prediction: &Tensor, target: &Tensor) -> Result<Tensor, NnError> {
         check_same_shape(prediction, target)?;
-        if prediction.dtype() == DType::F32 {
-            return Ok(prediction
-                .contiguous()?
-                .apply_op2(&target.detach().contiguous()?, self)?);
-        }
-        let difference = (prediction - target.detach())?;
-        Ok(match self {
-            Self::Mse => difference.sqr()?.mean_all()?,
-            Self::L1 => difference.abs()?.mean_all()?,
-        })
+        Ok(prediction
+            .contiguous()?
+            .apply_op2(&target.detach().contiguous()?, self)?)
     }
 }
 
@@ -49,7 +42,7 @@ pub(super) fn check_same_shape(prediction: &Tensor, target: &Tensor) -> Result<(
     Err(NnError::shape("prediction", prediction, expected))
 }
 
-/// The f32 implementation: one pass over memory forward and one backward.
+/// One pass over memory forward and one backward.
 impl CustomOp2 for Loss {
     fn name(&self) -> &'static str {
         "loss"

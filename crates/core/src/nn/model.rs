@@ -1,13 +1,16 @@
 //! The one type that the rest of the program predicts with, whatever the architecture.
 
+use std::collections::BTreeMap;
+
 use candle_core::Tensor;
 
-use super::autoencoder::{DenseModel, Feedback};
-use super::conditioned::ConditioningTensors;
-use super::flow::{FlowModel, FlowPrediction, Layers};
-use super::long_futures;
-use super::spec::in_range;
-use super::{Architecture, ModelSpec, NnError, Parameters};
+use super::conditioning::ConditioningTensors;
+use super::dense::{DenseModel, Feedback};
+use super::error::NnError;
+use super::flow::{FlowModel, FlowPrediction, predict_beyond_horizon};
+use super::parameters::Parameters;
+use super::spec::{Architecture, ModelSpec, in_range};
+use super::tensor_source::TensorSource;
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
 /// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
@@ -23,16 +26,17 @@ enum Network {
     Flow(Box<FlowModel>),
 }
 
-/// The flow network's tensors by name, some of them without gradients.
+/// A model's tensors by name, some of them without gradients.
 struct NamedTensors<'a> {
-    spec: &'a ModelSpec,
+    shapes: BTreeMap<String, Vec<usize>>,
     parameters: &'a Parameters,
     frozen: &'a [&'a str],
 }
 
-impl Layers for NamedTensors<'_> {
+impl TensorSource for NamedTensors<'_> {
     fn tensor(&self, name: &str) -> Result<Tensor, NnError> {
-        let expected = self.spec.tensor_shapes().remove(name).unwrap_or_default();
+        #[expect(clippy::expect_used, reason = "the specification names every tensor of the model")]
+        let expected = (self.shapes.get(name).cloned()).expect("a tensor that tensor_shapes() does not list is a bug");
         match self.parameters.get(name) {
             None => Err(NnError::TensorMissing {
                 name: name.to_owned(),
@@ -63,24 +67,22 @@ impl Model {
 
     /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
     pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+        spec.validate()?;
+        let tensors = NamedTensors {
+            shapes: spec.tensor_shapes(),
+            parameters,
+            frozen,
+        };
         let network = match spec.architecture {
-            Architecture::Dense => Network::Dense(Box::new(DenseModel::with_frozen(spec.clone(), parameters, frozen)?)),
-            Architecture::Flow => {
-                spec.validate()?;
-                let tensors = NamedTensors {
-                    spec: &spec,
-                    parameters,
-                    frozen,
-                };
-                Network::Flow(Box::new(FlowModel::new(&spec, &tensors)?))
-            }
+            Architecture::Dense(sizes) => Network::Dense(Box::new(DenseModel::new(spec.clone(), sizes, &tensors)?)),
+            Architecture::Flow(sizes) => Network::Flow(Box::new(FlowModel::new(&spec, sizes, &tensors)?)),
         };
         Ok(Self { spec, network })
     }
 
     /// The same network with a description that may not fit it, to test failures.
     #[cfg(test)]
-    pub fn with_spec(self, spec: ModelSpec) -> Self {
+    pub(crate) fn with_spec(self, spec: ModelSpec) -> Self {
         Self { spec, ..self }
     }
 
@@ -159,7 +161,7 @@ impl Model {
         self.check_windows(codes)?;
         match &self.network {
             Network::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
-            Network::Flow(flow) => long_futures::predict(flow, &self.spec, (codes, windows, conditioning), steps),
+            Network::Flow(flow) => predict_beyond_horizon(flow, &self.spec, (codes, windows, conditioning), steps),
         }
     }
 
@@ -237,4 +239,75 @@ impl Model {
 /// One future for each window.
 fn each_once(windows: usize) -> Vec<u32> {
     (0..windows as u32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+    use crate::nn::options::Conditioning;
+    use crate::nn::spec::{ChannelScale, DenseSpec, FlowSpec};
+    use crate::types::Seed;
+
+    fn channel(name: &str, unit: &str) -> ChannelScale {
+        ChannelScale {
+            name: name.to_owned(),
+            unit: unit.to_owned(),
+            mean: 0.0,
+            std: 1.0,
+        }
+    }
+
+    fn spec(architecture: Architecture) -> ModelSpec {
+        ModelSpec {
+            architecture,
+            frame_width_px: 8,
+            frame_height_px: 8,
+            context: 3,
+            horizon: 2,
+            conditioning: Conditioning::StateAction,
+            actions: vec![channel("linear", "m/s"), channel("angular", "rad/s")],
+            states: ["x", "y", "heading_cos", "heading_sin"]
+                .map(|name| channel(name, ""))
+                .to_vec(),
+            ..ModelSpec::default()
+        }
+    }
+
+    fn futures(spec: &ModelSpec, steps: usize) -> Tensor {
+        let model = Model::detached(spec.clone(), &Parameters::initialize(spec, Seed(3)).unwrap()).unwrap();
+        let frames: Vec<f32> = (0..3 * 64).map(|at| ((at * 7) % 64) as f32 / 64.0).collect();
+        let codes = model
+            .encode_frames(&Tensor::from_vec(frames, (3, 64), &Device::Cpu).unwrap())
+            .unwrap();
+        let codes = codes.reshape((1, 3, spec.code_len())).unwrap();
+        let actions: Vec<f32> = (0..2 * steps)
+            .map(|at| if at < 4 { at as f32 * 0.1 } else { 0.3 })
+            .collect();
+        let conditioning = ConditioningTensors {
+            actions: Some(Tensor::from_vec(actions, (1, steps, 2), &Device::Cpu).unwrap()),
+            state: Some(Tensor::new(&[[1.0f32, 2.0, 0.8, 0.6]], &Device::Cpu).unwrap()),
+        };
+        model.predict_steps(&codes, &[0], &conditioning, steps).unwrap()
+    }
+
+    #[test]
+    fn a_longer_future_starts_with_the_trained_one() {
+        let dense = DenseSpec {
+            features: 6,
+            hidden: 5,
+            ..DenseSpec::default()
+        };
+        for architecture in [Architecture::Dense(dense), Architecture::Flow(FlowSpec::default())] {
+            let spec = spec(architecture);
+            let (trained, longer) = (futures(&spec, 2), futures(&spec, 7));
+            assert_eq!(longer.dims(), [1, 7, spec.code_len()]);
+            let values = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            for (longer, trained) in values(longer.narrow(1, 0, 2).unwrap()).iter().zip(values(trained)) {
+                assert!((longer - trained).abs() < 1e-5);
+            }
+            assert!(values(longer).iter().all(|value| value.is_finite()));
+        }
+    }
 }

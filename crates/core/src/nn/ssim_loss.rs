@@ -6,7 +6,7 @@
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
 use rayon::prelude::*;
 
-use super::NnError;
+use super::error::NnError;
 use super::loss::check_same_shape;
 use super::tensors::{slice, with_values};
 use crate::frame::quality::SsimTerms;

@@ -310,10 +310,14 @@ mod tests {
     #[test]
     fn a_calibration_that_cannot_be_right_is_refused() {
         type Change = fn(&mut Calibration);
-        let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/moving");
-        let manifest = crate::registry::manifest::read(&directory).unwrap();
-        let right = manifest.calibration.clone().unwrap();
-        assert_eq!(right.check(&manifest.spec), Ok(()));
+        let manifest = include_str!(concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../models/moving/manifest.json"
+        ));
+        let mut manifest: serde_json::Value = serde_json::from_str(manifest).unwrap();
+        let spec: ModelSpec = serde_json::from_value(manifest["spec"].take()).unwrap();
+        let right: Calibration = serde_json::from_value(manifest["calibration"].take()).unwrap();
+        assert_eq!(right.check(&spec), Ok(()));
         let changes: [(Change, &str); 6] = [
             (|c| c.steps.clear(), "steps"),
             (|c| c.steps[0].mean_factor = -5.0, "steps"),
@@ -325,7 +329,7 @@ mod tests {
         for (change, field) in changes {
             let mut wrong = right.clone();
             change(&mut wrong);
-            let reason = wrong.check(&manifest.spec).unwrap_err();
+            let reason = wrong.check(&spec).unwrap_err();
             assert!(reason.starts_with(&format!("calibration.{field}")), "{reason}");
         }
     }

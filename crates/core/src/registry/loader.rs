@@ -8,8 +8,10 @@ use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor};
 
+use super::embedded;
+use super::error::RegistryError;
+use super::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 use super::manifest::{self, Manifest};
-use super::{MANIFEST_FILE, RegistryError, WEIGHTS_FILE, embedded};
 use crate::files::sha256_hex;
 use crate::nn::{Model, NnError, Parameters};
 

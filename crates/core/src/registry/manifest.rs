@@ -5,7 +5,10 @@ use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Calibration, MANIFEST_FILE, RegistryError, embedded};
+use super::calibration::Calibration;
+use super::embedded;
+use super::error::RegistryError;
+use super::layout::MANIFEST_FILE;
 use crate::nn::ModelSpec;
 use crate::types::Seed;
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::JobError;
-use foreframe_core::nn::Architecture;
+use foreframe_core::nn::ArchitectureKind;
 use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::training::TrainConfig;
 use foreframe_train::training::config::CodecStart;
@@ -124,19 +124,19 @@ fn training_mb(config: &TrainConfig, dataset: &DatasetInfo, held_mb: u64) -> u64
     let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
     let frames = dataset.frame_count as u64;
     let (codec, network) = match config.model.architecture {
-        Architecture::Dense => (
+        ArchitectureKind::Dense => (
             2 * pixels * features,
             2 * 4 * hidden * (features + hidden) + hidden * features,
         ),
         // Its weights are few beside its activations.
-        Architecture::Flow => (0, 0),
+        ArchitectureKind::Flow => (0, 0),
     };
     let weights = VALUE * WEIGHT_COPIES * (codec + network);
     let window = count(config.model.context + config.model.horizon);
     let fit_frames = count(config.fit.batch_size) * window;
     let fit_values = match config.model.architecture {
-        Architecture::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
-        Architecture::Flow => FLOW_PIXEL_VALUES * pixels,
+        ArchitectureKind::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
+        ArchitectureKind::Flow => FLOW_PIXEL_VALUES * pixels,
     };
     let fit = VALUE * fit_frames * fit_values;
     let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);

@@ -9,7 +9,8 @@ use super::optimizer::{OptimizerConfig, UpdateRule};
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{
-    Architecture, ChannelScale, Conditioning, FlowLayers, ModelSpec, PredictorOutput, Reconstruction,
+    Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec,
+    PredictorOutput, Reconstruction,
 };
 use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::{Dataset, sampler::WindowShape};
@@ -39,8 +40,8 @@ pub struct TrainConfig {
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
     /// The kind of network.
-    #[serde(default = "Architecture::dense")]
-    pub architecture: Architecture,
+    #[serde(default = "ArchitectureKind::dense")]
+    pub architecture: ArchitectureKind,
     /// Number of context frames.
     pub context: usize,
     /// Number of predicted frames.
@@ -67,15 +68,15 @@ pub struct ModelConfig {
 }
 
 fn default_features() -> usize {
-    ModelSpec::default().features
+    DenseSpec::default().features
 }
 
 fn default_hidden() -> usize {
-    ModelSpec::default().hidden
+    DenseSpec::default().hidden
 }
 
 fn default_reconstruction() -> Reconstruction {
-    ModelSpec::default().reconstruction
+    DenseSpec::default().reconstruction
 }
 
 /// Settings of the windows.
@@ -314,24 +315,29 @@ impl TrainConfig {
         let (info, model) = (dataset.info(), &self.model);
         let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
         let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
-        let is_flow = model.architecture == Architecture::Flow;
+        let architecture = match model.architecture {
+            ArchitectureKind::Dense => Architecture::Dense(DenseSpec {
+                features: model.features,
+                hidden: model.hidden,
+                reconstruction: model.reconstruction,
+                predictor_output: model.predictor_output,
+            }),
+            ArchitectureKind::Flow => Architecture::Flow(FlowSpec {
+                layers: model.flow.unwrap_or_default(),
+                camera: info.camera,
+            }),
+        };
         ModelSpec {
-            architecture: model.architecture,
+            architecture,
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,
             frame_period_s: info.frame_period_s,
             preprocess: model.preprocess,
             context: model.context,
             horizon: model.horizon,
-            features: model.features,
-            hidden: model.hidden,
-            reconstruction: model.reconstruction,
-            predictor_output: model.predictor_output,
             conditioning: model.conditioning,
             actions,
             states,
-            flow: is_flow.then(|| model.flow.unwrap_or_default()),
-            camera: info.camera.filter(|_| is_flow),
         }
     }
 }

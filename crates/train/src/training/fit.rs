@@ -9,7 +9,7 @@ use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan};
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
-use foreframe_core::nn::{Architecture, Feedback, Model, Parameters};
+use foreframe_core::nn::{Feedback, Model, Parameters};
 
 /// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
@@ -107,7 +107,7 @@ impl Objective for SequenceObjective<'_> {
             .windows(&windows, self.config.window_shape(), is_teacher_forced)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
-        if self.plan.spec.architecture == Architecture::Flow {
+        if self.plan.spec.flow().is_some() {
             let counting = fit.frames_that_count(step, self.plan.spec.horizon);
             return self.flow_loss(&model, &batch, counting);
         }

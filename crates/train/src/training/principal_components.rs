@@ -123,15 +123,18 @@ fn norm(row: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use foreframe_core::nn::{Model, ModelSpec};
+    use foreframe_core::nn::{Architecture, DenseSpec, Model, ModelSpec};
 
     #[test]
     fn the_codec_restores_frames_of_few_components() {
         let spec = ModelSpec {
             frame_width_px: 8,
             frame_height_px: 8,
-            features: 6,
-            hidden: 4,
+            architecture: Architecture::Dense(DenseSpec {
+                features: 6,
+                hidden: 4,
+                ..DenseSpec::default()
+            }),
             ..ModelSpec::default()
         };
         let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();

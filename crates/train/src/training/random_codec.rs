@@ -25,7 +25,7 @@ mod tests {
     use candle_core::Device;
 
     use super::*;
-    use foreframe_core::nn::{Model, ModelSpec};
+    use foreframe_core::nn::{Architecture, DenseSpec, Model, ModelSpec};
     use foreframe_core::types::Seed;
 
     #[test]
@@ -33,7 +33,10 @@ mod tests {
         let spec = ModelSpec {
             frame_width_px: 32,
             frame_height_px: 32,
-            features: 32,
+            architecture: Architecture::Dense(DenseSpec {
+                features: 32,
+                ..DenseSpec::default()
+            }),
             ..ModelSpec::default()
         };
         // Bright frames with a small dark square each.

@@ -4,17 +4,19 @@
 
 use candle_core::{DType, Device, Tensor};
 
-use super::super::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
-use super::super::flow_inputs::{FutureRows, fold_pixels, sampled_blocks};
-use super::super::pixel_shuffle::pixel_unshuffle;
-use super::super::rays::{CameraPose, own_places};
-use super::super::sampling::sample_features;
-use super::super::tensors::with_values;
-use super::super::{ModelSpec, NnError};
-use super::{FlowModel, FlowPrediction};
+use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
+use super::future_rows::FutureRows;
+use super::network::{FlowModel, FlowPrediction};
+use super::rays::CameraPose;
+use crate::nn::error::NnError;
+use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
+use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
+use crate::nn::ops::sampling::{own_places, sample_features};
+use crate::nn::spec::ModelSpec;
+use crate::nn::tensors::with_values;
 
 /// Of the blocks to move, the channels that hold pixels; the last one says how much of a block is inside the frame.
-const BLOCK_PIXELS: usize = 4;
+const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 impl FlowModel {
     /// The futures of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
@@ -27,7 +29,7 @@ impl FlowModel {
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
         let motion = Tensor::zeros((count, horizon, 3), DType::F32, &Device::Cpu)?;
-        let contexts = rows.contexts(spec);
+        let contexts = rows.contexts(spec, self.sizes.layers.frames_read);
         let coarse = self.encode(spec, &contexts)?;
         let mut state = sample_features(&coarse, own_places(quarter).repeat(count), &contexts.row_of)?;
 
@@ -47,7 +49,7 @@ impl FlowModel {
         let mut frames = Vec::with_capacity(steps);
         for step in 0..steps {
             let moved = sampled_blocks(&last_frames, &each, &own, size);
-            let moved = Tensor::from_vec(moved, (count, half.height, half.width, BLOCK_PIXELS + 1), &Device::Cpu)?;
+            let moved = Tensor::from_vec(moved, (count, half.height, half.width, MOVED_CHANNELS), &Device::Cpu)?;
             let seen = pixel_unshuffle(&moved.narrow(3, 0, BLOCK_PIXELS)?.contiguous()?)?;
             let inputs = Tensor::cat(&[&state, &features, &seen], 3)?;
             state = (state + Self::per_place(&self.mix, &inputs, quarter)?)?;

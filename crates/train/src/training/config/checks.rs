@@ -3,7 +3,7 @@
 use super::{Mirror, MirrorWord, TrainConfig, WindowBudget};
 use crate::training::TrainError;
 use crate::training::optimizer::UpdateRule;
-use foreframe_core::nn::{Architecture, Conditioning};
+use foreframe_core::nn::{ArchitectureKind, Conditioning};
 
 /// Largest number of steps of one stage.
 const MAX_STEPS: usize = 10_000_000;
@@ -85,7 +85,7 @@ impl TrainConfig {
     /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
     fn validate_together(&self) -> Result<(), TrainError> {
         let (run, fit) = (&self.run, &self.fit);
-        if self.model.architecture == Architecture::Dense {
+        if self.model.architecture == ArchitectureKind::Dense {
             let refused = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
                 ("fit.short_share", fit.short_share > 0.0, "0"),

@@ -1,0 +1,126 @@
+//! Conditioning inputs: the state and the future actions of a prediction (paper, "Proposed Action and State Conditioned
+//! LSTM Autoencoder Model"), scaled to the network's range.
+
+use candle_core::{Device, Tensor};
+
+use super::error::NnError;
+use super::spec::{ChannelScale, MIN_CHANNEL_STD, ModelSpec};
+
+/// Conditioning inputs as plain values in the channels' units, empty where the conditioning does not include them.
+pub(super) struct ConditioningValues {
+    /// `[B, horizon, A]`.
+    pub(super) actions: Vec<f32>,
+    /// `[B, S]`.
+    pub(super) states: Vec<f32>,
+}
+
+/// The conditioning inputs of a batch, in the units of the channels. An input that the model does not use is ignored; an
+/// input that the model needs but that is missing is an error.
+#[derive(Clone, Debug, Default)]
+pub struct ConditioningTensors {
+    /// Future actions `[B, horizon, A]`; action k leads to predicted frame k.
+    pub actions: Option<Tensor>,
+    /// State at the last context frame `[B, S]`.
+    pub state: Option<Tensor>,
+}
+
+impl ConditioningTensors {
+    /// No actions and no state.
+    #[must_use]
+    pub fn none() -> Self {
+        Self::default()
+    }
+
+    /// The scaled inputs that the predictor gets after the features in each step, `[B, horizon, A + S]`; `None` if the
+    /// conditioning is none. Errors: `Missing`, `Shape`.
+    pub(super) fn inputs(&self, spec: &ModelSpec, batch: usize) -> Result<Option<Tensor>, NnError> {
+        let horizon = spec.horizon;
+        let mut inputs = Vec::new();
+        if let Some(count) = spec.action_inputs() {
+            let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
+            inputs.push(scaled(actions, &spec.actions)?);
+        }
+        if let Some(count) = spec.state_inputs() {
+            let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+            let state = scaled(state, &spec.states)?.unsqueeze(1)?;
+            inputs.push(state.expand((batch, horizon, count))?.contiguous()?);
+        }
+        Ok(match inputs.as_slice() {
+            [] => None,
+            [only] => Some(only.clone()),
+            several => Some(Tensor::cat(several, 2)?),
+        })
+    }
+
+    /// The inputs as plain values. Values far outside the training's are limited, so that no prediction is NaN. Errors:
+    /// `Missing`, `Shape`.
+    pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
+        let values = |tensor: &Tensor, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
+            let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+            let channels = channels.iter().cycle();
+            Ok(values
+                .iter()
+                .zip(channels)
+                .map(|(value, channel)| channel.limited(*value))
+                .collect())
+        };
+        let actions = match spec.action_inputs() {
+            Some(count) => {
+                let shape = [batch, spec.horizon, count];
+                values(checked(spec, "actions", self.actions.as_ref(), &shape)?, &spec.actions)?
+            }
+            None => Vec::new(),
+        };
+        let states = match spec.state_inputs() {
+            Some(count) => {
+                let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+                values(state, &spec.states)?
+            }
+            None => Vec::new(),
+        };
+        Ok(ConditioningValues { actions, states })
+    }
+}
+
+/// The tensor, if it is given and has the expected shape. Errors: `Missing`, `Shape`.
+fn checked<'a>(
+    spec: &ModelSpec,
+    what: &'static str,
+    given: Option<&'a Tensor>,
+    shape: &[usize],
+) -> Result<&'a Tensor, NnError> {
+    let expected = || match (what, shape) {
+        ("actions", &[batch, horizon, count]) => {
+            format!(
+                "[{batch}, {horizon}, {count}]: windows, predicted frames, components {}",
+                names(&spec.actions)
+            )
+        }
+        _ => format!("{shape:?}: windows, components {}", names(&spec.states)),
+    };
+    match given {
+        None => Err(NnError::Missing {
+            what,
+            conditioning: spec.conditioning,
+            expected: expected(),
+        }),
+        Some(tensor) if tensor.dims() != shape => Err(NnError::shape(what, tensor, expected())),
+        Some(tensor) => Ok(tensor),
+    }
+}
+
+fn names(channels: &[ChannelScale]) -> String {
+    let names: Vec<&str> = channels.iter().map(|channel| channel.name.as_str()).collect();
+    format!("({})", names.join(", "))
+}
+
+/// (values − mean) / std along the last dimension.
+fn scaled(values: &Tensor, channels: &[ChannelScale]) -> Result<Tensor, NnError> {
+    let mean: Vec<f32> = channels.iter().map(|channel| channel.mean).collect();
+    let std: Vec<f32> = channels
+        .iter()
+        .map(|channel| channel.std.max(MIN_CHANNEL_STD))
+        .collect();
+    let (mean, std) = (Tensor::new(mean, &Device::Cpu)?, Tensor::new(std, &Device::Cpu)?);
+    Ok(values.broadcast_sub(&mean)?.broadcast_div(&std)?)
+}

@@ -1,0 +1,178 @@
+//! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
+
+use candle_core::Tensor;
+
+use super::lstm::unroll;
+use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
+use crate::nn::conditioning::ConditioningTensors;
+use crate::nn::error::NnError;
+use crate::nn::ops::linear::{Activation, Linear};
+use crate::nn::options::{PredictorOutput, Reconstruction};
+use crate::nn::spec::{DenseSpec, ModelSpec};
+use crate::nn::tensor_source::TensorSource;
+
+/// What the predictor gets as the previous frame in each step.
+#[derive(Clone, Copy, Debug)]
+pub enum Feedback<'a> {
+    /// The features that it predicted itself, as in use (autoregressive).
+    Prediction,
+    /// The true features `[B, horizon, F]` of the frames to predict ("teacher forcing"). The last one is not used.
+    TeacherForcing(&'a Tensor),
+}
+
+/// The network: a frame codec, an LSTM encoder and two LSTM decoders. It holds only weights and no stream state, so many
+/// streams can share one model. Its callers check the shapes of frames and features.
+#[derive(Clone, Debug)]
+pub(in crate::nn) struct DenseModel {
+    spec: ModelSpec,
+    sizes: DenseSpec,
+    frame_encoder: Linear,
+    frame_decoder: Linear,
+    encoder: PeepholeCell,
+    predictor: PeepholeCell,
+    predictor_output: Linear,
+    reconstructor: PeepholeCell,
+    reconstructor_output: Linear,
+}
+
+impl DenseModel {
+    /// The network of these tensors. Errors: `TensorMissing`, `TensorShape`.
+    pub(in crate::nn) fn new(spec: ModelSpec, sizes: DenseSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
+        let cell = |name: &str| {
+            let tensor = |part: &str| tensors.tensor(&format!("{name}.{part}"));
+            let (w_x, w_h, bias) = (tensor("w_x")?, tensor("w_h")?, tensor("bias")?);
+            let peepholes = [tensor("peephole_i")?, tensor("peephole_f")?, tensor("peephole_o")?];
+            Ok::<_, NnError>(PeepholeCell::new(w_x, w_h, bias, peepholes))
+        };
+        Ok(Self {
+            frame_encoder: tensors.linear("frame_encoder", Activation::Tanh)?,
+            frame_decoder: tensors.linear("frame_decoder", Activation::None)?,
+            encoder: cell("encoder")?,
+            predictor: cell("predictor")?,
+            predictor_output: tensors.linear("predictor.output", Activation::None)?,
+            reconstructor: cell("reconstructor")?,
+            reconstructor_output: tensors.linear("reconstructor.output", Activation::None)?,
+            spec,
+            sizes,
+        })
+    }
+
+    /// The same network for another number of steps.
+    pub(in crate::nn) fn with_horizon(&self, horizon: usize) -> Self {
+        let spec = ModelSpec {
+            horizon,
+            ..self.spec.clone()
+        };
+        Self { spec, ..self.clone() }
+    }
+
+    /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`.
+    pub(in crate::nn) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
+        self.frame_encoder.forward(frames)
+    }
+
+    /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped.
+    pub(in crate::nn) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
+        self.frame_decoder.forward(features)
+    }
+
+    /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The
+    /// predictor starts from the encoder's last state. Step k gets the features of frame k, the action that leads to frame
+    /// k + 1, and the state; its output is added to the features unless the specification says `absolute`. Errors:
+    /// `Shape`, `Missing`.
+    pub(in crate::nn) fn predict(
+        &self,
+        features: &Tensor,
+        condition: &ConditioningTensors,
+        feedback: Feedback,
+    ) -> Result<Tensor, NnError> {
+        let target = match feedback {
+            Feedback::TeacherForcing(target) => target,
+            Feedback::Prediction => return self.run_predictor(features, None, condition),
+        };
+        let conditions = condition.inputs(&self.spec, features.dim(0)?)?;
+        let (_, state) = self.encode(features)?;
+        let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
+        let previous = Tensor::cat(&[&last.unsqueeze(1)?, &target.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
+        let inputs = match &conditions {
+            Some(conditions) => Tensor::cat(&[&previous, conditions], 2)?,
+            None => previous.clone(),
+        };
+        let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
+        let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
+        let outputs = changes.reshape(target.dims())?;
+        Ok(match self.sizes.predictor_output {
+            PredictorOutput::Residual => (previous + outputs)?,
+            PredictorOutput::Absolute => outputs,
+        })
+    }
+
+    /// Predicts the features `[N, horizon, F]` of N rollouts from B windows with `features` `[B, context, F]`. Rollout n
+    /// starts from window `windows[n]` and uses row n of `condition`. Each window is encoded once, also if it has many
+    /// rollouts. Errors: `Shape`, `Missing`, `Tensor` if a window index is out of range.
+    pub(in crate::nn) fn predict_futures(
+        &self,
+        features: &Tensor,
+        windows: &[u32],
+        condition: &ConditioningTensors,
+    ) -> Result<Tensor, NnError> {
+        self.run_predictor(features, Some(windows), condition)
+    }
+
+    fn run_predictor(
+        &self,
+        features: &Tensor,
+        windows: Option<&[u32]>,
+        condition: &ConditioningTensors,
+    ) -> Result<Tensor, NnError> {
+        let (_, mut state) = self.encode(features)?;
+        let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
+        if let Some(windows) = windows {
+            let rows = Tensor::new(windows, features.device())?;
+            last = last.index_select(&rows, 0)?;
+            state = LstmState {
+                h: state.h.contiguous()?.index_select(&rows, 0)?,
+                c: state.c.contiguous()?.index_select(&rows, 0)?,
+            };
+        }
+        let conditions = condition.inputs(&self.spec, last.dim(0)?)?;
+        let decoder = Decoder {
+            cell: &self.predictor,
+            output: &self.predictor_output,
+            residual: self.sizes.predictor_output == PredictorOutput::Residual,
+        };
+        decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
+    }
+
+    /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
+    /// the encoder's last state; its first input is zero, then it gets its own output. Approach 2 (stepwise): after each
+    /// frame, the decoder gets the encoder's output at that frame.
+    pub(in crate::nn) fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
+        let (outputs, state) = self.encode(features)?;
+        match self.sizes.reconstruction {
+            Reconstruction::Sequence => {
+                let decoder = Decoder {
+                    cell: &self.reconstructor,
+                    output: &self.reconstructor_output,
+                    residual: false,
+                };
+                let first = features.get_on_dim(1, 0)?.zeros_like()?.contiguous()?;
+                decoder.run(self.spec.context, &first, None, &state)
+            }
+            Reconstruction::Stepwise => {
+                let (outputs, _) = unroll(
+                    &self.reconstructor,
+                    &outputs,
+                    &self.reconstructor.zero_state(features.dim(0)?)?,
+                )?;
+                let flat = self.reconstructor_output.forward(&outputs.flatten(0, 1)?)?;
+                Ok(flat.reshape(features.dims())?)
+            }
+        }
+    }
+
+    /// The encoder's outputs `[B, context, H]` and its last state.
+    fn encode(&self, features: &Tensor) -> Result<(Tensor, LstmState), NnError> {
+        unroll(&self.encoder, features, &self.encoder.zero_state(features.dim(0)?)?)
+    }
+}

@@ -1,0 +1,163 @@
+//! Why a network refuses a specification, weights or an input.
+
+use super::options::{ArchitectureKind, Conditioning};
+use crate::error_kind::{ErrorKind, HasErrorKind};
+
+/// Why the network refused a specification, weights or an input.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum NnError {
+    /// A number of the specification is out of range.
+    #[error("model specification: {field} is {value}; it must be {min} to {max}")]
+    OutOfRange {
+        /// The field's name.
+        field: &'static str,
+        /// The value given.
+        value: f64,
+        /// Smallest accepted value.
+        min: f64,
+        /// Largest accepted value.
+        max: f64,
+    },
+    /// The conditioning needs channels, but the specification has none.
+    #[error("model specification: conditioning \"{conditioning}\" needs at least one {kind} channel; {kind}s is empty")]
+    NoChannels {
+        /// The conditioning.
+        conditioning: Conditioning,
+        /// `action` or `state`.
+        kind: &'static str,
+    },
+    /// The mean or standard deviation of a channel is not finite, or the standard deviation is negative.
+    #[error(
+        "model specification: {kind} channel \"{name}\" has mean {mean} and std {std}; both must be finite and std not negative"
+    )]
+    ChannelScale {
+        /// `action` or `state`.
+        kind: &'static str,
+        /// The channel's name.
+        name: String,
+        /// Its mean.
+        mean: f32,
+        /// Its standard deviation.
+        std: f32,
+    },
+    /// A side of the frames does not suit the flow network.
+    #[error(
+        "model specification: frames are {width}×{height} px; each side must be a multiple of {min} from {min} to {max}"
+    )]
+    FrameSides {
+        /// Width of a frame in pixels.
+        width: u32,
+        /// Height of a frame in pixels.
+        height: u32,
+        /// Smallest side; sides are multiples of it.
+        min: u32,
+        /// Largest side.
+        max: u32,
+    },
+    /// The recurrent form of the flow network takes no actions.
+    #[error(
+        "model specification: flow.recurrent is true and the conditioning is \"{conditioning}\"; the recurrent form takes no \
+         actions: use \"none\" or \"state\", or flow.recurrent=false"
+    )]
+    RecurrentActions {
+        /// The conditioning.
+        conditioning: Conditioning,
+    },
+    /// No camera has this field of view or tilt.
+    #[error("model specification: {0}")]
+    Camera(#[source] crate::frame::FrameError),
+    /// An input has the wrong shape.
+    #[error("{what} has shape {found:?}; this model takes {expected}")]
+    Shape {
+        /// The input.
+        what: &'static str,
+        /// The given shape.
+        found: Vec<usize>,
+        /// The expected shape.
+        expected: String,
+    },
+    /// The model needs a conditioning input that is missing.
+    #[error("no {what} given; this model's conditioning is \"{conditioning}\", which takes {expected}")]
+    Missing {
+        /// `actions` or `state`.
+        what: &'static str,
+        /// The model's conditioning.
+        conditioning: Conditioning,
+        /// The expected shape.
+        expected: String,
+    },
+    /// The weights belong to another kind of network.
+    #[error("the weights are those of a \"{found}\" network; the model's architecture is \"{expected}\"")]
+    OtherArchitecture {
+        /// The architecture that the weights belong to.
+        found: ArchitectureKind,
+        /// The model's architecture.
+        expected: ArchitectureKind,
+    },
+    /// A tensor of the model is missing from the weights.
+    #[error("tensor \"{name}\" is missing from the weights; the model needs it with shape {expected:?}")]
+    TensorMissing {
+        /// The tensor's name.
+        name: String,
+        /// The expected shape.
+        expected: Vec<usize>,
+    },
+    /// The weights contain a tensor that the model does not have.
+    #[error("the weights contain tensor \"{name}\", which this model does not have")]
+    TensorUnknown {
+        /// The tensor's name.
+        name: String,
+    },
+    /// A tensor of the weights has the wrong shape.
+    #[error("tensor \"{name}\" has shape {found:?}; the model needs {expected:?}")]
+    TensorShape {
+        /// The tensor's name.
+        name: String,
+        /// The shape in the weights.
+        found: Vec<usize>,
+        /// The expected shape.
+        expected: Vec<usize>,
+    },
+    /// A tensor of the weights contains NaN or an infinity.
+    #[error("tensor \"{name}\" contains a value that is not a finite number")]
+    TensorNotFinite {
+        /// The tensor's name.
+        name: String,
+    },
+    /// The tensor library failed.
+    #[error("tensor computation failed")]
+    Tensor(#[from] candle_core::Error),
+}
+
+impl HasErrorKind for NnError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            // A training takes these from its settings.
+            Self::OutOfRange { .. } | Self::NoChannels { .. } => ErrorKind::Usage,
+            Self::ChannelScale { .. }
+            | Self::FrameSides { .. }
+            | Self::RecurrentActions { .. }
+            | Self::Camera(_)
+            | Self::Shape { .. }
+            | Self::Missing { .. }
+            | Self::OtherArchitecture { .. }
+            | Self::TensorMissing { .. }
+            | Self::TensorUnknown { .. }
+            | Self::TensorShape { .. }
+            | Self::TensorNotFinite { .. } => ErrorKind::Unusable,
+            Self::Tensor(_) => ErrorKind::Internal,
+        }
+    }
+}
+
+impl NnError {
+    /// The error for an input with an unexpected shape.
+    pub(in crate::nn) fn shape(what: &'static str, found: &candle_core::Tensor, expected: impl Into<String>) -> Self {
+        Self::Shape {
+            what,
+            found: found.dims().to_vec(),
+            expected: expected.into(),
+        }
+    }
+}

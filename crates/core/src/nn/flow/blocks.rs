@@ -1,0 +1,59 @@
+//! Frames cut into blocks of 2×2 pixels, and back.
+
+use candle_core::Tensor;
+
+use crate::nn::error::NnError;
+use crate::nn::ops::pixel_shuffle::pixel_shuffle;
+use crate::nn::ops::sampling::ImageSize;
+
+/// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.
+pub(super) const MOVED_CHANNELS: usize = 5;
+
+/// A column or row as −1 to 1.
+pub(super) fn centred(at: usize, side: usize) -> f32 {
+    (2.0 * at as f32 + 1.0) / side as f32 - 1.0
+}
+
+/// Samples a frame at `places` `[P, 2]` and writes each 2×2 block to four channels of its place, from channel `first` on.
+pub(super) fn write_blocks(frame: &[f32], size: ImageSize, places: &[f32], out: &mut [f32], first: usize) {
+    let half = size.shrunk(2);
+    let channels = out.len() / half.pixels();
+    for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
+        let out = &mut out[row / 2 * half.width * channels..][..half.width * channels];
+        for (out, pair) in out.chunks_exact_mut(channels).zip(places.chunks_exact(4)) {
+            let out = &mut out[first + row % 2 * 2..][..2];
+            out[0] = size.around(pair[0], pair[1]).sample(frame);
+            out[1] = size.around(pair[2], pair[3]).sample(frame);
+        }
+    }
+}
+
+/// The last frames `[contexts, P]` sampled at the items' places `[M, P, 2]`: per 2×2 block its four pixels and the share
+/// that lies inside the frame, `[M, H/2, W/2, 5]`.
+pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], size: ImageSize) -> Vec<f32> {
+    let (half, pixels) = (size.shrunk(2), size.pixels());
+    let mut out = vec![0.0; frame_of.len() * half.pixels() * MOVED_CHANNELS];
+    let items = out
+        .chunks_exact_mut(half.pixels() * MOVED_CHANNELS)
+        .zip(places.chunks_exact(pixels * 2));
+    for ((out, places), &frame) in items.zip(frame_of) {
+        write_blocks(&frames[frame as usize * pixels..], size, places, out, 0);
+        for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
+            let out = &mut out[row / 2 * half.width * MOVED_CHANNELS..][..half.width * MOVED_CHANNELS];
+            for (out, pair) in out.chunks_exact_mut(MOVED_CHANNELS).zip(places.chunks_exact(4)) {
+                let inside = pair.chunks_exact(2).filter(|place| {
+                    (0.0..=size.width as f32 - 1.0).contains(&place[0])
+                        && (0.0..=size.height as f32 - 1.0).contains(&place[1])
+                });
+                out[MOVED_CHANNELS - 1] += 0.25 * inside.count() as f32;
+            }
+        }
+    }
+    out
+}
+
+/// 2×2 blocks of pixels `[M, H/2, W/2, 4]` as frames `[M, P]`.
+pub(super) fn fold_pixels(blocks: &Tensor) -> Result<Tensor, NnError> {
+    let frames = pixel_shuffle(blocks)?;
+    Ok(frames.flatten_from(1)?)
+}

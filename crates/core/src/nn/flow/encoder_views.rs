@@ -1,0 +1,66 @@
+//! The contexts that the encoder reads, in the view of their last frames.
+
+use super::blocks::{centred, write_blocks};
+use super::rays::{CameraPose, Viewer};
+use super::state_channels::StateChannels;
+use crate::frame::warp::CameraModel;
+use crate::nn::ops::sampling::own_places;
+use crate::nn::spec::ModelSpec;
+
+/// The contexts that are encoded, each once.
+pub(super) struct EncoderViews {
+    /// The context of each future.
+    pub(super) row_of: Vec<u32>,
+    /// How many frames are read of each.
+    pub(super) frames_read: usize,
+    /// The last frame of each `[contexts, P]`.
+    pub(super) last_frames: Vec<f32>,
+    /// The frames before it, latest first `[contexts, frames_read - 1, P]`; the oldest repeats where the context is shorter.
+    pub(super) earlier: Vec<f32>,
+    /// The state at the last frame of each.
+    pub(super) states: Vec<Vec<f32>>,
+    /// Where the camera stands then.
+    pub(super) poses: Vec<CameraPose>,
+}
+
+impl EncoderViews {
+    /// Number of contexts.
+    pub(super) fn count(&self) -> usize {
+        self.poses.len()
+    }
+
+    /// Channels of [`EncoderViews::inputs`]: 2×2 blocks of the frames read and of the scene, and the place in the frame.
+    pub(super) fn channels(frames_read: usize) -> usize {
+        4 * (frames_read + 1) + 2
+    }
+
+    /// The encoder's inputs `[contexts, H/2, W/2, channels]`: blocks of the last frames, the earlier ones turned into the
+    /// last one's view by the measured yaw rate, and of what the scene looks like without what moves (`seen`,
+    /// `[contexts, H/2, W/2, 4]`).
+    pub(super) fn inputs(&self, spec: &ModelSpec, camera: Option<CameraModel>, seen: &[f32]) -> Vec<f32> {
+        let size = spec.image_size();
+        let (half, pixels) = (size.shrunk(2), size.pixels());
+        let own = own_places(size);
+        let (frames_read, channels) = (self.frames_read, Self::channels(self.frames_read));
+        let mut inputs = vec![0.0; self.count() * half.pixels() * channels];
+        for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * channels).enumerate() {
+            let turns = StateChannels::of(spec).yaw_rate_in(&self.states[index]).zip(camera);
+            write_blocks(&self.last_frames[index * pixels..], size, &own, inputs, 0);
+            for back in 1..frames_read {
+                let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..];
+                let places = turns.map(|(rate, camera)| {
+                    let viewer = Viewer::new(camera, size);
+                    viewer.turned(&viewer.rays(), rate * spec.frame_period_s as f32 * back as f32)
+                });
+                write_blocks(frame, size, places.as_ref().unwrap_or(&own), inputs, 4 * back);
+            }
+            let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];
+            for (place, (out, seen)) in inputs.chunks_exact_mut(channels).zip(seen.chunks_exact(4)).enumerate() {
+                out[4 * frames_read..4 * frames_read + 4].copy_from_slice(seen);
+                out[channels - 2] = centred(place % half.width, half.width);
+                out[channels - 1] = centred(place / half.width, half.height);
+            }
+        }
+        inputs
+    }
+}

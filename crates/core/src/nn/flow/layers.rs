@@ -1,0 +1,126 @@
+//! The layers of the flow network: its tensors and its cost.
+
+use std::collections::BTreeMap;
+
+use super::blocks::MOVED_CHANNELS;
+use super::encoder_views::EncoderViews;
+use super::motion::{MOTION_HIDDEN, WHEELS};
+use super::scene::SceneKind;
+use super::state_channels::StateChannels;
+use crate::nn::ops::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
+use crate::nn::ops::convolution::TAPS;
+use crate::nn::ops::sampling::ImageSize;
+use crate::nn::spec::{FlowLayers, FlowSpec, ModelSpec};
+
+/// Channels of a frame on the grid of a quarter of the sides: a 4×4 block.
+const FRAME_CHANNELS: usize = 16;
+/// Hidden units of the modulation.
+const MODULATION_HIDDEN: usize = 64;
+
+/// A layer of the network: its tensor's shape, and how often a window of one future applies it to one row.
+struct LayerSize {
+    name: String,
+    inputs: usize,
+    outputs: usize,
+    rows: usize,
+}
+
+/// Name and shape of every trained tensor.
+pub(in crate::nn) fn tensor_shapes(spec: &ModelSpec, flow: &FlowSpec) -> BTreeMap<String, Vec<usize>> {
+    let mut shapes = BTreeMap::new();
+    for layer in layer_sizes(spec, flow) {
+        shapes.insert(format!("{}.weight", layer.name), vec![layer.inputs, layer.outputs]);
+        shapes.insert(format!("{}.bias", layer.name), vec![layer.outputs]);
+    }
+    if StateChannels::of(spec).commands_speeds() {
+        shapes.insert(WHEELS.to_owned(), vec![2]);
+    }
+    let ImageSize { height, width } = spec.image_size().shrunk(2);
+    match SceneKind::of(spec, flow.camera) {
+        SceneKind::Room(..) => shapes.insert("flow.scene.room".to_owned(), vec![6]),
+        _ => shapes.insert("flow.scene.image".to_owned(), vec![height * width, SCENE_CHANNELS]),
+    };
+    shapes
+}
+
+/// Multiply–adds of weights to predict a window's frames, per frame, rounded up.
+pub(in crate::nn) fn multiply_adds_per_frame(spec: &ModelSpec, flow: &FlowSpec) -> u64 {
+    let all: u64 = layer_sizes(spec, flow)
+        .iter()
+        .map(|layer| (layer.inputs * layer.outputs * layer.rows) as u64)
+        .sum();
+    all.div_ceil(spec.horizon.max(1) as u64)
+}
+
+/// The layer that makes a step's state. In the recurrent form it adds to the state, so it starts small and has another
+/// name.
+pub(super) fn mix_name(sizes: &FlowLayers) -> &'static str {
+    if sizes.recurrent { "advance" } else { "mix" }
+}
+
+fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
+    let sizes = &flow.layers;
+    let size = spec.image_size();
+    let (half, quarter) = (size.shrunk(2).pixels(), size.shrunk(4).pixels());
+    let (horizon, channels) = (spec.horizon, sizes.channels);
+    let mut layers = Vec::new();
+    let mut layer = |name: &str, inputs: usize, outputs: usize, rows: usize| {
+        let name = format!("flow.{name}");
+        layers.push(LayerSize {
+            name,
+            inputs,
+            outputs,
+            rows,
+        });
+    };
+    layer(
+        "stem",
+        TAPS * EncoderViews::channels(sizes.frames_read),
+        sizes.stem_channels,
+        half,
+    );
+    layer("halving", TAPS * sizes.stem_channels, channels, quarter);
+    for index in 0..sizes.encoder_blocks {
+        for part in ["first", "second"] {
+            layer(&format!("encoder.{index}.{part}"), TAPS * channels, channels, quarter);
+        }
+    }
+    let (actions, states) = (spec.action_inputs(), spec.state_inputs().unwrap_or(0));
+    let known = states + horizon * actions.unwrap_or(0);
+    if actions.is_some() {
+        layer("motion.inputs", known, MOTION_HIDDEN, 1);
+        layer("motion.output", MOTION_HIDDEN, 3 * horizon, 1);
+        if flow.camera.is_none() {
+            layer("affine", 3, 6, horizon);
+        }
+    }
+    let moving = if actions.is_some() { 3 } else { 0 };
+    layer(
+        "modulation.inputs",
+        known + horizon + moving,
+        MODULATION_HIDDEN,
+        horizon,
+    );
+    let modulated = (2 * sizes.decoder_blocks).max(1) * 2 * channels;
+    layer("modulation.output", MODULATION_HIDDEN, modulated, horizon);
+    if let Some(inputs) = SceneKind::of(spec, flow.camera).inputs(spec) {
+        // Once for each predicted frame, and once for the last frame seen.
+        let rows = (horizon + 1) * half;
+        layer("scene.inputs", inputs, sizes.scene_hidden, rows);
+        layer("scene.hidden", sizes.scene_hidden, sizes.scene_hidden, rows);
+        layer("scene.output", sizes.scene_hidden, SCENE_CHANNELS, rows);
+    }
+    let mixed = channels + 4 * SCENE_FEATURES + if sizes.recurrent { FRAME_CHANNELS } else { 0 };
+    layer(mix_name(sizes), mixed, channels, horizon * quarter);
+    for index in 0..sizes.decoder_blocks {
+        for part in ["first", "second"] {
+            let name = format!("decoder.{index}.{part}");
+            layer(&name, TAPS * channels, channels, horizon * quarter);
+        }
+    }
+    layer("enlarge", channels, 4 * sizes.enlarged_channels, horizon * quarter);
+    let fine = sizes.enlarged_channels + MOVED_CHANNELS + SCENE_CHANNELS;
+    layer("fine", TAPS * fine, sizes.fine_channels, horizon * half);
+    layer("head", TAPS * sizes.fine_channels, 4 * HEAD_VALUES, horizon * half);
+    layers
+}

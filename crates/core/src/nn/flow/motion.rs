@@ -1,0 +1,97 @@
+//! How the camera will have moved at each predicted step: the integral of the speeds of a base that follows its commands
+//! ([`wheel_dynamics`]), corrected by a small learned network.
+
+use candle_core::{DType, Device, Tensor};
+
+use super::future_rows::FutureRows;
+use super::state_channels::StateChannels;
+use super::wheel_dynamics;
+use crate::nn::error::NnError;
+use crate::nn::ops::linear::{Activation, Linear};
+use crate::nn::ops::modulation::silu;
+use crate::nn::spec::{FlowSpec, ModelSpec};
+use crate::nn::tensor_source::TensorSource;
+
+/// Hidden units of the correction.
+pub(super) const MOTION_HIDDEN: usize = 64;
+/// The tensor of what was learned of the wheels.
+pub(super) const WHEELS: &str = "flow.motion.drive";
+/// Radians or metres that one unit of the correction stands for.
+const CORRECTION: f64 = 0.1;
+/// Pixels that one unit of the affine map moves the frame's corner, as a share of its side.
+const AFFINE: f64 = 0.25;
+
+/// The learned part.
+#[derive(Clone, Debug)]
+pub(super) struct MotionHead {
+    layers: Option<[Linear; 2]>,
+    /// What was learned of the wheels; `None` where no speeds are commanded.
+    wheels: Option<Tensor>,
+    affine: Option<Linear>,
+}
+
+impl MotionHead {
+    pub(super) fn new(spec: &ModelSpec, sizes: &FlowSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
+        let linear = |name: &str| tensors.linear(name, Activation::None);
+        let is_moving = spec.action_inputs().is_some();
+        let layers = || Ok::<_, NnError>([linear("flow.motion.inputs")?, linear("flow.motion.output")?]);
+        Ok(Self {
+            layers: is_moving.then(layers).transpose()?,
+            wheels: (StateChannels::of(spec).commands_speeds())
+                .then(|| tensors.tensor(WHEELS))
+                .transpose()?,
+            affine: (is_moving && sizes.camera.is_none())
+                .then(|| linear("flow.affine"))
+                .transpose()?,
+        })
+    }
+
+    /// Whether anything says how the camera moves.
+    pub(super) fn is_moving(&self) -> bool {
+        self.layers.is_some()
+    }
+
+    /// Yaw, ahead and left since the last frame `[N, horizon, 3]`; zero for a standing camera.
+    pub(super) fn forward(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<Tensor, NnError> {
+        let shape = (rows.count(), spec.horizon, 3);
+        let Some([inputs, output]) = &self.layers else {
+            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+        };
+        let channels = StateChannels::of(spec);
+        let speeds = (0..rows.count())
+            .map(|row| channels.speeds(rows.state(row), rows.actions(row), rows.action_count()))
+            .collect();
+        let wheels = match &self.wheels {
+            Some(wheels) => wheels.clone(),
+            None => Tensor::zeros(2, DType::F32, &Device::Cpu)?,
+        };
+        let plain = wheel_dynamics::integral(&wheels, speeds, spec.frame_period_s)?;
+        let correction = output.forward(&silu(&inputs.forward(&rows.scaled(spec)?)?)?)?;
+        Ok((plain + (correction.reshape(shape)? * CORRECTION)?)?)
+    }
+
+    /// Where each pixel was, `[M, P, 2]`, by a learned affine map of the image; `None` for a standing camera. `own` is each
+    /// pixel's place `[1, P, 2]`.
+    pub(super) fn affine_places(
+        &self,
+        spec: &ModelSpec,
+        motion: &Tensor,
+        own: &Tensor,
+    ) -> Result<Option<Tensor>, NnError> {
+        let Some(affine) = &self.affine else {
+            return Ok(None);
+        };
+        let size = spec.image_size();
+        let (items, pixels) = (motion.dim(0)?, size.pixels());
+        let sides = Tensor::new(&[size.width as f32, size.height as f32], &Device::Cpu)?;
+        let from_middle = (own.broadcast_div(&sides)? * 2.0)?.affine(1.0, -1.0)?;
+        let basis = Tensor::cat(
+            &[&from_middle, &Tensor::ones((1, pixels, 1), DType::F32, &Device::Cpu)?],
+            2,
+        )?;
+        let map = (affine.forward(motion)? * AFFINE)?.reshape((items, 3, 2))?;
+        let basis = basis.broadcast_as((items, pixels, 3))?.contiguous()?;
+        let moved = basis.matmul(&map)?.broadcast_mul(&sides)?;
+        Ok(Some(moved.broadcast_add(own)?))
+    }
+}

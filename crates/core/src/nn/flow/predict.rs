@@ -1,0 +1,61 @@
+//! Predicts the futures of a batch with the flow network, in either of its forms.
+
+use candle_core::Tensor;
+
+use super::future_rows::FutureRows;
+use super::network::{FlowModel, FlowPrediction};
+use crate::nn::conditioning::ConditioningTensors;
+use crate::nn::error::NnError;
+use crate::nn::spec::ModelSpec;
+
+/// Futures that are computed together without gradients, so that many take no more memory than few.
+const FUTURES_AT_ONCE: usize = 16;
+
+impl FlowModel {
+    /// N futures of B windows of frames `[B, context, P]`: future n follows window `windows[n]` under row n of the
+    /// conditioning. Errors: `Shape`, `Missing`.
+    pub(in crate::nn) fn predict(
+        &self,
+        spec: &ModelSpec,
+        frames: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+    ) -> Result<FlowPrediction, NnError> {
+        self.predict_first(spec, (frames, windows), conditioning, spec.horizon)
+    }
+
+    /// As [`FlowModel::predict`], with the frames of the first `steps` only.
+    pub(in crate::nn) fn predict_first(
+        &self,
+        spec: &ModelSpec,
+        (frames, windows): (&Tensor, &[u32]),
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<FlowPrediction, NnError> {
+        let rows = FutureRows::new(spec, frames, windows, conditioning)?;
+        if rows.count() <= FUTURES_AT_ONCE || self.is_trained() {
+            return self.predict_rows(spec, &rows, steps);
+        }
+        let (mut frames, mut scene, mut motion) = (Vec::new(), Vec::new(), Vec::new());
+        for first in (0..rows.count()).step_by(FUTURES_AT_ONCE) {
+            let part = rows.part(first..rows.count().min(first + FUTURES_AT_ONCE));
+            let part = self.predict_rows(spec, &part, steps)?;
+            frames.push(part.frames);
+            scene.push(part.scene);
+            motion.push(part.motion);
+        }
+        Ok(FlowPrediction {
+            frames: Tensor::cat(&frames, 0)?,
+            scene: Tensor::cat(&scene, 0)?,
+            motion: Tensor::cat(&motion, 0)?,
+        })
+    }
+
+    fn predict_rows(&self, spec: &ModelSpec, rows: &FutureRows, steps: usize) -> Result<FlowPrediction, NnError> {
+        if self.sizes.layers.recurrent {
+            self.predict_recurrently(spec, rows, steps)
+        } else {
+            self.predict_directly(spec, rows, steps)
+        }
+    }
+}

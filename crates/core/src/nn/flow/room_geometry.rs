@@ -1,0 +1,315 @@
+//! What a ray of the camera meets in a room whose six sides are learned: an upright box around all places where the robot
+//! was in training. The scene field reads the point met, so that it learns the sides' appearance in the sides' own
+//! coordinates, and the room's depth says how its pixels move when the camera drives.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
+
+use super::rays::{CameraPose, Viewer, rotated};
+use crate::nn::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
+
+/// Octaves of sines and cosines of each coordinate of the point met.
+const OCTAVES: usize = 5;
+/// The lowest frequency, in radians per unit of the room.
+const LOWEST: f32 = std::f32::consts::FRAC_PI_4;
+const WAVES: usize = 3 * 2 * OCTAVES;
+const SIDES: usize = 6;
+/// Numbers that describe one ray: waves, side met, point met, the ray itself and the distance.
+pub(super) const RAY_VALUES: usize = WAVES + SIDES + 12;
+/// How far the sides lie from the middle of the places seen in training, in units of the room, before they are learned.
+const FIRST_SIDE: f32 = 2.6;
+const FIRST_FLOOR: f32 = 0.8;
+const FIRST_CEILING: f32 = 2.0;
+/// Units of the room that one unit of the learned parameter moves a side.
+const SIDE_GAIN: f32 = 2.0;
+/// Nearest that a side counts.
+const MIN_DISTANCE: f32 = 0.02;
+
+/// The unit of a room and its origin: typical places of the robot in training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct RoomScale {
+    /// The middle of the places, in metres.
+    pub(super) middle: [f32; 2],
+    /// How far they spread, in metres: the unit.
+    pub(super) unit: f32,
+}
+
+/// A ray in units of the room.
+#[derive(Clone, Copy)]
+struct RoomRay {
+    origin: [f32; 3],
+    direction: [f32; 3],
+}
+
+/// Where a ray meets the room.
+#[derive(Clone, Copy)]
+struct RoomHit {
+    point: [f32; 3],
+    /// Index of the side: 2 · axis, plus 1 at its far end.
+    side: usize,
+    /// In lengths of the ray's direction.
+    time: f32,
+}
+
+/// The six sides, low and high of each axis, in units of the room.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RoomSides([f32; SIDES]);
+
+impl RoomSides {
+    /// From the learned parameter's values.
+    fn learned(parameter: &[f32]) -> Self {
+        let first = [
+            -FIRST_SIDE,
+            FIRST_SIDE,
+            -FIRST_SIDE,
+            FIRST_SIDE,
+            -FIRST_FLOOR,
+            FIRST_CEILING,
+        ];
+        Self(std::array::from_fn(|side| {
+            first[side] + SIDE_GAIN * parameter.get(side).copied().unwrap_or(0.0)
+        }))
+    }
+
+    /// From the parameter `[6]` as it is now.
+    pub(super) fn of(parameter: &Tensor) -> Result<Self> {
+        with_values(parameter, Self::learned)
+    }
+
+    #[inline(always)]
+    fn hit(&self, ray: RoomRay) -> RoomHit {
+        let (mut time, mut side) = (f32::MAX, 0);
+        for axis in 0..3 {
+            let speed = ray.direction[axis];
+            let far = usize::from(speed > 0.0);
+            let speed = if speed.abs() < 1e-6 { 1e-6 } else { speed };
+            let until = (self.0[2 * axis + far] - ray.origin[axis]) / speed;
+            if until < time {
+                (time, side) = (until, 2 * axis + far);
+            }
+        }
+        let time = time.max(MIN_DISTANCE);
+        RoomHit {
+            point: std::array::from_fn(|axis| ray.origin[axis] + time * ray.direction[axis]),
+            side,
+            time,
+        }
+    }
+}
+
+/// Views of one room.
+#[derive(Clone)]
+pub(super) struct RoomViews {
+    pub(super) scale: RoomScale,
+    /// The rays of a view in the robot's axes.
+    pub(super) rays: Vec<[f32; 3]>,
+    /// Where each view is taken from.
+    pub(super) poses: Vec<CameraPose>,
+}
+
+impl RoomViews {
+    #[inline(always)]
+    fn origin(&self, pose: CameraPose) -> [f32; 3] {
+        let RoomScale { middle: [x, y], unit } = self.scale;
+        [(pose.x - x) / unit, (pose.y - y) / unit, 0.0]
+    }
+
+    /// Calls `visit` with each ray in the room, views one after another.
+    #[inline(always)]
+    fn visit(&self, mut visit: impl FnMut(usize, RoomRay)) {
+        let mut index = 0;
+        for &pose in &self.poses {
+            let origin = self.origin(pose);
+            let (sin, cos) = pose.heading.sin_cos();
+            for &ray in &self.rays {
+                let direction = rotated(ray, sin, cos);
+                visit(index, RoomRay { origin, direction });
+                index += 1;
+            }
+        }
+    }
+
+    /// What each ray meets, described by [`RAY_VALUES`] numbers: `[views · rays, RAY_VALUES]`. `parameter` `[6]` moves the
+    /// sides, and gradients go to it.
+    pub(super) fn describe(self, parameter: &Tensor) -> Result<Tensor> {
+        if parameter.track_op() {
+            parameter.apply_op1(self)
+        } else {
+            parameter.apply_op1_no_bwd(&self)
+        }
+    }
+
+    /// Where each view's pixels were seen from the pose of the same index in `before`: `[views, rays, 2]`.
+    pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
+        let of_view = 2 * self.rays.len();
+        let mut places = vec![0.0; self.poses.len() * of_view];
+        let views = places.chunks_exact_mut(of_view).zip(&self.poses).zip(before);
+        for ((places, &pose), &from) in views {
+            let (origin, seen_from) = (self.origin(pose), self.origin(from));
+            let [(sin, cos), (sin_before, cos_before)] = [pose, from].map(|pose| pose.heading.sin_cos());
+            vectorized(
+                #[inline(always)]
+                || {
+                    for (place, &ray) in places.chunks_exact_mut(2).zip(&self.rays) {
+                        let direction = rotated(ray, sin, cos);
+                        let hit = sides.hit(RoomRay { origin, direction });
+                        let relative = std::array::from_fn(|axis| hit.point[axis] - seen_from[axis]);
+                        place.copy_from_slice(&viewer.project(rotated(relative, -sin_before, cos_before)));
+                    }
+                },
+            );
+        }
+        places
+    }
+}
+
+/// Writes a ray's description.
+#[inline(always)]
+fn describe(ray: RoomRay, hit: RoomHit, out: &mut [f32]) {
+    for axis in 0..3 {
+        let (mut sin, mut cos) = (LOWEST * hit.point[axis]).sin_cos();
+        for octave in 0..OCTAVES {
+            let at = 2 * (axis * OCTAVES + octave);
+            out[at] = sin;
+            out[at + 1] = cos;
+            (sin, cos) = (2.0 * sin * cos, cos * cos - sin * sin);
+        }
+    }
+    out[WAVES + hit.side] = 1.0;
+    let rest = &mut out[WAVES + SIDES..];
+    rest[..3].copy_from_slice(&hit.point);
+    let [x, y, z] = ray.direction;
+    let level = (x * x + y * y).sqrt().max(1e-6);
+    rest[3] = ray.origin[0];
+    rest[4] = ray.origin[1];
+    rest[5] = x / level;
+    rest[6] = y / level;
+    rest[7] = z / level;
+    // With the direction, the line's distance from the middle says which line it is: upright things stand on lines.
+    rest[8] = (ray.origin[0] * y - ray.origin[1] * x) / level;
+    let distance = hit.time * (level * level + z * z).sqrt();
+    rest[9] = 0.25 * distance;
+    rest[10] = 0.05 * distance * distance;
+    rest[11] = 1.0 / (distance + 0.3);
+}
+
+impl CustomOp1 for RoomViews {
+    fn name(&self) -> &'static str {
+        "describe-rays"
+    }
+
+    fn cpu_fwd(&self, parameter: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let sides = RoomSides::learned(slice(parameter, layout)?);
+        let rows = self.poses.len() * self.rays.len();
+        let mut out = vec![0.0; rows * RAY_VALUES];
+        self.visit(|index, ray| {
+            describe(
+                ray,
+                sides.hit(ray),
+                &mut out[index * RAY_VALUES..(index + 1) * RAY_VALUES],
+            );
+        });
+        Ok((CpuStorage::F32(out), Shape::from((rows, RAY_VALUES))))
+    }
+
+    fn bwd(&self, parameter: &Tensor, y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
+        let sides = RoomSides::of(parameter)?;
+        let mut sums = [0.0; SIDES];
+        with_values(y, |y| {
+            with_values(gradient, |gradient| {
+                self.visit(|index, ray| {
+                    let range = index * RAY_VALUES..(index + 1) * RAY_VALUES;
+                    let hit = sides.hit(ray);
+                    sums[hit.side] += SIDE_GAIN * side_gradient(ray, hit, &y[range.clone()], &gradient[range]);
+                });
+            })
+        })??;
+        Ok(Some(Tensor::from_vec(
+            sums.to_vec(),
+            parameter.dims(),
+            parameter.device(),
+        )?))
+    }
+}
+
+/// The gradient for the side that the ray meets, in units of the room.
+#[inline(always)]
+fn side_gradient(ray: RoomRay, hit: RoomHit, y: &[f32], gradient: &[f32]) -> f32 {
+    let speed = ray.direction[hit.side / 2];
+    if speed.abs() < 1e-3 || hit.time <= MIN_DISTANCE {
+        return 0.0;
+    }
+    let rest = WAVES + SIDES;
+    let mut for_time = 0.0;
+    for axis in 0..3 {
+        let mut for_point = gradient[rest + axis];
+        let mut frequency = LOWEST;
+        for octave in 0..OCTAVES {
+            let at = 2 * (axis * OCTAVES + octave);
+            for_point += frequency * (gradient[at] * y[at + 1] - gradient[at + 1] * y[at]);
+            frequency *= 2.0;
+        }
+        for_time += for_point * ray.direction[axis];
+    }
+    let [x, level_y, z] = ray.direction;
+    let length = (x * x + level_y * level_y + z * z).sqrt();
+    let distance = hit.time * length;
+    let near = 1.0 / (distance + 0.3);
+    for_time +=
+        length * (0.25 * gradient[rest + 9] + 0.1 * distance * gradient[rest + 10] - near * near * gradient[rest + 11]);
+    for_time / speed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::warp::CameraModel;
+    use crate::nn::gradient_check::assert_gradients;
+    use crate::nn::ops::sampling::{ImageSize, own_places};
+
+    fn views(viewer: Viewer, poses: &[CameraPose]) -> RoomViews {
+        RoomViews {
+            scale: RoomScale {
+                middle: [2.0, 0.5],
+                unit: 0.8,
+            },
+            rays: viewer.rays(),
+            poses: poses.to_vec(),
+        }
+    }
+
+    fn viewer() -> Viewer {
+        let camera = CameraModel {
+            horizontal_fov_rad: 1.0,
+            tilt_down_rad: 0.2,
+        };
+        Viewer::new(camera, ImageSize { height: 4, width: 6 })
+    }
+
+    #[test]
+    fn gradients_of_the_sides_agree_with_differences() {
+        let poses = [0.3, 2.0, -1.2].map(|heading| CameraPose {
+            x: 2.3,
+            y: 0.2,
+            heading,
+        });
+        let parameter = Tensor::new(&[0.02f32, -0.03, 0.01, 0.05, 0.04, -0.02], &candle_core::Device::Cpu).unwrap();
+        assert_gradients(&[parameter], 2e-4, |inputs| {
+            views(viewer(), &poses).describe(&inputs[0])
+        });
+    }
+
+    #[test]
+    fn an_unmoved_camera_saw_every_pixel_where_it_is() {
+        let pose = CameraPose {
+            x: 2.3,
+            y: 0.2,
+            heading: 0.7,
+        };
+        let places = views(viewer(), &[pose]).places_before(RoomSides::learned(&[0.0; 6]), viewer(), &[pose]);
+        let own = own_places(ImageSize { height: 4, width: 6 });
+        assert!(places.iter().zip(own).all(|(a, b)| (a - b).abs() < 1e-3), "{places:?}");
+    }
+}

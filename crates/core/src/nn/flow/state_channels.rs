@@ -1,0 +1,129 @@
+//! Which channels of actions and states say how the robot moves and where it is.
+
+use candle_core::{Device, Tensor};
+
+use super::rays::CameraPose;
+use super::wheel_dynamics::CommandedSpeeds;
+use crate::nn::error::NnError;
+use crate::nn::spec::{ChannelScale, ModelSpec};
+
+/// Which channels say how the robot moves and where it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct StateChannels {
+    /// x, y, cosine and sine of the heading.
+    pub(super) pose: Option<[usize; 4]>,
+    /// Forward speed and yaw rate in the state.
+    measured: [Option<usize>; 2],
+    /// Forward speed and yaw rate in the action.
+    commanded: [Option<usize>; 2],
+}
+
+impl StateChannels {
+    /// The channels of a model, by name for the pose, by unit for the speeds.
+    pub(super) fn of(spec: &ModelSpec) -> Self {
+        let by_unit = |channels: &[ChannelScale]| {
+            ["m/s", "rad/s"].map(|unit| channels.iter().position(|channel| channel.unit == unit))
+        };
+        let states: &[ChannelScale] = if spec.state_inputs().is_some() {
+            &spec.states
+        } else {
+            &[]
+        };
+        let actions: &[ChannelScale] = if spec.action_inputs().is_some() {
+            &spec.actions
+        } else {
+            &[]
+        };
+        let named = |name: &str| states.iter().position(|channel| channel.name == name);
+        let pose = match ["x", "y", "heading_cos", "heading_sin"].map(named) {
+            [Some(x), Some(y), Some(cos), Some(sin)] => Some([x, y, cos, sin]),
+            _ => None,
+        };
+        Self {
+            pose,
+            measured: by_unit(states),
+            commanded: by_unit(actions),
+        }
+    }
+
+    /// The pose in a state; the origin where states hold none.
+    pub(super) fn pose_in(self, state: &[f32]) -> CameraPose {
+        self.pose
+            .map_or_else(CameraPose::default, |[x, y, cos, sin]| CameraPose {
+                x: state[x],
+                y: state[y],
+                heading: state[sin].atan2(state[cos]),
+            })
+    }
+
+    /// The yaw rate in a state, in radians a second.
+    pub(super) fn yaw_rate_in(self, state: &[f32]) -> Option<f32> {
+        self.measured[1].map(|channel| state[channel])
+    }
+
+    /// Moves a state on: its pose by the motion, its speeds to those of the last action. Other channels stay.
+    pub(super) fn advance(self, state: &mut [f32], motion: [f32; 3], action: &[f32]) {
+        if let Some([x, y, cos, sin]) = self.pose {
+            let pose = self.pose_in(state).moved(motion);
+            state[x] = pose.x;
+            state[y] = pose.y;
+            (state[sin], state[cos]) = pose.heading.sin_cos();
+        }
+        for (measured, commanded) in self.measured.into_iter().zip(self.commanded) {
+            if let (Some(measured), Some(commanded)) = (measured, commanded) {
+                state[measured] = action[commanded];
+            }
+        }
+    }
+
+    /// Whether the actions command speeds.
+    pub(super) fn commands_speeds(self) -> bool {
+        self.commanded.iter().any(Option::is_some)
+    }
+
+    /// The speeds of a future. One that is not commanded stays as measured; one that is not measured starts as commanded.
+    /// `actions` holds them step after step, `action_count` components each.
+    pub(super) fn speeds(self, state: &[f32], actions: &[f32], action_count: usize) -> CommandedSpeeds {
+        let measured = self.measured.map(|channel| channel.map(|channel| state[channel]));
+        let commands: Vec<[f32; 2]> = actions
+            .chunks_exact(action_count.max(1))
+            .map(|action| {
+                std::array::from_fn(|part| {
+                    let commanded = self.commanded[part].map(|channel| action[channel]);
+                    commanded.or(measured[part]).unwrap_or(0.0)
+                })
+            })
+            .collect();
+        let first = commands.first().copied().unwrap_or_default();
+        CommandedSpeeds {
+            start: std::array::from_fn(|part| measured[part].unwrap_or(first[part])),
+            commands,
+        }
+    }
+}
+
+impl ModelSpec {
+    /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left
+    /// `[B, T, 3]`, in radians and metres. `None` if the model gets no state or the state has no pose.
+    pub fn measured_motion(&self, state: &Tensor, later: &Tensor) -> Result<Option<Tensor>, NnError> {
+        let channels = StateChannels::of(self);
+        if channels.pose.is_none() {
+            return Ok(None);
+        }
+        let (batch, time, count) = later.dims3()?;
+        let (now, later) = (
+            state.flatten_all()?.to_vec1::<f32>()?,
+            later.flatten_all()?.to_vec1::<f32>()?,
+        );
+        let windows = now.chunks_exact(count).zip(later.chunks_exact(time * count));
+        let motions: Vec<f32> = windows
+            .flat_map(|(now, later)| {
+                let now = channels.pose_in(now);
+                later
+                    .chunks_exact(count)
+                    .flat_map(move |later| now.motion_to(channels.pose_in(later)))
+            })
+            .collect();
+        Ok(Some(Tensor::from_vec(motions, (batch, time, 3), &Device::Cpu)?))
+    }
+}

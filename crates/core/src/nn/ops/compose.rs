@@ -1,0 +1,298 @@
+//! The predicted frame from its parts: pixels of the last true frame moved twice (with the room and with what moves in
+//! it) and new content, mixed by a mask of three. The last true frame is sampled once per step, so it never blurs twice.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+
+use super::activation::exp;
+use super::sampling::{ImageSize, Neighbourhood};
+use crate::nn::tensors::{slice, with_values};
+use crate::vectorized::vectorized;
+
+/// Numbers that the head gives for each pixel: two flows (column, row), three mask logits, one change of the content.
+pub(in crate::nn) const HEAD_VALUES: usize = 8;
+/// Channels of the scene that are not content.
+pub(in crate::nn) const SCENE_FEATURES: usize = 8;
+/// Channels of the scene on the grid of half the sides: features, then the content of each 2×2 block.
+pub(in crate::nn) const SCENE_CHANNELS: usize = SCENE_FEATURES + 4;
+/// Pixels that a flow of 1 moves.
+const FLOW_PX: f32 = 4.0;
+/// How much the room's pixels are preferred before anything is learned, as a logit.
+const ROOM_LOGIT: f32 = 1.5;
+/// Logit lost with each pixel that a place lies outside the frame, and the most that is lost.
+const OUTSIDE_LOGIT: f32 = 2.0;
+const MAX_OUTSIDE_LOGIT: f32 = 8.0;
+
+/// What a frame is composed from, beside the tensors.
+#[derive(Clone)]
+pub(in crate::nn) struct Composition {
+    pub(in crate::nn) size: ImageSize,
+    /// The last true frames `[B, P]`.
+    pub(in crate::nn) frames: Vec<f32>,
+    /// Which of them each item moves, `[M]`.
+    pub(in crate::nn) frame_of: Vec<u32>,
+    /// Where each pixel of the room was seen, `[M, P, 2]` (columns and rows); the turning grid where absent.
+    pub(in crate::nn) room_places: Option<Vec<f32>>,
+}
+
+/// What one pixel is made of.
+struct PixelParts {
+    /// Around the places of the two flows.
+    around: [Neighbourhood; 2],
+    /// The two moved pixels and the content.
+    values: [f32; 3],
+    /// Their shares.
+    mask: [f32; 3],
+}
+
+impl Composition {
+    /// The frames `[M, P]`. `head` is `[M, H/2, W/2, 4 · HEAD_VALUES]`, `scene` `[M, H/2, W/2, SCENE_CHANNELS]`, `places`
+    /// `[M, P, 2]` where each pixel was before the camera turned. Gradients go to all three.
+    pub(in crate::nn) fn compose(self, head: &Tensor, scene: &Tensor, places: &Tensor) -> Result<Tensor> {
+        let (head, scene, places) = (head.contiguous()?, scene.contiguous()?, places.contiguous()?);
+        if head.track_op() || scene.track_op() || places.track_op() {
+            head.apply_op3(&scene, &places, self)
+        } else {
+            head.apply_op3_no_bwd(&scene, &places, &self)
+        }
+    }
+
+    /// Calls `visit` with the index of each pixel among all, of its head values, of its content, and its frame's.
+    #[inline(always)]
+    fn visit(&self, mut visit: impl FnMut([usize; 3], &[f32])) {
+        let ImageSize { height, width } = self.size;
+        let pixels = self.size.pixels();
+        for (item, &frame) in self.frame_of.iter().enumerate() {
+            let from = frame as usize * pixels;
+            let frame = &self.frames[from..from + pixels];
+            for row in 0..height {
+                for column in 0..width {
+                    let block = (item * (height / 2) + row / 2) * (width / 2) + column / 2;
+                    let part = row % 2 * 2 + column % 2;
+                    let pixel = item * pixels + row * width + column;
+                    let head = (block * 4 + part) * HEAD_VALUES;
+                    let content = block * SCENE_CHANNELS + SCENE_FEATURES + part;
+                    visit([pixel, head, content], frame);
+                }
+            }
+        }
+    }
+
+    /// The parts of a pixel from its head values, content and turning place.
+    #[inline(always)]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the values of one pixel, in the innermost loop"
+    )]
+    fn parts(&self, pixel: usize, head: &[f32], content: f32, places: &[f32], frame: &[f32]) -> PixelParts {
+        let turned = [places[2 * pixel], places[2 * pixel + 1]];
+        let room = match &self.room_places {
+            Some(places) => [places[2 * pixel], places[2 * pixel + 1]],
+            None => turned,
+        };
+        let around = [
+            self.size
+                .around(room[0] + FLOW_PX * head[0], room[1] + FLOW_PX * head[1]),
+            self.size
+                .around(turned[0] + FLOW_PX * head[2], turned[1] + FLOW_PX * head[3]),
+        ];
+        let logits = [
+            head[4] + ROOM_LOGIT - self.outside(room),
+            head[5] - self.outside(turned),
+            head[6],
+        ];
+        let most = logits[0].max(logits[1]).max(logits[2]);
+        let shares = logits.map(|logit| exp(logit - most));
+        let sum = shares[0] + shares[1] + shares[2];
+        PixelParts {
+            values: [around[0].sample(frame), around[1].sample(frame), content + head[7]],
+            mask: shares.map(|share| share / sum),
+            around,
+        }
+    }
+
+    /// The logit that a place outside the frame costs.
+    #[inline(always)]
+    fn outside(&self, [x, y]: [f32; 2]) -> f32 {
+        let beyond = |at: f32, side: usize| (-at).max(at - (side as f32 - 1.0)).max(0.0);
+        let distance = beyond(x, self.size.width) + beyond(y, self.size.height);
+        (OUTSIDE_LOGIT * distance).min(MAX_OUTSIDE_LOGIT)
+    }
+
+    fn check(&self, head: &[usize], scene: &[usize], places: &[usize]) -> Result<()> {
+        let (items, ImageSize { height, width }) = (self.frame_of.len(), self.size);
+        let fits = head == [items, height / 2, width / 2, 4 * HEAD_VALUES]
+            && scene == [items, height / 2, width / 2, SCENE_CHANNELS]
+            && places == [items, height * width, 2];
+        if fits {
+            return Ok(());
+        }
+        bail!("{items} frames of {width}×{height} are not composed of {head:?}, {scene:?} and {places:?}")
+    }
+}
+
+impl CustomOp3 for Composition {
+    fn name(&self) -> &'static str {
+        "compose"
+    }
+
+    fn cpu_fwd(
+        &self,
+        head: &CpuStorage,
+        head_layout: &Layout,
+        scene: &CpuStorage,
+        scene_layout: &Layout,
+        places: &CpuStorage,
+        places_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        self.check(head_layout.dims(), scene_layout.dims(), places_layout.dims())?;
+        let head = slice(head, head_layout)?;
+        let scene = slice(scene, scene_layout)?;
+        let places = slice(places, places_layout)?;
+        let mut out = vec![0.0; self.frame_of.len() * self.size.pixels()];
+        vectorized(
+            #[inline(always)]
+            || {
+                self.visit(
+                    #[inline(always)]
+                    |[pixel, at, content], frame| {
+                        let parts = self.parts(pixel, &head[at..at + HEAD_VALUES], scene[content], places, frame);
+                        let weighted = parts.values.iter().zip(parts.mask);
+                        out[pixel] = weighted.map(|(value, share)| value * share).sum();
+                    },
+                );
+            },
+        );
+        Ok((
+            CpuStorage::F32(out),
+            Shape::from((self.frame_of.len(), self.size.pixels())),
+        ))
+    }
+
+    fn bwd(
+        &self,
+        head: &Tensor,
+        scene: &Tensor,
+        places: &Tensor,
+        _y: &Tensor,
+        gradient: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let mut for_head = vec![0.0; head.elem_count()];
+        let mut for_scene = vec![0.0; scene.elem_count()];
+        let mut for_places = vec![0.0; places.elem_count()];
+        with_values(head, |head| {
+            with_values(scene, |scene| {
+                with_values(places, |places| {
+                    with_values(gradient, |gradient| {
+                        vectorized(
+                            #[inline(always)]
+                            || {
+                                self.visit(
+                                    #[inline(always)]
+                                    |[pixel, at, content], frame| {
+                                        let head = &head[at..at + HEAD_VALUES];
+                                        let for_head = &mut for_head[at..at + HEAD_VALUES];
+                                        let parts = self.parts(pixel, head, scene[content], places, frame);
+                                        let moved = parts.gradient(gradient[pixel], frame, for_head);
+                                        let turned = usize::from(self.room_places.is_some());
+                                        for place in &moved[turned..] {
+                                            for_places[2 * pixel] += place[0];
+                                            for_places[2 * pixel + 1] += place[1];
+                                        }
+                                        for_scene[content] = gradient[pixel] * parts.mask[2];
+                                    },
+                                );
+                            },
+                        );
+                    })
+                })
+            })
+        })????;
+        Ok((
+            Some(Tensor::from_vec(for_head, head.dims(), head.device())?),
+            Some(Tensor::from_vec(for_scene, scene.dims(), scene.device())?),
+            Some(Tensor::from_vec(for_places, places.dims(), places.device())?),
+        ))
+    }
+}
+
+impl PixelParts {
+    /// Writes the gradient of the pixel's head values; gives that of the two places.
+    #[inline(always)]
+    fn gradient(&self, gradient: f32, frame: &[f32], for_head: &mut [f32]) -> [[f32; 2]; 2] {
+        let [first, second] = [0, 1].map(|flow: usize| {
+            let slopes = self.around[flow].slopes(frame);
+            slopes.map(|slope| gradient * self.mask[flow] * slope)
+        });
+        let mixed: f32 = self
+            .values
+            .iter()
+            .zip(self.mask)
+            .map(|(value, share)| value * share)
+            .sum();
+        for_head[0] = FLOW_PX * first[0];
+        for_head[1] = FLOW_PX * first[1];
+        for_head[2] = FLOW_PX * second[0];
+        for_head[3] = FLOW_PX * second[1];
+        for part in 0..3 {
+            for_head[4 + part] = gradient * self.mask[part] * (self.values[part] - mixed);
+        }
+        for_head[7] = gradient * self.mask[2];
+        [first, second]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    fn composition(with_room: bool) -> Composition {
+        let size = ImageSize { height: 4, width: 6 };
+        let values = |count: usize, seed| noise(&[count], seed).to_vec1::<f32>().unwrap();
+        Composition {
+            size,
+            frames: values(2 * 24, 1),
+            frame_of: vec![0, 1, 1],
+            room_places: with_room.then(|| values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect()),
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_differences() {
+        for with_room in [false, true] {
+            let inputs = [
+                (noise(&[3, 2, 3, 32], 3) * 0.3).unwrap(),
+                noise(&[3, 2, 3, SCENE_CHANNELS], 4),
+                noise(&[3, 24, 2], 5).affine(1.2, 1.37).unwrap(),
+            ];
+            assert_gradients(&inputs[..2], 1e-4, |tensors| {
+                composition(with_room).compose(&tensors[0], &tensors[1], &inputs[2])
+            });
+            if !with_room {
+                // Of the mask's dependence on the place nothing is passed on; inside the frame there is none.
+                assert_gradients(&inputs[2..], 1e-4, |tensors| {
+                    composition(with_room).compose(&inputs[0], &inputs[1], &tensors[0])
+                });
+            }
+        }
+    }
+
+    #[test]
+    fn without_a_head_the_moved_pixels_prevail() {
+        let composition = composition(false);
+        let places = crate::nn::ops::sampling::own_places(composition.size);
+        let places = Tensor::from_vec(places.repeat(3), (3, 24, 2), &candle_core::Device::Cpu).unwrap();
+        let zeros = |last| Tensor::zeros((3, 2, 3, last), candle_core::DType::F32, places.device()).unwrap();
+        let frames = composition
+            .clone()
+            .compose(&zeros(32), &zeros(SCENE_CHANNELS), &places)
+            .unwrap();
+        let share = (1.5f32.exp() + 1.0) / (1.5f32.exp() + 2.0);
+        let first = frames.get(0).unwrap().to_vec1::<f32>().unwrap();
+        for (found, value) in first.iter().zip(&composition.frames) {
+            assert!((found - share * value).abs() < 1e-6, "{found} {value}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! The sizes of the flow network.
+
+use serde::{Deserialize, Serialize};
+
+use super::limits::in_range;
+use crate::frame::warp::CameraModel;
+use crate::nn::error::NnError;
+use crate::nn::options::Conditioning;
+
+/// Least and greatest side of a frame; both sides are multiples of the least.
+const SIDES_PX: [u32; 2] = [4, 256];
+
+/// Sizes of the flow network, and the camera that it predicts for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FlowSpec {
+    /// Sizes of the layers.
+    pub layers: FlowLayers,
+    /// The camera model, if it is known.
+    pub camera: Option<CameraModel>,
+}
+
+/// Sizes of the flow network's layers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(default, deny_unknown_fields)]
+pub struct FlowLayers {
+    /// Channels on the grid of a quarter of the sides.
+    pub channels: usize,
+    /// Channels of the encoder's first layer, on the grid of half the sides.
+    pub stem_channels: usize,
+    /// Residual blocks of the encoder.
+    pub encoder_blocks: usize,
+    /// Residual blocks of each predicted step.
+    pub decoder_blocks: usize,
+    /// Channels that go from the quarter grid to the half grid.
+    pub enlarged_channels: usize,
+    /// Channels before the head, on the half grid.
+    pub fine_channels: usize,
+    /// Units of the scene's two hidden layers.
+    pub scene_hidden: usize,
+    /// Frames that the encoder reads: the last ones of the context.
+    pub frames_read: usize,
+    /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
+    /// true frame. Only for models that take no actions.
+    pub recurrent: bool,
+}
+
+impl Default for FlowLayers {
+    fn default() -> Self {
+        Self {
+            channels: 48,
+            stem_channels: 24,
+            encoder_blocks: 2,
+            decoder_blocks: 1,
+            enlarged_channels: 12,
+            fine_channels: 16,
+            scene_hidden: 48,
+            frames_read: 3,
+            recurrent: false,
+        }
+    }
+}
+
+impl FlowSpec {
+    /// Errors: `Camera`, and those of the layers, for a model with this conditioning and frames of this width and height.
+    pub(super) fn check(&self, conditioning: Conditioning, sides_px: [u32; 2]) -> Result<(), NnError> {
+        if let Some(camera) = &self.camera {
+            camera.validate().map_err(NnError::Camera)?;
+        }
+        self.layers.check_sizes()?;
+        if self.layers.recurrent && conditioning.has_actions() {
+            return Err(NnError::RecurrentActions { conditioning });
+        }
+        let [least, most] = SIDES_PX;
+        let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);
+        let [width, height] = sides_px;
+        if fits(width) && fits(height) {
+            return Ok(());
+        }
+        Err(NnError::FrameSides {
+            width,
+            height,
+            min: least,
+            max: most,
+        })
+    }
+}
+
+impl FlowLayers {
+    /// Errors: `OutOfRange` at the first size that is out of range.
+    fn check_sizes(&self) -> Result<(), NnError> {
+        let sizes = [
+            ("flow.channels", self.channels, 1, 512),
+            ("flow.stem_channels", self.stem_channels, 1, 512),
+            ("flow.encoder_blocks", self.encoder_blocks, 0, 16),
+            ("flow.decoder_blocks", self.decoder_blocks, 0, 16),
+            ("flow.enlarged_channels", self.enlarged_channels, 1, 512),
+            ("flow.fine_channels", self.fine_channels, 1, 512),
+            ("flow.scene_hidden", self.scene_hidden, 1, 1024),
+            ("flow.frames_read", self.frames_read, 1, 256),
+        ];
+        sizes
+            .into_iter()
+            .try_for_each(|(field, size, least, most)| in_range(field, size as f64, f64::from(least), f64::from(most)))
+    }
+}
