@@ -1,6 +1,7 @@
 //! The background in front of which a standing camera sees things move.
 
-use super::{Dataset, DatasetError};
+use super::error::DatasetError;
+use super::opened::Dataset;
 
 /// Frames that the background is the median of at most, evenly spread.
 const MAX_FRAMES: usize = 1000;

@@ -1,6 +1,7 @@
 //! Checks that every data set must pass: matching lengths, finite numbers, increasing timestamps.
 
-use super::{DatasetError, DatasetInfo, EpisodeData};
+use super::error::DatasetError;
+use super::info::{DatasetInfo, EpisodeData};
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::warp::CameraModel;
 

@@ -5,9 +5,10 @@ use std::io::{self, BufWriter};
 use std::ops::Range;
 use std::path::Path;
 
-use super::super::{Dataset, DatasetError};
 use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
+use crate::dataset::error::DatasetError;
+use crate::dataset::opened::Dataset;
 use foreframe_core::types::Channel;
 
 /// The topic of the images.

@@ -8,19 +8,21 @@ use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
 use arrow_array::{Array, BinaryArray, RecordBatch, StructArray};
 use parquet::arrow::ProjectionMask;
 
-use super::check::Numbers;
-use super::frame_file::{FrameFileWriter, FrameImage};
 use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
+use super::parquet_file;
 use super::parquet_file::Batches;
 use super::shard::{EpisodeRecord, RECORDS_KEY};
-use super::{DatasetError, DatasetInfo, Episode, parquet_file};
+use crate::dataset::check::Numbers;
+use crate::dataset::error::DatasetError;
+use crate::dataset::frame_store::frame_file::{FrameFileWriter, FrameImage};
+use crate::dataset::info::{DatasetInfo, Episode};
 use foreframe_core::frame::codec;
 
 /// Rows that are read at a time, with their images.
 const IMAGE_ROWS: usize = 64;
 
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
-pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
+pub(crate) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let builder = parquet_file::open(file).map_err(|error| corrupt(path, &error))?;
     let pairs = builder.metadata().file_metadata().key_value_metadata();
@@ -32,7 +34,7 @@ pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
 }
 
 /// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
-pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
+pub(crate) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = parquet_file::open(file)
         .and_then(parquet_file::batches)
@@ -48,7 +50,7 @@ fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
 }
 
 /// Where the decoded frames of a shard go.
-pub(super) enum FrameTarget<'a> {
+pub(crate) enum FrameTarget<'a> {
     /// The memory of the shard's frames.
     Memory {
         pixels: &'a mut [u8],
@@ -61,25 +63,25 @@ pub(super) enum FrameTarget<'a> {
 }
 
 /// A shard to read, the expected number of frames, and where the frames go.
-pub(super) struct ShardSlot<'a> {
-    pub(super) path: PathBuf,
-    pub(super) frames: usize,
+pub(crate) struct ShardSlot<'a> {
+    pub(crate) path: PathBuf,
+    pub(crate) frames: usize,
     /// Its first frame, counted over the whole data set.
-    pub(super) first_frame: usize,
-    pub(super) target: FrameTarget<'a>,
+    pub(crate) first_frame: usize,
+    pub(crate) target: FrameTarget<'a>,
 }
 
 /// Actions, states and timestamps of frames.
 #[derive(Default)]
-pub(super) struct ShardNumbers {
-    pub(super) actions: Vec<f32>,
-    pub(super) states: Vec<f32>,
-    pub(super) timestamps_s: Vec<f64>,
+pub(crate) struct ShardNumbers {
+    pub(crate) actions: Vec<f32>,
+    pub(crate) states: Vec<f32>,
+    pub(crate) timestamps_s: Vec<f64>,
 }
 
 impl ShardNumbers {
     /// The numbers of a whole data set from those of its shards.
-    pub(super) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
+    pub(crate) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
         let mut all = Self {
             actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
             states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
@@ -94,7 +96,7 @@ impl ShardNumbers {
     }
 
     /// The numbers of an episode from those of its data set.
-    pub(super) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
+    pub(crate) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
         let frames = episode.frames();
         let (actions, states) = (info.action_channels.len(), info.state_channels.len());
         Numbers {
@@ -107,7 +109,7 @@ impl ShardNumbers {
 
 /// Reads a shard, a few rows at a time, and decodes its frames into the slot's target.
 /// Errors: `Io`, `Corrupt`, `CorruptFrame`, `FrameFile`.
-pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
+pub(crate) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
     let mut numbers = ShardNumbers::default();
     let mut row = 0;
     let with_images = !matches!(slot.target, FrameTarget::Nothing);
@@ -247,21 +249,21 @@ impl ImageBatch<'_> {
     }
 }
 
-pub(super) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
+pub(crate) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
     let images: &StructArray = batch.column_by_name(key)?.as_struct_opt()?;
     let bytes = images.column_by_name("bytes")?.as_binary_opt::<i32>()?;
     (bytes.null_count() == 0).then_some(bytes)
 }
 
 /// The columns of a batch. Errors name the file and the column.
-pub(super) struct Column<'a> {
-    pub(super) batch: &'a RecordBatch,
-    pub(super) path: &'a Path,
+pub(crate) struct Column<'a> {
+    pub(crate) batch: &'a RecordBatch,
+    pub(crate) path: &'a Path,
 }
 
 impl<'a> Column<'a> {
     /// The numbers of a column without null values. Errors: `Corrupt`.
-    pub(super) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
+    pub(crate) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
         self.batch
             .column_by_name(key)
             .and_then(|column| column.as_primitive_opt::<T>())
@@ -271,7 +273,7 @@ impl<'a> Column<'a> {
     }
 
     /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
-    pub(super) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
+    pub(crate) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
         match size {
             0 => return Ok(&[]),
             1 => return self.numbers::<Float32Type>(key),
@@ -306,7 +308,7 @@ impl<'a> Column<'a> {
     }
 
     /// The texts of a column; null values become none. Errors: `Corrupt`.
-    pub(super) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
+    pub(crate) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
         self.batch
             .column_by_name(key)
             .and_then(|column| column.as_string_opt::<i32>())

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use super::DatasetError;
+use crate::dataset::error::DatasetError;
 use foreframe_core::files::{self, hex, is_partial_of};
 
 /// Writes a file atomically. Creates its directory if it is missing. Errors: `Io`.
-pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory)
         .and_then(|()| files::write_atomically(path, bytes))
@@ -19,7 +19,7 @@ pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetE
 
 /// Whether a directory is missing, empty, or contains only what was left by a program that was killed while it wrote the first
 /// file, `meta/…`. Errors: `Io`.
-pub(super) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
+pub(crate) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
     if !out.exists() {
         return Ok(true);
     }
@@ -43,7 +43,7 @@ pub(super) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
 }
 
 /// The SHA-256 of a file in hexadecimal. Errors: `Io`.
-pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
+pub(crate) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
     let mut hasher = Sha256::new();
     File::open(path)
         .and_then(|mut file| io::copy(&mut file, &mut hasher))
@@ -52,7 +52,7 @@ pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
 }
 
 /// Errors: `HashDiffers` unless the file has this SHA-256 (hexadecimal).
-pub(super) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
+pub(crate) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
     let found = sha256_of_file(path)?;
     if found == expected {
         return Ok(());
