@@ -1,5 +1,7 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
 //! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
+//!
+//! The header is parsed here, not by the crate `npyz`, which allocates whatever length a header states (up to 4 GiB).
 
 use std::fs::File;
 use std::io::{BufReader, Read};

@@ -3,7 +3,7 @@
 use std::fmt::Display;
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::error::ImportError;
 use foreframe_core::frame::MAX_SIDE_PX;
@@ -28,35 +28,51 @@ pub struct ImportConfig {
 /// The default of [`ImportConfig::disk_mib`].
 pub const DEFAULT_DISK_MIB: u64 = 16 << 10;
 
-/// How a recording is read. All of it has defaults.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+/// How a recording is read. All of it has defaults. With the feature `cli`, the fields are options of `foreframe import`, whose
+/// help is what is written above them; the program sets width and height.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
 pub struct ImportOptions {
-    /// Width of the data set's frames in pixels.
+    /// Width of the data set's frames in pixels
+    #[cfg_attr(feature = "cli", arg(skip))]
     pub frame_width_px: u32,
-    /// Height of the data set's frames in pixels.
+    /// Height of the data set's frames in pixels
+    #[cfg_attr(feature = "cli", arg(skip))]
     pub frame_height_px: u32,
-    /// How images of another shape are fitted.
+    /// How images of another shape are fitted: crop, letterbox or stretch
+    #[cfg_attr(feature = "cli", arg(long, default_value = "crop"))]
     pub fit: Fit,
-    /// Frames per second of the data set. Without timestamps: of the recording. `None` keeps the recording's rate.
+    /// Frames per second: of the data set or, where the source has no times, of the recording
+    #[cfg_attr(feature = "cli", arg(long = "rate", value_name = "HZ"))]
     pub rate_hz: Option<f64>,
-    /// Keeps every Nth frame, 1 to 1,000,000; actions in between are averaged.
+    /// Keep every Nth frame, 1 to 1000000
+    // Actions in between are averaged.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N", default_value_t = 1))]
     pub every: usize,
-    /// A CSV file with one line per image.
+    /// The CSV file, if it is not the only one in the folder
+    #[cfg_attr(feature = "cli", arg(long, value_name = "FILE"))]
     pub csv: Option<PathBuf>,
-    /// The CSV column, the array, or the bag's topic, of the images; by default the usual names.
+    /// The column, input, camera, array or topic with the images [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long, value_name = "NAME"))]
     pub image: Option<String>,
-    /// The CSV column of the time in seconds (or `_ms`, `_us`, `_ns` by its name). For a bag, `header` or `log`.
+    /// The column or array with the times [default: found by name]; for a bag, `header` or `log` [default: header if near log]
+    // In seconds, unless its name ends with _ms, _us or _ns.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "NAME"))]
     pub time: Option<String>,
-    /// Names of the action's components; by default those that the source marks as actions.
+    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long = "action", value_name = "NAME"))]
     pub actions: Vec<String>,
-    /// Names of the state's components; by default those that the source marks as states.
+    /// A component of the state, or a topic as for the action; may be given many times [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long = "state", value_name = "NAME"))]
     pub states: Vec<String>,
-    /// Units as `NAME=UNIT`.
+    /// The unit of an action or state, as in speed=m/s; may be given many times
+    #[cfg_attr(feature = "cli", arg(long = "unit", value_name = "NAME=UNIT"))]
     pub units: Vec<String>,
-    /// For how long, in seconds, the last action and state of a bag hold.
+    /// For how long the last action and state of a bag hold
+    #[cfg_attr(feature = "cli", arg(long = "hold", value_name = "SECONDS", default_value_t = 1.0))]
     pub hold_s: f64,
-    /// Leaves out what is damaged, counts it and lists it, instead of stopping there.
+    /// Leave out what is damaged and list it, instead of stopping there
+    #[cfg_attr(feature = "cli", arg(long))]
     pub skip_bad: bool,
 }
 

@@ -1,5 +1,7 @@
 //! MCAP files: <https://mcap.dev/spec>. Read once from start to end, so that the index at the end is not needed and a file
 //! that was cut off can be read; then message by message at the positions found.
+//!
+//! The crate `mcap` is not used: it does not say where in the file a message lies, and decompresses with libraries in C.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
