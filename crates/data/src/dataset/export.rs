@@ -25,10 +25,8 @@ use super::store::files::write_atomically;
 use super::store::layout::{self, IMAGE, INFO, MASK, shard_location, shard_path};
 use super::store::shard::{EncodedEpisode, ShardStart, batch, schema};
 use super::store::tables::{self, EpisodeRow};
-use super::store::writer::{ShardWriter, write_json, write_tables};
+use super::store::writer::{ShardWriter, shard_ranges, write_json, write_tables};
 
-/// A shard is closed once it has so many frames. It holds whole episodes.
-const SHARD_FRAMES: usize = 2000;
 const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
 
 /// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too.
@@ -60,7 +58,7 @@ pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
         });
     }
     let (mut records, mut start) = (Vec::new(), ShardStart { episode: 0, frame: 0 });
-    for (shard, episodes) in shards(dataset).into_iter().enumerate() {
+    for (shard, episodes) in shards(dataset).enumerate() {
         let encoded = encoded(dataset, &info, episodes)?;
         let bytes = numbers(&info, start, &encoded).map_err(DatasetError::Build)?;
         write_atomically(&out.join(shard_path(shard)), &bytes)?;
@@ -92,20 +90,12 @@ pub fn to_mp4(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<()
     video::write(dataset, frames, path)
 }
 
-/// Ranges of episodes, each one shard.
-fn shards(dataset: &Dataset) -> Vec<&[Episode]> {
-    let (mut shards, mut rest) = (Vec::new(), dataset.episodes());
-    while !rest.is_empty() {
-        let mut frames = 0;
-        let until = rest.iter().position(|episode| {
-            frames += episode.frame_count;
-            frames >= SHARD_FRAMES
-        });
-        let (shard, more) = rest.split_at(until.map_or(rest.len(), |last| last + 1));
-        shards.push(shard);
-        rest = more;
-    }
-    shards
+/// The episodes of each shard.
+fn shards(dataset: &Dataset) -> impl Iterator<Item = &[Episode]> {
+    let lengths = dataset.episodes().iter().map(|episode| episode.frame_count);
+    shard_ranges(lengths)
+        .into_iter()
+        .map(|range| &dataset.episodes()[range])
 }
 
 /// The episodes with regular times.

@@ -8,10 +8,8 @@ use super::check::{check_description, check_episode};
 use super::error::DatasetError;
 use super::frame_store::{FrameStore, HeldFrames, item};
 use super::info::{DatasetInfo, Episode, EpisodeData};
-use foreframe_core::error_text::comma_separated;
 use foreframe_core::files::hex;
 use foreframe_core::frame::Frame;
-use foreframe_core::types::Channel;
 
 /// An open data set.
 #[derive(Clone, Debug, PartialEq)]
@@ -152,43 +150,5 @@ impl Dataset {
     #[must_use]
     pub fn timestamp_s(&self, frame: usize) -> f64 {
         self.timestamps_s[frame]
-    }
-
-    /// Errors: `FrameSize` unless the frames have this size.
-    pub fn require_frame_size(&self, width_px: u32, height_px: u32) -> Result<(), DatasetError> {
-        let info = &self.info;
-        if (info.frame_width_px, info.frame_height_px) == (width_px, height_px) {
-            return Ok(());
-        }
-        Err(DatasetError::FrameSize {
-            name: info.name.clone(),
-            width: info.frame_width_px,
-            height: info.frame_height_px,
-            wanted_width: width_px,
-            wanted_height: height_px,
-        })
-    }
-
-    /// Errors: `Channels` unless actions have this number of components.
-    pub fn require_action_count(&self, wanted: usize) -> Result<(), DatasetError> {
-        self.require_channels("action", &self.info.action_channels, wanted)
-    }
-
-    /// Errors: `Channels` unless states have this number of components.
-    pub fn require_state_count(&self, wanted: usize) -> Result<(), DatasetError> {
-        self.require_channels("state", &self.info.state_channels, wanted)
-    }
-
-    fn require_channels(&self, kind: &'static str, channels: &[Channel], wanted: usize) -> Result<(), DatasetError> {
-        if channels.len() == wanted {
-            return Ok(());
-        }
-        Err(DatasetError::Channels {
-            name: self.info.name.clone(),
-            kind,
-            found: channels.len(),
-            names: comma_separated(channels),
-            wanted,
-        })
     }
 }

@@ -57,10 +57,6 @@ pub(crate) fn remove_all(out: &Path) -> Result<(), DatasetError> {
 }
 
 fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetError> {
-    let corrupt = |reason: &str| DatasetError::Corrupt {
-        path: path.to_owned(),
-        reason: reason.to_owned(),
-    };
     let mut rows = Rows::default();
     for batch in &batches(path)? {
         let column = Column { batch, path };
@@ -75,7 +71,7 @@ fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetE
     }
     let records = records(path)?;
     if records.iter().map(|record| record.frames).sum::<usize>() != rows.images.len() {
-        return Err(corrupt("its records do not count its rows"));
+        return Err(DatasetError::corrupt(path, &"its records do not count its rows"));
     }
     let episodes = records.into_iter().map(|record| {
         let frames = record.frames;
@@ -102,10 +98,8 @@ struct Rows {
 }
 
 fn image_column(column: &Column<'_>, key: &str) -> Result<Vec<Vec<u8>>, DatasetError> {
-    let images = image_bytes(column.batch, key).ok_or_else(|| DatasetError::Corrupt {
-        path: column.path.to_owned(),
-        reason: format!("it has no column \"{key}\" of images"),
-    })?;
+    let missing = || DatasetError::corrupt(column.path, &format!("it has no column \"{key}\" of images"));
+    let images = image_bytes(column.batch, key).ok_or_else(missing)?;
     Ok((0..column.batch.num_rows())
         .map(|row| images.value(row).to_vec())
         .collect())

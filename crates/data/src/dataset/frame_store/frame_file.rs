@@ -247,10 +247,8 @@ impl FrameFile {
         if checksum == crc32fast::hash(&record).to_le_bytes() {
             return Ok(record);
         }
-        Err(DatasetError::Corrupt {
-            path: self.path.clone(),
-            reason: format!("frame {frame} has another checksum; delete this file, and it is written again"),
-        })
+        let reason = format!("frame {frame} has another checksum; delete this file, and it is written again");
+        Err(DatasetError::corrupt(&self.path, &reason))
     }
 
     pub(crate) fn has_masks(&self) -> bool {

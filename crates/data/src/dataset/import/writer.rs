@@ -19,13 +19,11 @@ use crate::dataset::store::arguments::lock_file;
 use crate::dataset::store::files::{is_unused, write_atomically};
 use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use crate::dataset::store::shard::EncodedEpisode;
-use crate::dataset::store::writer::ShardWriter;
+use crate::dataset::store::writer::{ShardWriter, shard_ranges};
 use foreframe_core::files::remove_partials;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::fit::fit;
 
-/// A shard is closed once it has so many frames. It holds whole episodes.
-const SHARD_FRAMES: usize = 2000;
 /// Images that are decoded in parallel.
 const CHUNK_FRAMES: usize = 256;
 /// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
@@ -164,14 +162,13 @@ impl<'a> Directory<'a> {
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
-        let shards = shards(&plan.episodes);
         let mut writer = ShardWriter::new(&self.config.out, description(self.config, plan));
         let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
         let mut done = 0;
         // Those that the source's lists have are found again by every run.
         let mut skipped = self.read_skipped()?;
         skipped.retain(|(of, _)| of.is_some());
-        for episodes in shards {
+        for episodes in shard_ranges(plan.episodes.iter().map(Vec::len)) {
             let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
             if cancelled.load(Ordering::Relaxed) {
                 return Err(ImportError::Cancelled { done, total });
@@ -247,19 +244,6 @@ fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
         camera: plan.recording.camera,
         ..DatasetInfo::default()
     }
-}
-
-/// Ranges of episodes, each one shard.
-fn shards(episodes: &[Vec<PlannedFrame>]) -> Vec<Range<usize>> {
-    let (mut shards, mut start, mut frames) = (Vec::new(), 0, 0);
-    for (index, episode) in episodes.iter().enumerate() {
-        frames += episode.len();
-        if frames >= SHARD_FRAMES || index + 1 == episodes.len() {
-            shards.push(start..index + 1);
-            (start, frames) = (index + 1, 0);
-        }
-    }
-    shards
 }
 
 /// Makes the episodes of the next shard.

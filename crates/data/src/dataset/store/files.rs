@@ -17,6 +17,24 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetE
         .map_err(DatasetError::io("write", path))
 }
 
+/// Writes a file that appears when it is whole. Creates its directory if it is missing. `write` gets the name of the file to
+/// write, which ends with `ending`. Errors: `Io`, and those of `write`.
+pub(crate) fn write_whole(
+    path: &Path,
+    ending: &str,
+    write: impl FnOnce(&Path) -> Result<(), DatasetError>,
+) -> Result<(), DatasetError> {
+    let directory = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
+    let partial = path.with_extension(ending);
+    let written = write(&partial).and_then(|()| fs::rename(&partial, path).map_err(DatasetError::io("write", path)));
+    if written.is_err() {
+        // A later run overwrites it if it stays.
+        let _ = fs::remove_file(&partial);
+    }
+    written
+}
+
 /// Whether a directory is missing, empty, or contains only what was left by a program that was killed while it wrote the first
 /// file, `meta/…`. Errors: `Io`.
 pub(crate) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {

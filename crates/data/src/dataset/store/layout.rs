@@ -125,15 +125,10 @@ impl DatasetMetadata {
 
     /// Parses and checks the text of a metadata file. Errors: `Corrupt`; they name `path`.
     pub(crate) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
-        let corrupt = |reason| DatasetError::Corrupt {
-            path: path.to_owned(),
-            reason,
-        };
-        let metadata: Self = serde_json::from_slice(text).map_err(|error| corrupt(error.to_string()))?;
+        let metadata: Self = serde_json::from_slice(text).map_err(|error| DatasetError::corrupt(path, &error))?;
         if metadata.content_hash != content_hash(&metadata.shards) {
-            return Err(corrupt(
-                "its content hash does not match the shards that it lists".to_owned(),
-            ));
+            let reason = "its content hash does not match the shards that it lists";
+            return Err(DatasetError::corrupt(path, &reason));
         }
         Ok(metadata)
     }
@@ -174,10 +169,8 @@ fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError
         return Ok(None);
     }
     let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
-    let arguments: CollectedWith = serde_json::from_slice(&text).map_err(|error| DatasetError::Corrupt {
-        path,
-        reason: error.to_string(),
-    })?;
+    let arguments: CollectedWith =
+        serde_json::from_slice(&text).map_err(|error| DatasetError::corrupt(&path, &error))?;
     Ok(arguments.world)
 }
 

@@ -24,13 +24,13 @@ const IMAGE_ROWS: usize = 64;
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
 pub(crate) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let builder = parquet_file::open(file).map_err(|error| corrupt(path, &error))?;
+    let builder = parquet_file::open(file).map_err(|error| DatasetError::corrupt(path, &error))?;
     let pairs = builder.metadata().file_metadata().key_value_metadata();
     let text = pairs
         .and_then(|pairs| pairs.iter().find(|pair| pair.key == RECORDS_KEY))
         .and_then(|pair| pair.value.as_deref())
-        .ok_or_else(|| corrupt(path, &format!("its footer has no \"{RECORDS_KEY}\"")))?;
-    serde_json::from_str(text).map_err(|error| corrupt(path, &error))
+        .ok_or_else(|| DatasetError::corrupt(path, &format!("its footer has no \"{RECORDS_KEY}\"")))?;
+    serde_json::from_str(text).map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 /// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
@@ -38,15 +38,10 @@ pub(crate) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = parquet_file::open(file)
         .and_then(parquet_file::batches)
-        .map_err(|error| corrupt(path, &error))?;
-    reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, &error))
-}
-
-fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
-    DatasetError::Corrupt {
-        path: path.to_owned(),
-        reason: reason.to_string().trim().to_owned(),
-    }
+        .map_err(|error| DatasetError::corrupt(path, &error))?;
+    reader
+        .collect::<Result<_, _>>()
+        .map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 /// Where the decoded frames of a shard go.
@@ -114,7 +109,7 @@ pub(crate) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<Shard
     let mut row = 0;
     let with_images = !matches!(slot.target, FrameTarget::Nothing);
     for batch in reader(&slot.path, with_images)? {
-        let batch = batch.map_err(|error| corrupt(&slot.path, &error))?;
+        let batch = batch.map_err(|error| DatasetError::corrupt(&slot.path, &error))?;
         if row + batch.num_rows() > slot.frames {
             return Err(wrong_rows(slot, row + batch.num_rows()));
         }
@@ -139,11 +134,11 @@ fn reader(path: &Path, with_images: bool) -> Result<Batches, DatasetError> {
         let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
         parquet_file::batches(builder.with_projection(columns))
     });
-    built.map_err(|error| corrupt(path, &error))
+    built.map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
-    corrupt(
+    DatasetError::corrupt(
         &slot.path,
         &format!("it has {found} or more rows; its metadata states {}", slot.frames),
     )
@@ -200,7 +195,7 @@ fn read_batch(
     let first = (slot.first_frame + row) as i64;
     let indexes = column.numbers::<Int64Type>(INDEX)?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(corrupt(
+        return Err(DatasetError::corrupt(
             &slot.path,
             &"its column \"index\" does not number the frames one after another",
         ));
@@ -225,7 +220,7 @@ impl ImageBatch<'_> {
         mut take: impl FnMut(usize, &[u8]) -> Result<(), DatasetError>,
     ) -> Result<(), DatasetError> {
         let images = image_bytes(self.batch, key)
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
         let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
         for index in 0..images.len() {
             let row = self.row + index;
@@ -241,7 +236,7 @@ impl ImageBatch<'_> {
                     frame.width(),
                     frame.height()
                 );
-                return Err(corrupt(self.path, &reason));
+                return Err(DatasetError::corrupt(self.path, &reason));
             }
             take(row, frame.pixels())?;
         }
@@ -269,7 +264,7 @@ impl<'a> Column<'a> {
             .and_then(|column| column.as_primitive_opt::<T>())
             .filter(|column| column.null_count() == 0)
             .map(|column| &column.values()[..])
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
     }
 
     /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
@@ -284,13 +279,13 @@ impl<'a> Column<'a> {
             .column_by_name(key)
             .and_then(|column| column.as_fixed_size_list_opt())
             .filter(|list| list.null_count() == 0)
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
         if list.value_length() as usize != size {
             let reason = format!(
                 "column \"{key}\" has {} components; the metadata states {size}",
                 list.value_length()
             );
-            return Err(corrupt(self.path, &reason));
+            return Err(DatasetError::corrupt(self.path, &reason));
         }
         let values = list.values().as_primitive_opt::<Float32Type>();
         // A slice of a list array still refers to all values. Select those of its rows.
@@ -300,7 +295,7 @@ impl<'a> Column<'a> {
             .filter(|values| values.null_count() == 0)
             .and_then(|values| values.values().get(rows))
             .ok_or_else(|| {
-                corrupt(
+                DatasetError::corrupt(
                     self.path,
                     &format!("column \"{key}\" does not contain 32-bit floating-point numbers"),
                 )
@@ -313,6 +308,6 @@ impl<'a> Column<'a> {
             .column_by_name(key)
             .and_then(|column| column.as_string_opt::<i32>())
             .map(|column| column.iter().collect())
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of text")))
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of text")))
     }
 }

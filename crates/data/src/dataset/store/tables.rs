@@ -242,10 +242,7 @@ fn write(columns: Vec<(String, ArrayRef)>, metadata: &[(&str, String)]) -> Resul
 
 /// Reads the table of episodes. Errors: `Io`, `Corrupt`.
 pub(crate) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
-    let corrupt = |reason: String| DatasetError::Corrupt {
-        path: path.to_owned(),
-        reason,
-    };
+    let corrupt = |reason: String| DatasetError::corrupt(path, &reason);
     let mut episodes = Vec::with_capacity(info.episode_count);
     let mut first_frame = 0;
     for batch in &batches(path)? {

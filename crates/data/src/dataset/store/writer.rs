@@ -1,5 +1,6 @@
 //! Writes the shards of a data set in order, and the tables and metadata that complete it.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use parquet::errors::ParquetError;
@@ -12,6 +13,9 @@ use super::tables::{self, EpisodeRow};
 use crate::dataset::error::DatasetError;
 use crate::dataset::info::DatasetInfo;
 use foreframe_core::files::sha256_hex;
+
+/// A shard is closed once it has so many frames. It holds whole episodes.
+const SHARD_FRAMES: usize = 2000;
 
 /// A data set that is being written. Its finished shards are the first ones, without gaps.
 pub(crate) struct ShardWriter {
@@ -124,6 +128,19 @@ impl ShardWriter {
         write_json(&directory.join(INFO), &layout::lerobot_info(&info))?;
         Ok(info)
     }
+}
+
+/// Divides episodes of these lengths among shards.
+pub(crate) fn shard_ranges(lengths: impl ExactSizeIterator<Item = usize>) -> Vec<Range<usize>> {
+    let (mut shards, mut start, mut frames, count) = (Vec::new(), 0, 0, lengths.len());
+    for (end, length) in (1..).zip(lengths) {
+        frames += length;
+        if frames >= SHARD_FRAMES || end == count {
+            shards.push(start..end);
+            (start, frames) = (end, 0);
+        }
+    }
+    shards
 }
 
 /// Writes the tables of episodes (made by `episodes`), tasks and statistics. Returns the bytes of the first.
