@@ -1,7 +1,6 @@
 //! The background in front of which a standing camera sees things move.
 
-use super::error::DatasetError;
-use super::opened::Dataset;
+use super::{Dataset, DatasetError};
 
 /// Frames that the background is the median of at most, evenly spread.
 const MAX_FRAMES: usize = 1000;

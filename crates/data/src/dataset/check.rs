@@ -1,7 +1,6 @@
 //! Checks that every data set must pass: matching lengths, finite numbers, increasing timestamps.
 
-use super::error::DatasetError;
-use super::info::{DatasetInfo, EpisodeData};
+use super::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::warp::CameraModel;
 

@@ -17,9 +17,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use self::collection::Collection;
 pub use self::collection::CollectionStatus;
 pub use self::config::{CollectConfig, CollectProgress, DEFAULT_TRIALS_PER_SHARD};
-use super::error::DatasetError;
-use super::info::{DatasetInfo, EpisodeData};
 use super::store::shard::EncodedEpisode;
+use super::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_sim::{Observation, SimError, World, action_channels};
 
 /// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished

@@ -18,14 +18,12 @@ use parquet::errors::ParquetError;
 use serde_json::{Value, json};
 
 pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
-use super::error::DatasetError;
-use super::info::{DatasetInfo, Episode, EpisodeData};
-use super::opened::Dataset;
 use super::store::files::write_atomically;
 use super::store::layout::{self, IMAGE, INFO, MASK, shard_location, shard_path};
 use super::store::shard::{EncodedEpisode, ShardStart, batch, schema};
 use super::store::tables::{self, EpisodeRow};
 use super::store::writer::{ShardWriter, shard_ranges, write_json, write_tables};
+use super::{Dataset, DatasetError, DatasetInfo, Episode, EpisodeData};
 
 const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
 

@@ -6,8 +6,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use self::frame_file::{FrameFile, FrameImage};
-use super::error::DatasetError;
-use super::info::DatasetInfo;
+use super::{DatasetError, DatasetInfo};
 
 /// Frames in memory, one after another.
 #[derive(Clone, Debug, Default, PartialEq)]

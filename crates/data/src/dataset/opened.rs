@@ -5,9 +5,8 @@ use std::borrow::Cow;
 use sha2::{Digest, Sha256};
 
 use super::check::{check_description, check_episode};
-use super::error::DatasetError;
 use super::frame_store::{FrameStore, HeldFrames, item};
-use super::info::{DatasetInfo, Episode, EpisodeData};
+use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
 use foreframe_core::files::hex;
 use foreframe_core::frame::Frame;
 

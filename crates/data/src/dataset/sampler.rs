@@ -6,8 +6,7 @@ use std::ops::Range;
 use rand::Rng;
 use rand::seq::index;
 
-use super::error::DatasetError;
-use super::opened::Dataset;
+use super::{Dataset, DatasetError};
 use foreframe_core::types::Seed;
 use foreframe_sim::TrialParameters;
 

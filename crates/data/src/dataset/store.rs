@@ -22,11 +22,9 @@ use self::layout::{DatasetMetadata, EPISODES, ShardEntry};
 use self::shard_reader::{FrameTarget, ShardNumbers, ShardSlot, read};
 use self::tables::read_episodes;
 use super::check::check_numbers;
-use super::error::DatasetError;
 use super::frame_store::frame_file::{FrameFile, FrameFilePlace};
 use super::frame_store::{FrameStore, HeldFrames};
-use super::info::DatasetInfo;
-use super::opened::Dataset;
+use super::{Dataset, DatasetError, DatasetInfo};
 
 impl Dataset {
     /// Reads a complete data set into memory and verifies the hash of every file.

@@ -6,12 +6,11 @@ use serde::Serialize;
 
 use super::config::CollectConfig;
 use super::unfinished;
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
 use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
 use crate::dataset::store::layout::{DatasetMetadata, INFO, shard_path};
 use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::ShardWriter;
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::types::Seed;
 use foreframe_sim::{Scenario, WorldConfig, action_channels, state_channels};
 

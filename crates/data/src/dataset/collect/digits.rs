@@ -7,8 +7,7 @@ use std::path::{Path, PathBuf};
 use flate2::read::MultiGzDecoder;
 use sha2::{Digest, Sha256};
 
-use crate::dataset::error::DatasetError;
-use crate::dataset::sampler::Split;
+use crate::dataset::{DatasetError, Split};
 use foreframe_core::files::{files_below, hex};
 use foreframe_core::frame::codec;
 use foreframe_sim::moving_digits::{DIGIT_PIXELS, DIGIT_SIDE_PX};

@@ -15,13 +15,11 @@ use serde::Serialize;
 
 use super::config::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
 use super::digits::DigitPools;
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::{DatasetInfo, EpisodeData};
-use crate::dataset::sampler::Split;
 use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
 use crate::dataset::store::layout::{DatasetMetadata, INFO};
 use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::ShardWriter;
+use crate::dataset::{DatasetError, DatasetInfo, EpisodeData, Split};
 use foreframe_core::types::Seed;
 use foreframe_sim::moving_digits::{DIGITS_FRAME_SIDE_PX, moving_digits};
 

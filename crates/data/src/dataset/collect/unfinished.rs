@@ -4,12 +4,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
 use crate::dataset::store::files;
 use crate::dataset::store::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
 use crate::dataset::store::shard::{EncodedEpisode, ShardStart, build};
 use crate::dataset::store::shard_reader::{Column, batches, image_bytes, records};
+use crate::dataset::{DatasetError, DatasetInfo};
 
 /// Their directory in the data set's.
 const DIRECTORY: &str = "unfinished";

@@ -7,9 +7,8 @@ use std::path::Path;
 
 use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
-use crate::dataset::error::DatasetError;
-use crate::dataset::opened::Dataset;
 use crate::dataset::store::files::write_whole;
+use crate::dataset::{Dataset, DatasetError};
 use foreframe_core::types::Channel;
 
 /// The topic of the images.

@@ -5,10 +5,9 @@ use std::ops::Range;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use crate::dataset::error::DatasetError;
-use crate::dataset::opened::Dataset;
 use crate::dataset::program::{ProgramError, spawn};
 use crate::dataset::store::files::write_whole;
+use crate::dataset::{Dataset, DatasetError};
 
 /// Writes frames, counted over the whole data set, as an MP4 file; one frame takes the data set's frame period.
 /// Errors: `Program`, `Io`.

@@ -11,8 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::{PositionedFile, is_partial, open_lock, partial_path};
 
 /// The directory in a data set's directory. Backups leave out hidden directories.

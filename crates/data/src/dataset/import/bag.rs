@@ -27,10 +27,9 @@ use self::mcap::McapFile;
 use self::messages::RosType;
 #[cfg(feature = "databases")]
 use self::sqlite::SqliteFile;
-use super::error::ImportError;
 use super::files::{extension, stem};
-use super::options::ImportOptions;
 use super::recording::{ImageSource, Recording, WantedImage};
+use super::{ImportError, ImportOptions};
 use foreframe_core::frame::{Frame, codec};
 
 /// Whether a source is a bag: a file, or a directory of rosbag2.

@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 
-use super::error::ImportError;
 use super::files::{folder_name, inside, open_file, read_text};
 use super::image_files::ImageFiles;
-use super::options::ImportOptions;
 use super::recording::{Record, Recording};
 use super::skipped::{SkippedList, listed, shortened};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 const MANIFEST: &str = "manifest.json";

@@ -3,12 +3,11 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use super::error::ImportError;
 use super::files::{entries, extension, inside, open_file, stem};
 use super::image_files::ImageFiles;
-use super::options::ImportOptions;
 use super::recording::{Record, Recording, seconds_per_unit};
 use super::skipped::{SkippedList, listed};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 /// Names of the column with the image's file, if none is given.

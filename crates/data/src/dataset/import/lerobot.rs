@@ -13,12 +13,11 @@ use self::description::{Component, Description, INFO};
 use self::episodes::{EpisodeEntry, VideoPart};
 use self::images::ImageTable;
 use self::rows::{Row, read_rows};
-use super::error::ImportError;
 use super::files::folder_name;
-use super::options::ImportOptions;
 use super::recording::{ImageSource, Record, Recording};
 use super::skipped::SkippedList;
 use super::video::{ListedFrames, VideoFrames, frames_of};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 /// Whether a directory holds a data set of `LeRobot`.

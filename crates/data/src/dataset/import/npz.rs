@@ -10,12 +10,11 @@ use zip::read::ZipFile;
 use zip::result::ZipError;
 use zip::{CompressionMethod, ZipArchive};
 
-use super::error::ImportError;
 use super::files::{open_file, stem};
 use super::numpy::{ArrayHeader, FrameLayout, FramePosition};
-use super::options::{ImportConfig, ImportOptions};
 use super::recording::{Record, Recording, seconds_per_unit};
 use super::skipped::listed;
+use super::{ImportConfig, ImportError, ImportOptions};
 use foreframe_core::files::partial_path;
 use foreframe_core::types::Channel;
 

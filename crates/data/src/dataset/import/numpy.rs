@@ -8,11 +8,10 @@ use std::io::{BufReader, Read};
 use std::path::Path;
 use std::sync::Mutex;
 
-use super::error::ImportError;
 use super::files::{open_file, stem};
-use super::options::ImportOptions;
 use super::raw_images::{PixelType, RawImages};
 use super::recording::{Record, Recording};
+use super::{ImportError, ImportOptions};
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// A header is a short Python dictionary.

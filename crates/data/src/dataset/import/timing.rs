@@ -7,10 +7,8 @@
 
 use std::ops::RangeInclusive;
 
-use super::error::ImportError;
-use super::options::ImportOptions;
 use super::recording::{Record, Recording};
-use super::skipped::SkippedItem;
+use super::{ImportError, ImportOptions, SkippedItem};
 
 /// A jump of time by more than this many median periods ends an episode.
 const GAP_PERIODS: f64 = 3.0;

@@ -8,11 +8,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::error::ImportError;
 use super::files::stem;
-use super::options::ImportOptions;
 use super::recording::{FitImage, ImageSource, Record, Recording, WantedImage};
 use super::skipped::SkippedList;
+use super::{ImportError, ImportOptions};
 use crate::dataset::program::{ProgramError, ProgramOutput};
 use foreframe_core::frame::{Frame, MAX_SIDE_PX};
 

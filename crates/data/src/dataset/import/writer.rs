@@ -9,11 +9,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::error::ImportError;
-use super::options::{ImportConfig, ImportOptions};
 use super::recording::{Record, Recording, WantedImage};
 use super::skipped::{MAX_ITEMS, SkippedItem};
 use super::timing::{ImportPlan, PlannedFrame};
+use super::{ImportConfig, ImportError, ImportOptions};
 use crate::dataset::info::{DatasetInfo, EpisodeData};
 use crate::dataset::store::arguments::lock_file;
 use crate::dataset::store::files::{is_unused, write_atomically};

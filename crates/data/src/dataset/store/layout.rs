@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::{Channel, Seed};

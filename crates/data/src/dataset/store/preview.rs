@@ -6,9 +6,7 @@ use super::files::verify;
 use super::layout::{DatasetMetadata, EPISODES};
 use super::shard_reader::{FrameTarget, ShardSlot, read};
 use super::tables::read_episodes;
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
-use crate::dataset::opened::Dataset;
+use crate::dataset::{Dataset, DatasetError, DatasetInfo};
 use foreframe_core::frame::Frame;
 
 /// The description of the finished data set in a directory, without reading its frames.

@@ -19,8 +19,7 @@ use serde::{Deserialize, Serialize};
 use super::layout::{ACTION, COUNTERS, IMAGE, MASK, STATE, TIMESTAMP, huggingface_features};
 use super::stats::ChannelStats;
 use crate::dataset::check::check_episode;
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::{DatasetInfo, EpisodeData};
+use crate::dataset::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_core::frame::{Frame, codec};
 
 /// Key of the episode records in a shard's footer.

@@ -13,9 +13,8 @@ use super::parquet_file;
 use super::parquet_file::Batches;
 use super::shard::{EpisodeRecord, RECORDS_KEY};
 use crate::dataset::check::Numbers;
-use crate::dataset::error::DatasetError;
 use crate::dataset::frame_store::frame_file::{FrameFileWriter, FrameImage};
-use crate::dataset::info::{DatasetInfo, Episode};
+use crate::dataset::{DatasetError, DatasetInfo, Episode};
 use foreframe_core::frame::codec;
 
 /// Rows that are read at a time, with their images.

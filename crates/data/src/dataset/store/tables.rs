@@ -18,8 +18,7 @@ use super::layout::{COUNTERS, IMAGE, MASK, shard_location};
 use super::shard::EpisodeRecord;
 use super::shard_reader::{Column, batches};
 use super::stats::ChannelStats;
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::{DatasetInfo, Episode};
+use crate::dataset::{DatasetError, DatasetInfo, Episode};
 use foreframe_sim::TrialParameters;
 
 /// One row of the table of episodes: the record, the shard and the first frame.

@@ -10,8 +10,7 @@ use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, Shar
 use super::shard::{EncodedEpisode, EpisodeRecord, ShardStart, build};
 use super::shard_reader::records;
 use super::tables::{self, EpisodeRow};
-use crate::dataset::error::DatasetError;
-use crate::dataset::info::DatasetInfo;
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::sha256_hex;
 
 /// A shard is closed once it has so many frames. It holds whole episodes.

@@ -2,9 +2,8 @@
 
 use super::index::{BagIndex, Content, Topic, ValueStream};
 use super::messages::{Projection, RosType};
-use crate::dataset::import::error::ImportError;
-use crate::dataset::import::options::ImportOptions;
 use crate::dataset::import::skipped::listed;
+use crate::dataset::import::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 /// In place of a topic: none at all.

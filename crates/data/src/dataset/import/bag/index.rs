@@ -6,9 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
-use crate::dataset::import::error::ImportError;
-use crate::dataset::import::options::ImportOptions;
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
+use crate::dataset::import::{ImportError, ImportOptions};
 
 /// The maximum number of topics that can be imported, and of others.
 const MAX_TOPICS: usize = 4096;

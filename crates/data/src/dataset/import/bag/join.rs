@@ -7,10 +7,9 @@
 
 use super::choice::{ChosenTopics, ChosenValues};
 use super::index::{BagIndex, Content, ImageEntry, MessageTime, ValueStream};
-use crate::dataset::import::error::ImportError;
-use crate::dataset::import::options::ImportOptions;
 use crate::dataset::import::recording::Record;
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
+use crate::dataset::import::{ImportError, ImportOptions};
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
 const SAME_CLOCK_NS: i64 = 1_000_000_000;

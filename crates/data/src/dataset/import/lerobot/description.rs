@@ -6,10 +6,9 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::dataset::import::error::ImportError;
 use crate::dataset::import::files::read_file;
-use crate::dataset::import::options::ImportOptions;
 use crate::dataset::import::skipped::listed;
+use crate::dataset::import::{ImportError, ImportOptions};
 
 /// The description, which every data set of `LeRobot` has.
 pub(super) const INFO: &str = "meta/info.json";
