@@ -10,7 +10,6 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
 use crate::dataset::{DatasetInfo, is_finished};
-use crate::frame::fit::Fit;
 use crate::registry::is_valid_name;
 
 /// How many left-out items are printed.
@@ -45,39 +44,8 @@ pub(super) struct ImportArgs {
     /// Width and height of the frames in pixels, as in 64x64
     #[arg(long, value_name = "WxH", default_value = "64x64", value_parser = size)]
     size: (u32, u32),
-    /// How images of another shape are fitted: crop, letterbox or stretch
-    #[arg(long, default_value = "crop")]
-    fit: Fit,
-    /// Frames per second: of the data set or, where the source has no times, of the recording
-    #[arg(long, value_name = "HZ")]
-    rate: Option<f64>,
-    /// Keep every Nth frame, 1 to 1000000
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    every: usize,
-    /// The CSV file, if it is not the only one in the folder
-    #[arg(long, value_name = "FILE")]
-    csv: Option<PathBuf>,
-    /// The column, input, camera, array or topic with the images [default: found by name or type]
-    #[arg(long, value_name = "NAME")]
-    image: Option<String>,
-    /// The column or array with the times [default: found by name]; for a bag, `header` or `log` [default: header if near log]
-    #[arg(long, value_name = "NAME")]
-    time: Option<String>,
-    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times [default: found by name or type]
-    #[arg(long = "action", value_name = "NAME")]
-    actions: Vec<String>,
-    /// A component of the state, or a topic as for the action; may be given many times [default: found by name or type]
-    #[arg(long = "state", value_name = "NAME")]
-    states: Vec<String>,
-    /// The unit of an action or state, as in speed=m/s; may be given many times
-    #[arg(long = "unit", value_name = "NAME=UNIT")]
-    units: Vec<String>,
-    /// For how long the last action and state of a bag hold
-    #[arg(long, value_name = "SECONDS", default_value_t = 1.0)]
-    hold: f64,
-    /// Leave out what is damaged and list it, instead of stopping there
-    #[arg(long)]
-    skip_bad: bool,
+    #[command(flatten)]
+    options: ImportOptions,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -102,17 +70,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         options: ImportOptions {
             frame_width_px: args.size.0,
             frame_height_px: args.size.1,
-            fit: args.fit,
-            rate_hz: args.rate,
-            every: args.every,
-            csv: args.csv,
-            image: args.image,
-            time: args.time,
-            actions: args.actions,
-            states: args.states,
-            units: args.units,
-            hold_s: args.hold,
-            skip_bad: args.skip_bad,
+            ..args.options
         },
         disk_mib: workspace.import_disk_mib(),
     };

@@ -224,16 +224,3 @@ fn timestamps_that_do_not_increase_are_refused() {
     let error = Dataset::from_episodes(info(), vec![data]).unwrap_err();
     assert!(matches!(error, DatasetError::TimeOrder { episode: 0, frame: 2 }));
 }
-
-#[test]
-fn a_shape_mismatch_names_both_shapes() {
-    let dataset = recorded(&[12], &[]);
-    assert_eq!(
-        dataset.require_frame_size(64, 64).unwrap_err().to_string(),
-        "the data set \"made-up\" has frames of 1×1 px; 64×64 px are needed"
-    );
-    assert_eq!(
-        dataset.require_action_count(2).unwrap_err().to_string(),
-        "the data set \"made-up\" has actions of 1 components (linear m/s); 2 are needed"
-    );
-}

@@ -4,8 +4,7 @@
 
 use std::f32::consts::PI;
 
-use super::PlanarPose;
-use super::robot::wrap;
+use super::robot::{PlanarPose, wrap};
 
 /// From the wall behind Tb1 to the opposite wall (x starts at 0), in metres.
 pub const LENGTH_M: f32 = 5.0;

@@ -9,9 +9,12 @@ use rapier3d::parry::query::{Ray, RayCast};
 use rapier3d::parry::shape::Cuboid;
 use rapier3d::prelude::Vector;
 
+use super::arena;
+use super::config::{Look, WorldConfig};
+use super::error::SimError;
 use super::ray_cast::UprightCylinder;
 use super::rendered_robot::{NearestHit, RenderedRobot, RobotView, face};
-use super::{Look, PlanarPose, SimError, WorldConfig, arena};
+use super::robot::PlanarPose;
 use foreframe_core::frame::Frame;
 
 /// A pixel at an edge is the mean of a square grid of rays with this many rays on each side.

@@ -7,7 +7,8 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::{PlanarPose, appearance, arena};
+use super::robot::PlanarPose;
+use super::{appearance, arena};
 
 /// Highest speed of the driver, in m/s.
 pub(super) const CRUISE_M_S: f32 = 0.5;

@@ -1,6 +1,9 @@
 //! The Gymnasium interface of a [`World`]: `reset` starts an episode, `step` acts in it.
 
-use super::{Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
+use super::config::WorldConfig;
+use super::error::SimError;
+use super::scenario::{Scenario, TrialParameters};
+use super::world::{Observation, StepResult, World};
 use foreframe_core::types::{Action, Seed};
 
 /// An environment for one scenario. It runs one trial after another.

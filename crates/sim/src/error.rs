@@ -1,6 +1,5 @@
 //! Errors of the simulator.
 
-use super::scenario;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::frame::{FrameError, MAX_SIDE_PX};
 use foreframe_core::types::ValueError;
@@ -10,10 +9,12 @@ use foreframe_core::types::ValueError;
 #[non_exhaustive]
 pub enum SimError {
     /// No scenario has this name.
-    #[error("there is no scenario \"{name}\"; there are {}", scenario::names())]
+    #[error("there is no scenario \"{name}\"; there are {known}")]
     UnknownScenario {
         /// The name given.
         name: String,
+        /// The names of all scenarios.
+        known: String,
     },
     /// No look has this name.
     #[error("there is no look \"{name}\"; there are gray and bright")]

@@ -5,8 +5,9 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::pid::Pid;
+use super::robot::PlanarPose;
 use super::scenario::Route;
-use super::{PlanarPose, arena, robot};
+use super::{arena, robot};
 
 /// A robot has reached its goal at this distance, in metres.
 pub(super) const ARRIVAL_M: f32 = 0.1;

@@ -10,8 +10,8 @@ use rapier3d::prelude::{
     ColliderBuilder, ColliderHandle, LockedAxes, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
-use super::robot::{DifferentialDrive, WHEEL_BASE_M, mean_velocity};
-use super::{PlanarPose, arena};
+use super::arena;
+use super::robot::{DifferentialDrive, PlanarPose, WHEEL_BASE_M, mean_velocity};
 
 /// Height of the centers of all colliders, in metres.
 const PLANE_M: f32 = 0.2;

@@ -4,8 +4,8 @@ use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
 use rapier3d::parry::shape::FeatureId;
 use rapier3d::prelude::Vector;
 
-use super::PlanarPose;
 use super::appearance::{RobotAppearance, Solid};
+use super::robot::PlanarPose;
 
 /// The nearest point that a ray hits, of all solids tested so far.
 pub(super) struct NearestHit {

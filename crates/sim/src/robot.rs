@@ -1,8 +1,8 @@
-//! A Kobuki base: two driven wheels with limits, and wheel odometry.
+//! A robot's pose and its Kobuki base: two driven wheels with limits, and wheel odometry.
 
 use std::f32::consts::{PI, TAU};
 
-use super::PlanarPose;
+use serde::{Deserialize, Serialize};
 
 /// Radius of a driven wheel, in metres.
 pub const WHEEL_RADIUS_M: f32 = 0.035;
@@ -14,6 +14,19 @@ pub const MAX_LINEAR_M_S: f32 = 0.7;
 pub const MAX_ANGULAR_RAD_S: f32 = 110.0 * PI / 180.0;
 /// Highest acceleration of a wheel's rim, in m/s².
 pub const MAX_RIM_ACCELERATION_M_S2: f32 = 1.2;
+
+/// Position and heading of a robot on the floor.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct PlanarPose {
+    /// Metres ahead of the arena's back wall.
+    pub x_m: f32,
+    /// Metres to the left of the arena's middle line.
+    pub y_m: f32,
+    /// Counter-clockwise from x, in radians.
+    pub heading_rad: f32,
+}
 
 /// The wheels of one robot: target speeds, current speeds and odometry.
 #[derive(Clone, Debug)]

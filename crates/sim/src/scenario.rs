@@ -10,8 +10,10 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::config::in_range;
+use super::error::SimError;
 use super::pid::Gains;
-use super::{PlanarPose, SimError, arena, robot};
+use super::robot::PlanarPose;
+use super::{arena, robot};
 use foreframe_core::types::Seed;
 
 /// (start, goal) pairs of Tb2 that are never used for training. Their routes cross routes of the other pairs.
@@ -59,11 +61,6 @@ impl Scenario {
     }
 }
 
-/// Names of all scenarios, separated by commas, for messages.
-pub(super) fn names() -> String {
-    Scenario::ALL.map(Scenario::name).join(", ")
-}
-
 impl fmt::Display for Scenario {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(self.name())
@@ -75,7 +72,10 @@ impl FromStr for Scenario {
 
     fn from_str(name: &str) -> Result<Self, SimError> {
         let found = Self::ALL.into_iter().find(|scenario| scenario.name() == name);
-        found.ok_or_else(|| SimError::UnknownScenario { name: name.to_owned() })
+        found.ok_or_else(|| SimError::UnknownScenario {
+            name: name.to_owned(),
+            known: Self::ALL.map(Self::name).join(", "),
+        })
     }
 }
 

@@ -4,95 +4,22 @@
 //! atomically. If the collection is stopped, the finished trials of the other shards are saved beside them. The finished
 //! data set depends only on seed and trial numbers, not on threads or interruptions.
 
+mod collection;
+mod config;
+mod digits;
+pub mod moving_mnist;
+mod unfinished;
+
 use std::collections::BTreeMap;
-use std::ops::Range;
-use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use super::collection::{Collection, CollectionStatus};
-use super::shard::EncodedEpisode;
+use self::collection::Collection;
+pub use self::collection::CollectionStatus;
+pub use self::config::{CollectConfig, CollectProgress, DEFAULT_TRIALS_PER_SHARD};
+use super::store::shard::EncodedEpisode;
 use super::{DatasetError, DatasetInfo, EpisodeData};
-use foreframe_core::types::Seed;
-use foreframe_sim::{Observation, Scenario, SimError, World, WorldConfig, action_channels};
-
-/// Default number of trials in a shard.
-pub const DEFAULT_TRIALS_PER_SHARD: u64 = 50;
-
-/// Settings of a collection.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CollectConfig {
-    /// The scenario.
-    pub scenario: Scenario,
-    /// Number of trials. Trials are numbered from 0.
-    pub trials: u64,
-    /// The seed from which the seed of every trial is derived.
-    pub seed: Seed,
-    /// The data set's directory.
-    pub out: PathBuf,
-    /// Settings of the simulated world.
-    pub world: WorldConfig,
-    /// Number of simulation threads; 0 for the number of cores.
-    pub threads: usize,
-    /// Number of trials in a shard.
-    pub trials_per_shard: u64,
-}
-
-impl CollectConfig {
-    /// A collection of this many trials of a scenario, with default values for all other settings.
-    #[must_use]
-    pub fn new(scenario: Scenario, trials: u64, seed: Seed, out: &Path) -> Self {
-        Self {
-            scenario,
-            trials,
-            seed,
-            out: out.to_owned(),
-            world: WorldConfig::default(),
-            threads: 0,
-            trials_per_shard: DEFAULT_TRIALS_PER_SHARD,
-        }
-    }
-
-    /// Checks the settings. Errors: `Zero`, `World`.
-    pub fn validate(&self) -> Result<(), DatasetError> {
-        for (what, value) in [
-            ("the number of trials", self.trials),
-            ("the number of trials in a shard", self.trials_per_shard),
-        ] {
-            if value == 0 {
-                return Err(DatasetError::Zero { what });
-            }
-        }
-        self.world.validate().map_err(DatasetError::World)
-    }
-
-    /// Number of shards.
-    pub(super) fn shard_count(&self) -> usize {
-        self.trials.div_ceil(self.trials_per_shard) as usize
-    }
-
-    /// The trials of a shard.
-    pub(super) fn shard_trials(&self, shard: usize) -> Range<u64> {
-        let first = shard as u64 * self.trials_per_shard;
-        first..(first + self.trials_per_shard).min(self.trials)
-    }
-
-    fn thread_count(&self) -> usize {
-        match self.threads {
-            0 => std::thread::available_parallelism().map_or(1, usize::from),
-            threads => threads,
-        }
-    }
-}
-
-/// How far a collection is, in trials.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CollectProgress {
-    /// Simulated trials, including those found on disk when the collection was resumed.
-    pub done: u64,
-    /// Requested trials.
-    pub total: u64,
-}
+use foreframe_sim::{Observation, SimError, World, action_channels};
 
 /// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished
 /// ([`CollectionStatus::of`] tells). Several threads call `on_progress`.

@@ -62,34 +62,6 @@ pub enum DatasetError {
     /// The description of the data set is invalid.
     #[error("{0}")]
     Description(String),
-    /// The frames have another size than the user of the data set needs.
-    #[error("the data set \"{name}\" has frames of {width}×{height} px; {wanted_width}×{wanted_height} px are needed")]
-    FrameSize {
-        /// The data set's name.
-        name: String,
-        /// Width in pixels.
-        width: u32,
-        /// Height in pixels.
-        height: u32,
-        /// Width needed.
-        wanted_width: u32,
-        /// Height needed.
-        wanted_height: u32,
-    },
-    /// The actions or states have another number of components than the user of the data set needs.
-    #[error("the data set \"{name}\" has {kind}s of {found} components ({names}); {wanted} are needed")]
-    Channels {
-        /// The data set's name.
-        name: String,
-        /// `action` or `state`.
-        kind: &'static str,
-        /// Components found.
-        found: usize,
-        /// Their names and units.
-        names: String,
-        /// Components needed.
-        wanted: usize,
-    },
     /// A count that must be at least 1 is 0.
     #[error("{what} is 0; it must be at least 1")]
     Zero {
@@ -324,9 +296,7 @@ impl HasErrorKind for DatasetError {
             Self::Unknown { .. } | Self::NotADataset { .. } | Self::NoEpisode { .. } => ErrorKind::NotFound,
             Self::Zero { .. }
             | Self::OtherTool { .. }
-            | Self::FrameSize { .. }
             | Self::OddFrames { .. }
-            | Self::Channels { .. }
             | Self::WindowTooLong { .. }
             | Self::TooFewWindows { .. } => ErrorKind::Usage,
             Self::OutExists { .. } | Self::OtherArguments { .. } | Self::Unfinished { .. } => ErrorKind::Conflict,
@@ -357,5 +327,13 @@ impl DatasetError {
     pub fn io(action: &'static str, path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
+    }
+
+    /// Makes a [`DatasetError::Corrupt`] of this file.
+    pub(crate) fn corrupt(path: &std::path::Path, reason: &impl ToString) -> Self {
+        Self::Corrupt {
+            path: path.to_owned(),
+            reason: reason.to_string().trim().to_owned(),
+        }
     }
 }

@@ -18,16 +18,13 @@ use parquet::errors::ParquetError;
 use serde_json::{Value, json};
 
 pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
-use super::files::write_atomically;
-use super::layout::{self, EPISODES, IMAGE, INFO, MASK, STATS, TASKS, shard_location, shard_path};
-use super::shard::{EncodedEpisode, ShardStart, batch, build, schema};
-use super::store::{FinishedShard, complete, write_json};
-use super::tables::{self, EpisodeRow};
+use super::store::files::write_atomically;
+use super::store::layout::{self, IMAGE, INFO, MASK, shard_location, shard_path};
+use super::store::shard::{EncodedEpisode, ShardStart, batch, schema};
+use super::store::tables::{self, EpisodeRow};
+use super::store::writer::{ShardWriter, shard_ranges, write_json, write_tables};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, EpisodeData};
-use foreframe_core::files::sha256_hex;
 
-/// A shard is closed once it has so many frames. It holds whole episodes.
-const SHARD_FRAMES: usize = 2000;
 const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
 
 /// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too.
@@ -37,18 +34,12 @@ pub fn to_lerobot_images(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
         content_hash: String::new(),
         ..dataset.info().clone()
     };
-    let (mut finished, mut start) = (Vec::new(), ShardStart { episode: 0, frame: 0 });
+    let mut writer = ShardWriter::new(out, info);
     for episodes in shards(dataset) {
-        let encoded = encoded(dataset, &info, episodes)?;
-        let built = build(&info, start, &encoded)?;
-        write_atomically(&out.join(shard_path(finished.len())), &built.bytes)?;
-        start = after(start, &encoded);
-        finished.push(FinishedShard {
-            sha256: sha256_hex(&built.bytes),
-            records: encoded.into_iter().map(|episode| episode.record).collect(),
-        });
+        let encoded = encoded(dataset, writer.info(), episodes)?;
+        writer.write(&encoded)?;
     }
-    complete(out, info, &finished).map(drop)
+    writer.complete().map(drop)
 }
 
 /// Writes an empty directory as a `LeRobot` data set of version 3 with its frames as H.264 videos, without masks.
@@ -65,7 +56,7 @@ pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
         });
     }
     let (mut records, mut start) = (Vec::new(), ShardStart { episode: 0, frame: 0 });
-    for (shard, episodes) in shards(dataset).into_iter().enumerate() {
+    for (shard, episodes) in shards(dataset).enumerate() {
         let encoded = encoded(dataset, &info, episodes)?;
         let bytes = numbers(&info, start, &encoded).map_err(DatasetError::Build)?;
         write_atomically(&out.join(shard_path(shard)), &bytes)?;
@@ -77,26 +68,18 @@ pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
         records.extend(encoded.into_iter().map(|episode| (shard, episode.record)));
     }
     let mut first_frame = 0;
-    let row = |(shard, record)| {
-        let row = EpisodeRow {
+    let mut rows = Vec::new();
+    for (shard, record) in &records {
+        rows.push(EpisodeRow {
             record,
-            shard,
+            shard: *shard,
             first_frame,
-        };
-        first_frame += row.record.frames;
-        row
-    };
-    let rows: Vec<EpisodeRow<'_>> = records
-        .iter()
-        .map(|(shard, record)| (*shard, record))
-        .map(row)
-        .collect();
-    let task = info.scenario.clone().unwrap_or_else(|| info.name.clone());
-    let table = tables::episodes_with_videos(&rows, &task, info.frame_period_s).map_err(DatasetError::Build)?;
-    write_atomically(&out.join(EPISODES), &table)?;
-    let table = tables::tasks(&task).map_err(DatasetError::Build)?;
-    write_atomically(&out.join(TASKS), &table)?;
-    write_json(&out.join(STATS), &tables::stats_json(&rows))?;
+        });
+        first_frame += record.frames;
+    }
+    write_tables(out, &info, &rows, |rows, task| {
+        tables::episodes_with_videos(rows, task, info.frame_period_s)
+    })?;
     write_json(&out.join(INFO), &video_info(&info))
 }
 
@@ -105,20 +88,12 @@ pub fn to_mp4(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<()
     video::write(dataset, frames, path)
 }
 
-/// Ranges of episodes, each one shard.
-fn shards(dataset: &Dataset) -> Vec<&[Episode]> {
-    let (mut shards, mut rest) = (Vec::new(), dataset.episodes());
-    while !rest.is_empty() {
-        let mut frames = 0;
-        let until = rest.iter().position(|episode| {
-            frames += episode.frame_count;
-            frames >= SHARD_FRAMES
-        });
-        let (shard, more) = rest.split_at(until.map_or(rest.len(), |last| last + 1));
-        shards.push(shard);
-        rest = more;
-    }
-    shards
+/// The episodes of each shard.
+fn shards(dataset: &Dataset) -> impl Iterator<Item = &[Episode]> {
+    let lengths = dataset.episodes().iter().map(|episode| episode.frame_count);
+    shard_ranges(lengths)
+        .into_iter()
+        .map(|range| &dataset.episodes()[range])
 }
 
 /// The episodes with regular times.

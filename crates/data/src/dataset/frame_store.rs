@@ -1,9 +1,11 @@
 //! The frames of an open data set: all in memory, or in a file of decoded frames.
 
+pub(super) mod frame_file;
+
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use super::frame_file::{FrameFile, FrameImage};
+use self::frame_file::{FrameFile, FrameImage};
 use super::{DatasetError, DatasetInfo};
 
 /// Frames in memory, one after another.
@@ -35,7 +37,7 @@ impl FrameStore {
     /// The intensities of a frame of `size` pixels. Panics if there is no such frame. Errors: `Io`, `Corrupt`.
     pub(super) fn pixels(&self, frame: usize, size: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
         Ok(match self {
-            Self::Memory(held) => Cow::Borrowed(super::item(&held.pixels, frame, size)),
+            Self::Memory(held) => Cow::Borrowed(item(&held.pixels, frame, size)),
             Self::File(file) => Cow::Owned(file.read(FrameImage::Pixels, frame)?),
         })
     }
@@ -45,7 +47,7 @@ impl FrameStore {
         Ok(match self {
             Self::Memory(held) => {
                 let masks = held.masks.as_deref();
-                masks.map(|masks| Cow::Borrowed(super::item(masks, frame, size)))
+                masks.map(|masks| Cow::Borrowed(item(masks, frame, size)))
             }
             Self::File(file) if file.has_masks() => Some(Cow::Owned(file.read(FrameImage::Mask, frame)?)),
             Self::File(_) => None,
@@ -59,4 +61,9 @@ impl FrameStore {
             Self::File(_) => 0,
         }
     }
+}
+
+/// Item `index` of those of equal size that lie one after another.
+pub(super) fn item<T>(all: &[T], index: usize, size: usize) -> &[T] {
+    &all[index * size..(index + 1) * size]
 }

@@ -6,8 +6,9 @@ use std::ops::Range;
 use rand::Rng;
 use rand::seq::index;
 
-use super::{Dataset, DatasetError, TrialParameters, Window};
+use super::{Dataset, DatasetError};
 use foreframe_core::types::Seed;
+use foreframe_sim::TrialParameters;
 
 /// A time step longer than this many median periods is a gap. No window crosses a gap.
 const GAP_PERIODS: f64 = 3.0;
@@ -75,6 +76,15 @@ impl WindowShape {
     pub fn frames(self) -> usize {
         self.context + self.horizon
     }
+}
+
+/// `context + horizon` consecutive frames of one episode: the context, then the frames to predict.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Window {
+    /// Position in [`Dataset::episodes`].
+    pub episode: usize,
+    /// The first context frame, counted over the whole data set.
+    pub first_frame: usize,
 }
 
 /// Consecutive frames of one episode that belong to one split and contain no gap.

@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::Histogram;
 use super::charts::number;
+use super::histogram::Histogram;
 use crate::dataset::Dataset;
 use foreframe_core::types::Channel;
 

@@ -2,7 +2,8 @@
 
 use std::fmt::Write as _;
 
-use super::{Histogram, LagCorrelation};
+use super::delays::LagCorrelation;
+use super::histogram::Histogram;
 
 const WIDTH: f64 = 320.0;
 const HEIGHT: f64 = 84.0;

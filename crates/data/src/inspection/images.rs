@@ -3,8 +3,9 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::histogram::median;
+use super::places::{FramePlace, counted, listed};
 use super::timing::FrameTiming;
-use super::{FramePlace, counted, listed, median};
 use crate::dataset::{Dataset, DatasetError};
 
 /// Pixels that differ by at most so many gray levels count as equal.

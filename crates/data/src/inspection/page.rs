@@ -5,8 +5,11 @@ use std::fmt::Write as _;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
+use super::channels::ChannelSummary;
 use super::charts::{self, Mark, number};
-use super::{ActionDelay, ChannelSummary, FramePlace, Inspection, counted};
+use super::delays::ActionDelay;
+use super::findings::Inspection;
+use super::places::{FramePlace, counted};
 use crate::dataset::{Dataset, DatasetError};
 use foreframe_core::frame::codec;
 

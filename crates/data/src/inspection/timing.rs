@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use super::{FramePlace, Histogram, counted, listed, median};
+use super::histogram::{Histogram, median};
+use super::places::{FramePlace, counted, listed};
 use crate::dataset::Dataset;
 
 /// A step longer than this many median steps is a gap.

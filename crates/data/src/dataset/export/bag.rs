@@ -5,9 +5,10 @@ use std::io::{self, BufWriter};
 use std::ops::Range;
 use std::path::Path;
 
-use super::super::{Dataset, DatasetError};
 use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
+use crate::dataset::store::files::write_whole;
+use crate::dataset::{Dataset, DatasetError};
 use foreframe_core::types::Channel;
 
 /// The topic of the images.
@@ -37,24 +38,13 @@ const REGION: &str = "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32
 /// Writes episodes, as ranges of frames counted over the whole data set, as one MCAP file, which `foreframe import` and ROS 2
 /// read. Frame k of an episode is at k times the frame period. Errors: `Io`.
 pub fn to_mcap(dataset: &Dataset, episodes: &[Range<usize>], path: &Path) -> Result<(), DatasetError> {
-    let directory = path.parent().unwrap_or(Path::new("."));
-    std::fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
-    // The file appears when it is whole.
-    let partial = path.with_extension("partial.mcap");
     let failed = |error| DatasetError::io("write", path)(error);
-    let written = File::create(&partial).map_err(failed).and_then(|file| {
-        let mut out = BufWriter::new(file);
+    write_whole(path, "partial.mcap", |partial| {
+        let mut out = BufWriter::new(File::create(partial).map_err(failed)?);
         write(dataset, episodes, McapWriter::new(&mut out).map_err(failed)?, &failed)?;
         let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
-        file.sync_all()
-            .and_then(|()| std::fs::rename(&partial, path))
-            .map_err(failed)
-    });
-    if written.is_err() {
-        // A later run overwrites it if it stays.
-        let _ = std::fs::remove_file(&partial);
-    }
-    written
+        file.sync_all().map_err(failed)
+    })
 }
 
 /// `failed` says what a failed write of the file means.

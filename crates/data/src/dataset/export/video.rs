@@ -5,23 +5,16 @@ use std::ops::Range;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use super::super::program::{ProgramError, spawn};
-use super::super::{Dataset, DatasetError};
+use crate::dataset::program::{ProgramError, spawn};
+use crate::dataset::store::files::write_whole;
+use crate::dataset::{Dataset, DatasetError};
 
 /// Writes frames, counted over the whole data set, as an MP4 file; one frame takes the data set's frame period.
 /// Errors: `Program`, `Io`.
 pub(super) fn write(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<(), DatasetError> {
-    let directory = path.parent().unwrap_or(Path::new("."));
-    std::fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
-    // The file appears when it is whole.
-    let partial = path.with_extension("partial.mp4");
-    let encoded = start(dataset, &partial).and_then(|encoder| encode(dataset, frames, encoder));
-    let finished = encoded.and_then(|()| std::fs::rename(&partial, path).map_err(DatasetError::io("write", path)));
-    if finished.is_err() {
-        // A later run overwrites it if it stays.
-        let _ = std::fs::remove_file(&partial);
-    }
-    finished
+    write_whole(path, "partial.mp4", |partial| {
+        encode(dataset, frames, start(dataset, partial)?)
+    })
 }
 
 fn start(dataset: &Dataset, path: &Path) -> Result<Child, DatasetError> {

@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 
-use super::images::inside;
-use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, SkippedList, listed, open_file, read_text, shortened};
+use super::files::{folder_name, inside, open_file, read_text};
+use super::image_files::ImageFiles;
+use super::recording::{Record, Recording};
+use super::skipped::{SkippedList, listed, shortened};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 const MANIFEST: &str = "manifest.json";
@@ -123,20 +125,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
     };
     // `user/angle` becomes `angle`.
     let channel = |name: &String| Channel::new(name.rsplit('/').next().unwrap_or(name), &options.unit(name));
-    let mut recording = Recording {
-        name: tub
-            .canonicalize()
-            .ok()
-            .and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()))
-            .unwrap_or_else(|| "tub".to_owned()),
-        action_channels: reader.actions.iter().map(channel).collect(),
-        state_channels: reader.states.iter().map(channel).collect(),
-        camera: None,
-        records: Vec::new(),
-        images: Images::Files(Vec::new()),
-        skipped: SkippedList::default(),
-    };
-    let mut paths = Vec::new();
+    let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
         let file = open_file(&path)?;
@@ -150,21 +139,22 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
             match parsed {
                 Ok((index, _, _)) if manifest.deleted.contains(&index) => {}
                 Ok((_, image, record)) => {
-                    recording.records.push(Record {
+                    records.push(Record {
                         image: paths.len(),
                         ..record
                     });
                     paths.push(image);
                 }
-                Err(error) => match error.skippable().filter(|_| options.skip_bad) {
-                    Some(item) => recording.skipped.push(item),
-                    None => return Err(error),
-                },
+                Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
             }
         }
     }
-    recording.images = Images::Files(paths);
-    Ok(recording)
+    Ok(Recording {
+        action_channels: reader.actions.iter().map(channel).collect(),
+        state_channels: reader.states.iter().map(channel).collect(),
+        skipped,
+        ..Recording::of_images(folder_name(tub, "tub"), records, ImageFiles(paths))
+    })
 }
 
 /// The next line, or why it cannot be read; `None` at the end.
@@ -221,8 +211,8 @@ impl Reader<'_> {
                 .to_owned(),
             action: numbers(&self.actions)?,
             state: numbers(&self.states)?,
-            image: 0,
             place: place.to_owned(),
+            ..Record::default()
         };
         Ok((index, inside(&self.tub.join("images"), image, place)?, record))
     }

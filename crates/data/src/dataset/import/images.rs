@@ -3,9 +3,11 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use super::recording::{Images, Record, Recording};
-use super::{ImportError, ImportOptions, SkippedList, extension, listed, open_file};
-use foreframe_core::files::natural_order;
+use super::files::{entries, extension, inside, open_file, stem};
+use super::image_files::ImageFiles;
+use super::recording::{Record, Recording, seconds_per_unit};
+use super::skipped::{SkippedList, listed};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 /// Names of the column with the image's file, if none is given.
@@ -54,23 +56,6 @@ fn csv_file(folder: &Path, options: &ImportOptions) -> Result<Option<PathBuf>, I
     }
 }
 
-pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
-    let entries = std::fs::read_dir(folder).and_then(Iterator::collect::<Result<Vec<_>, _>>);
-    let mut paths: Vec<PathBuf> = entries
-        .map_err(ImportError::io("read", folder))?
-        .iter()
-        .map(std::fs::DirEntry::path)
-        .collect();
-    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    paths.sort_by(|a, b| natural_order(&name(a), &name(b)));
-    Ok(paths)
-}
-
-fn name_of(path: &Path) -> String {
-    path.file_stem()
-        .map_or_else(|| "recording".to_owned(), |name| name.to_string_lossy().into_owned())
-}
-
 fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     let mut paths = entries(folder)?;
     paths.retain(|path| ["png", "jpg", "jpeg"].contains(&extension(path).as_str()));
@@ -85,21 +70,13 @@ fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, Impo
     };
     let record = |(index, path): (usize, &PathBuf)| Record {
         timestamp_s: index as f64 / rate,
-        session: String::new(),
-        action: Vec::new(),
-        state: Vec::new(),
         image: index,
         place: path.display().to_string(),
+        ..Record::default()
     };
-    Ok(Recording {
-        name: name_of(folder),
-        action_channels: Vec::new(),
-        state_channels: Vec::new(),
-        camera: None,
-        records: paths.iter().enumerate().map(record).collect(),
-        images: Images::Files(paths),
-        skipped: SkippedList::default(),
-    })
+    let records = paths.iter().enumerate().map(record).collect();
+    let name = stem(folder, "recording");
+    Ok(Recording::of_images(name, records, ImageFiles(paths)))
 }
 
 /// The columns that are used, by position.
@@ -113,16 +90,7 @@ struct Columns {
 fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     let (mut reader, header) = reader(csv, options)?;
     let columns = Columns::find(&header, csv, options)?;
-    let mut recording = Recording {
-        name: name_of(folder),
-        action_channels: channels(&header, &columns.actions, options),
-        state_channels: channels(&header, &columns.states, options),
-        camera: None,
-        records: Vec::new(),
-        images: Images::Files(Vec::new()),
-        skipped: SkippedList::default(),
-    };
-    let mut paths = Vec::new();
+    let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
     let mut lines = reader.records();
     let mut row = 0;
     while let Some(line) = lines.next() {
@@ -134,21 +102,22 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
             .and_then(|line| columns.record(&line, row, &place, folder, options));
         match parsed {
             Ok((path, record)) => {
-                recording.records.push(Record {
+                records.push(Record {
                     image: paths.len(),
                     ..record
                 });
                 paths.push(path);
             }
-            Err(error) => match error.skippable().filter(|_| options.skip_bad) {
-                Some(item) => recording.skipped.push(item),
-                None => return Err(error),
-            },
+            Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
         }
         row += 1;
     }
-    recording.images = Images::Files(paths);
-    Ok(recording)
+    Ok(Recording {
+        action_channels: channels(&header, &columns.actions, options),
+        state_channels: channels(&header, &columns.states, options),
+        skipped,
+        ..Recording::of_images(stem(folder, "recording"), records, ImageFiles(paths))
+    })
 }
 
 /// A CSV file after its header, and the header. Its columns are separated by what gives the images' column, or else the
@@ -284,21 +253,15 @@ impl Columns {
                 columns()
             )));
         }
-        let (mut actions, mut states) = (
-            wanted(&options.actions, "--action")?,
-            wanted(&options.states, "--state")?,
-        );
-        if options.actions.is_empty() {
-            actions = prefixed("action");
-        }
-        if options.states.is_empty() {
-            states = prefixed("state");
-        }
+        let chosen = |names: &[String], prefix: &str| match names {
+            [] => Ok(prefixed(prefix)),
+            names => wanted(names, &format!("--{prefix}")),
+        };
         Ok(Self {
             file,
             time,
-            actions,
-            states,
+            actions: chosen(&options.actions, "action")?,
+            states: chosen(&options.states, "state")?,
         })
     }
 
@@ -339,43 +302,13 @@ impl Columns {
         };
         let record = Record {
             timestamp_s,
-            session: String::new(),
             action: numbers(&self.actions)?,
             state: numbers(&self.states)?,
-            image: 0,
             place: place.to_owned(),
+            ..Record::default()
         };
         Ok((inside(folder, text(self.file), place)?, record))
     }
-}
-
-/// Seconds per unit of a time column, by its name's ending.
-pub(super) fn seconds_per_unit(name: &str) -> f64 {
-    let unit = |ending: &str| name.ends_with(ending);
-    match () {
-        () if unit("_ms") => 1e-3,
-        () if unit("_us") => 1e-6,
-        () if unit("_ns") => 1e-9,
-        () => 1.0,
-    }
-}
-
-/// A file of the folder. Errors: `Record` if the name leads out of it.
-pub(super) fn inside(folder: &Path, name: &str, place: &str) -> Result<PathBuf, ImportError> {
-    let relative = Path::new(name);
-    let is_inside = relative
-        .components()
-        .all(|part| matches!(part, std::path::Component::Normal(_) | std::path::Component::CurDir));
-    if name.is_empty() || !is_inside {
-        return Err(ImportError::record(
-            place,
-            format!(
-                "the image's name is {name:?}; it must be a file below {}",
-                folder.display()
-            ),
-        ));
-    }
-    Ok(folder.join(relative))
 }
 
 #[cfg(test)]
@@ -387,14 +320,5 @@ mod tests {
         assert_eq!(name_and_unit("speed [m/s]"), ("speed", "m/s"));
         assert_eq!(name_and_unit("turn (rad/s)"), ("turn", "rad/s"));
         assert_eq!(name_and_unit("throttle"), ("throttle", ""));
-    }
-
-    #[test]
-    fn image_names_cannot_leave_the_folder() {
-        let folder = Path::new("tub");
-        assert!(inside(folder, "images/1.png", "").is_ok());
-        for name in ["../1.png", "/etc/passwd", "", "a/../../b"] {
-            assert!(inside(folder, name, "").is_err(), "{name}");
-        }
     }
 }

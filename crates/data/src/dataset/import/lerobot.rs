@@ -1,6 +1,7 @@
 //! `LeRobot` data sets, versions 2 and 3, as their own tools write them: Parquet tables with numbers and images, or videos.
 
 mod description;
+mod episodes;
 mod images;
 mod rows;
 
@@ -8,16 +9,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use self::description::{Description, EpisodeEntry, VideoPart};
-pub(super) use self::images::ImageTable;
+use self::description::{Component, Description, INFO};
+use self::episodes::{EpisodeEntry, VideoPart};
+use self::images::ImageTable;
 use self::rows::{Row, read_rows};
-use super::recording::{Images, Record, Recording};
+use super::files::folder_name;
+use super::recording::{ImageSource, Record, Recording};
+use super::skipped::SkippedList;
 use super::video::{ListedFrames, VideoFrames, frames_of};
-use super::{ImportError, ImportOptions, SkippedList};
+use super::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
-
-/// The description, which every data set of `LeRobot` has.
-const INFO: &str = "meta/info.json";
 
 /// Whether a directory holds a data set of `LeRobot`.
 pub(super) fn is_lerobot(source: &Path) -> bool {
@@ -32,7 +33,7 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
     let states = description.components(&options.states, "observation.state", "--state")?;
     let columns: Vec<_> = actions.iter().chain(&states).cloned().collect();
     let episodes = description.episodes(&image)?;
-    let mut reader = RecordCollector {
+    let mut reader = EpisodeReader {
         source,
         skip_bad: options.skip_bad,
         is_video: image.is_video,
@@ -51,18 +52,14 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
         reader.take(tables.len(), &rows, of_table)?;
         tables.push(path);
     }
-    let channel = |component: &description::Component| Channel::new(&component.name, &options.unit(&component.name));
-    let images = if image.is_video {
-        Images::Videos(VideoFrames::new(reader.videos.paths(), reader.places))
+    let channel = |component: &Component| Channel::new(&component.name, &options.unit(&component.name));
+    let images: Box<dyn ImageSource> = if image.is_video {
+        Box::new(VideoFrames::new(reader.videos.paths(), reader.places))
     } else {
-        Images::Table(ImageTable::new(source, &image.name, tables, reader.places))
+        Box::new(ImageTable::new(source, &image.name, tables, reader.places))
     };
     Ok(Recording {
-        name: source
-            .canonicalize()
-            .ok()
-            .and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()))
-            .unwrap_or_else(|| "lerobot".to_owned()),
+        name: folder_name(source, "lerobot"),
         action_channels: actions.iter().map(channel).collect(),
         state_channels: states.iter().map(channel).collect(),
         camera: None,
@@ -132,7 +129,7 @@ impl VideoTimes {
 }
 
 /// Collects the records of all tables.
-struct RecordCollector<'a> {
+struct EpisodeReader<'a> {
     source: &'a Path,
     skip_bad: bool,
     is_video: bool,
@@ -145,7 +142,7 @@ struct RecordCollector<'a> {
     cancelled: &'a AtomicBool,
 }
 
-impl RecordCollector<'_> {
+impl EpisodeReader<'_> {
     /// Takes the episodes of a table.
     fn take(&mut self, table: usize, rows: &[Row], episodes: &[EpisodeEntry]) -> Result<(), ImportError> {
         let mut by_episode: BTreeMap<usize, Vec<(usize, &Row)>> = BTreeMap::new();
@@ -233,12 +230,6 @@ impl RecordCollector<'_> {
 
     /// Lists what is damaged, if it may be left out.
     fn leave_out(&mut self, error: ImportError) -> Result<(), ImportError> {
-        match error.skippable().filter(|_| self.skip_bad) {
-            Some(item) => {
-                self.skipped.push(item);
-                Ok(())
-            }
-            None => Err(error),
-        }
+        error.leave_out(self.skip_bad, &mut self.skipped)
     }
 }

@@ -4,15 +4,17 @@
 use std::fs::File;
 use std::io::{Read, Write as _};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use zip::read::ZipFile;
 use zip::result::ZipError;
 use zip::{CompressionMethod, ZipArchive};
 
-use super::numpy::{ArrayHeader, FrameLayout};
-use super::recording::{Images, RawImages, Record, Recording};
-use super::{ImportConfig, ImportError, ImportOptions, SkippedList, listed, open_file};
+use super::files::{open_file, stem};
+use super::numpy::{ArrayHeader, FrameLayout, FramePosition};
+use super::recording::{Record, Recording, seconds_per_unit};
+use super::skipped::listed;
+use super::{ImportConfig, ImportError, ImportOptions};
 use foreframe_core::files::partial_path;
 use foreframe_core::types::Channel;
 
@@ -56,42 +58,22 @@ pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Reco
     let (actions, action_names) = read(&options.actions, &ACTIONS, "--action")?;
     let (states, state_names) = read(&options.states, &STATES, "--state")?;
     let times = npz.times(options, &layout)?;
+    let place = npz.place(&frames);
     let mut records = Vec::new();
-    let mut order = Vec::new();
-    for sequence in 0..layout.sequences {
-        for frame in 0..layout.frames {
-            let at = layout.position(sequence, frame);
-            let of = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.at(at)).collect();
-            records.push(Record {
-                timestamp_s: times.at(at, frame),
-                session: sequence.to_string(),
-                action: of(&actions),
-                state: of(&states),
-                image: order.len(),
-                place: format!("{} sequence {sequence} frame {frame}", npz.place(&frames)),
-            });
-            order.push(at as u64);
-        }
+    for at in layout.positions() {
+        let of = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.at(at.index)).collect();
+        records.push(Record {
+            action: of(&actions),
+            state: of(&states),
+            ..at.record(records.len(), times.at(&at), &place)
+        });
     }
     let (pixels, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
-    let frame_bytes = layout.frame_bytes();
+    let images = layout.images(&pixels, file, start);
     Ok(Recording {
-        name: path
-            .file_stem()
-            .map_or_else(|| "array".to_owned(), |name| name.to_string_lossy().into_owned()),
         action_channels: channels(&action_names, &actions, options),
         state_channels: channels(&state_names, &states, options),
-        camera: None,
-        records,
-        images: Images::Raw(RawImages {
-            file: Mutex::new(file),
-            path: pixels,
-            width_px: layout.width as u32,
-            height_px: layout.height as u32,
-            offsets: order.iter().map(|at| start + at * frame_bytes).collect(),
-            pixel: layout.pixel,
-        }),
-        skipped: SkippedList::default(),
+        ..Recording::of_images(stem(path, "array"), records, images)
     })
 }
 
@@ -117,10 +99,10 @@ enum FrameTimes {
 }
 
 impl FrameTimes {
-    fn at(&self, position: usize, frame: usize) -> f64 {
+    fn at(&self, at: &FramePosition) -> f64 {
         match self {
-            Self::Array(rows, unit_s) => rows.values[position] * unit_s,
-            Self::Rate(rate) => frame as f64 / rate,
+            Self::Array(rows, unit_s) => rows.values[at.index] * unit_s,
+            Self::Rate(rate) => at.frame as f64 / rate,
         }
     }
 }
@@ -207,19 +189,23 @@ impl Npz {
         Ok(if given.is_empty() { found } else { given.to_vec() })
     }
 
+    /// An array's file in the archive. Errors: `Record`.
+    fn entry(&mut self, name: &str) -> Result<ZipFile<'_, File>, ImportError> {
+        let place = self.place(name);
+        let entry = self.archive.by_name(&format!("{name}.npy"));
+        entry.map_err(|error| ImportError::record(place, error.to_string()))
+    }
+
     /// Reads an array's beginning. Errors: `Record`, `Io`.
     fn header(&mut self, name: &str) -> Result<ArrayHeader, ImportError> {
         let place = self.place(name);
-        let entry = self.archive.by_name(&format!("{name}.npy"));
-        let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
-        ArrayHeader::read(entry, &place)
+        ArrayHeader::read(self.entry(name)?, &place)
     }
 
     /// Checks that the archive can hold an array of this shape. Errors: `Record`.
     fn check_size(&mut self, name: &str, header: &ArrayHeader) -> Result<(), ImportError> {
         let place = self.place(name);
-        let entry = self.archive.by_name(&format!("{name}.npy"));
-        let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
+        let entry = self.entry(name)?;
         let needed = header.data_offset.saturating_add(header.bytes());
         // What the archive states can be wrong as well.
         let found = entry
@@ -239,8 +225,7 @@ impl Npz {
     fn rows(&mut self, name: &str, layout: &FrameLayout) -> Result<ArrayRows, ImportError> {
         let place = self.place(name);
         let wrong = |reason: String| ImportError::record(&place, reason);
-        let entry = self.archive.by_name(&format!("{name}.npy"));
-        let mut entry = entry.map_err(|error| wrong(error.to_string()))?;
+        let mut entry = self.entry(name)?;
         let header = ArrayHeader::read(&mut entry, &place)?;
         let Some(rest) = header.shape.strip_prefix(layout.leading.as_slice()) else {
             return Err(wrong(format!(
@@ -281,7 +266,7 @@ impl Npz {
             (Some(name), _) if !self.has(name) => {
                 return Err(self.missing(&format!("array \"{name}\""), "--time"));
             }
-            (Some(name), _) => (name.clone(), super::images::seconds_per_unit(name)),
+            (Some(name), _) => (name.clone(), seconds_per_unit(name)),
             (None, Some((name, unit_s))) => ((*name).to_owned(), *unit_s),
             (None, None) => {
                 let rate = options.rate_hz.map(FrameTimes::Rate);
@@ -306,15 +291,14 @@ impl Npz {
         config: &ImportConfig,
         cancelled: &AtomicBool,
     ) -> Result<(PathBuf, File, u64), ImportError> {
-        let place = self.place(name);
-        let entry = self.archive.by_name(&format!("{name}.npy"));
-        let entry = entry.map_err(|error| ImportError::record(&place, error.to_string()))?;
+        let (path, place) = (self.path.clone(), self.place(name));
+        let entry = self.entry(name)?;
         let needed = header.data_offset.saturating_add(header.bytes());
         if entry.compression() == CompressionMethod::Stored
             && let Some(start) = entry.data_start()
         {
-            let file = File::open(&self.path).map_err(ImportError::io("read", &self.path))?;
-            return Ok((self.path.clone(), file, start + header.data_offset));
+            let file = File::open(&path).map_err(ImportError::io("read", &path))?;
+            return Ok((path, file, start + header.data_offset));
         }
         let needed_mib = needed.div_ceil(1 << 20);
         if needed_mib > config.disk_mib {

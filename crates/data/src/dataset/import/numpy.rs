@@ -1,12 +1,17 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
 //! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
+//!
+//! The header is parsed here, not by the crate `npyz`, which allocates whatever length a header states (up to 4 GiB).
 
+use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 use std::sync::Mutex;
 
-use super::recording::{Images, PixelType, RawImages, Record, Recording};
-use super::{ImportError, ImportOptions, SkippedList, open_file};
+use super::files::{open_file, stem};
+use super::raw_images::{PixelType, RawImages};
+use super::recording::{Record, Recording};
+use super::{ImportError, ImportOptions};
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// A header is a short Python dictionary.
@@ -71,47 +76,19 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
             format!("the file ends here; its shape {:?} needs {needed} bytes", header.shape),
         ));
     }
-    let (mut records, mut offsets) = (Vec::new(), Vec::new());
-    for sequence in 0..layout.sequences {
-        for frame in 0..layout.frames {
-            records.push(Record {
-                timestamp_s: frame as f64 / rate,
-                session: sequence.to_string(),
-                action: Vec::new(),
-                state: Vec::new(),
-                image: offsets.len(),
-                place: format!("{place} sequence {sequence} frame {frame}"),
-            });
-            offsets.push(header.data_offset + layout.position(sequence, frame) as u64 * layout.frame_bytes());
-        }
-    }
-    Ok(Recording {
-        name: path
-            .file_stem()
-            .map_or_else(|| "array".to_owned(), |name| name.to_string_lossy().into_owned()),
-        action_channels: Vec::new(),
-        state_channels: Vec::new(),
-        camera: None,
-        records,
-        images: Images::Raw(RawImages {
-            path: path.to_owned(),
-            file: Mutex::new(file),
-            width_px: layout.width as u32,
-            height_px: layout.height as u32,
-            offsets,
-            pixel: layout.pixel,
-        }),
-        skipped: SkippedList::default(),
-    })
+    let record = |(image, at): (usize, FramePosition)| at.record(image, at.frame as f64 / rate, &place);
+    let records = layout.positions().enumerate().map(record).collect();
+    let images = layout.images(path, file, header.data_offset);
+    Ok(Recording::of_images(stem(path, "array"), records, images))
 }
 
 /// Which sides of the array are sequences, time, rows and columns.
 pub(super) struct FrameLayout {
     pub(super) sequences: usize,
     pub(super) frames: usize,
-    pub(super) height: usize,
-    pub(super) width: usize,
-    pub(super) pixel: PixelType,
+    height: usize,
+    width: usize,
+    pixel: PixelType,
     time_first: bool,
     /// The sides before the rows.
     pub(super) leading: Vec<usize>,
@@ -171,16 +148,58 @@ impl FrameLayout {
         })
     }
 
-    pub(super) fn frame_bytes(&self) -> u64 {
-        (self.height * self.width * self.pixel.bytes()) as u64
+    /// Every frame, sequence by sequence.
+    pub(super) fn positions(&self) -> impl Iterator<Item = FramePosition> {
+        let of = |sequence| (0..self.frames).map(move |frame| (sequence, frame));
+        (0..self.sequences).flat_map(of).map(|(sequence, frame)| FramePosition {
+            sequence,
+            frame,
+            index: self.index(sequence, frame),
+        })
     }
 
-    /// The frame's position in the file, in frames.
-    pub(super) fn position(&self, sequence: usize, frame: usize) -> usize {
+    /// The frame's position in the array, in frames.
+    fn index(&self, sequence: usize, frame: usize) -> usize {
         if self.time_first {
             frame * self.sequences + sequence
         } else {
             sequence * self.frames + frame
+        }
+    }
+
+    /// The frames of a file whose values begin at `data_offset`, in the order of [`Self::positions`].
+    pub(super) fn images(&self, path: &Path, file: File, data_offset: u64) -> RawImages {
+        let frame_bytes = (self.height * self.width * self.pixel.bytes()) as u64;
+        let offset = |at: FramePosition| data_offset + at.index as u64 * frame_bytes;
+        RawImages {
+            path: path.to_owned(),
+            file: Mutex::new(file),
+            width_px: self.width as u32,
+            height_px: self.height as u32,
+            offsets: self.positions().map(offset).collect(),
+            pixel: self.pixel,
+        }
+    }
+}
+
+/// A frame of an array.
+pub(super) struct FramePosition {
+    pub(super) sequence: usize,
+    pub(super) frame: usize,
+    /// Its position in the array, in frames.
+    pub(super) index: usize,
+}
+
+impl FramePosition {
+    /// Its record without action and state.
+    pub(super) fn record(&self, image: usize, timestamp_s: f64, place: &str) -> Record {
+        let (sequence, frame) = (self.sequence, self.frame);
+        Record {
+            timestamp_s,
+            session: sequence.to_string(),
+            image,
+            place: format!("{place} sequence {sequence} frame {frame}"),
+            ..Record::default()
         }
     }
 }
@@ -293,7 +312,7 @@ mod tests {
         );
         let layout = FrameLayout::of(&header, "a.npy").unwrap();
         assert_eq!((layout.sequences, layout.frames), (10000, 20));
-        assert_eq!(layout.position(3, 2), 2 * 10000 + 3);
+        assert_eq!(layout.index(3, 2), 2 * 10000 + 3);
         let header = read("{'descr': '|u1', 'fortran_order': False, 'shape': (9, 48, 64, 3), }").unwrap();
         let layout = FrameLayout::of(&header, "a.npy").unwrap();
         assert_eq!((layout.frames, layout.width, layout.pixel), (9, 64, PixelType::Rgb8));

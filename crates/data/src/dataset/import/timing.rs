@@ -137,10 +137,7 @@ fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Re
                 record.timestamp_s, last.timestamp_s
             ),
         );
-        match error.skippable().filter(|_| options.skip_bad) {
-            Some(item) => recording.skipped.push(item),
-            None => return Err(error),
-        }
+        error.leave_out(options.skip_bad, &mut recording.skipped)?;
     }
     recording.records = kept;
     Ok(())
@@ -241,28 +238,22 @@ fn mean_action(records: &[Record]) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::SkippedList;
-    use super::super::recording::Images;
+    use super::super::image_files::ImageFiles;
     use super::*;
     use foreframe_core::types::Channel;
 
     fn recording(times_s: &[f64]) -> Recording {
         let record = |(index, &timestamp_s): (usize, &f64)| Record {
             timestamp_s,
-            session: String::new(),
             action: vec![index as f32],
-            state: Vec::new(),
             image: index,
             place: format!("line {}", index + 1),
+            ..Record::default()
         };
+        let records = times_s.iter().enumerate().map(record).collect();
         Recording {
-            name: "test".to_owned(),
             action_channels: vec![Channel::new("turn", "")],
-            state_channels: Vec::new(),
-            camera: None,
-            records: times_s.iter().enumerate().map(record).collect(),
-            images: Images::Files(Vec::new()),
-            skipped: SkippedList::default(),
+            ..Recording::of_images("test".to_owned(), records, ImageFiles(Vec::new()))
         }
     }
 

@@ -8,8 +8,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::recording::{FitImage, Images, Record, Recording, WantedImage};
-use super::{ImportError, ImportOptions, SkippedList};
+use super::files::stem;
+use super::recording::{FitImage, ImageSource, Record, Recording, WantedImage};
+use super::skipped::SkippedList;
+use super::{ImportError, ImportOptions};
 use crate::dataset::program::{ProgramError, ProgramOutput};
 use foreframe_core::frame::{Frame, MAX_SIDE_PX};
 
@@ -30,29 +32,20 @@ pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool
     let ListedFrames { times_s, damage } = frames_of(video, cancelled)?;
     let mut skipped = SkippedList::default();
     if let Some(damage) = damage {
-        skipped.push(damage.skippable().filter(|_| options.skip_bad).ok_or(damage)?);
+        damage.leave_out(options.skip_bad, &mut skipped)?;
     }
     let record = |(index, &timestamp_s): (usize, &f64)| Record {
         timestamp_s,
-        session: String::new(),
-        action: Vec::new(),
-        state: Vec::new(),
         image: index,
         place: format!("{} frame {index}", video.display()),
+        ..Record::default()
     };
+    let records = times_s.iter().enumerate().map(record).collect();
+    let places = (0..times_s.len()).map(|frame| (0, frame)).collect();
+    let images = VideoFrames::new(vec![(video.to_owned(), times_s.len())], places);
     Ok(Recording {
-        name: video
-            .file_stem()
-            .map_or_else(|| "video".to_owned(), |name| name.to_string_lossy().into_owned()),
-        action_channels: Vec::new(),
-        state_channels: Vec::new(),
-        camera: None,
-        records: times_s.iter().enumerate().map(record).collect(),
-        images: Images::Videos(VideoFrames::new(
-            vec![(video.to_owned(), times_s.len())],
-            (0..times_s.len()).map(|frame| (0, frame)).collect(),
-        )),
         skipped,
+        ..Recording::of_images(stem(video, "video"), records, images)
     })
 }
 
@@ -165,36 +158,30 @@ impl VideoFrames {
             stream: Mutex::new(None),
         }
     }
+}
 
-    /// Decodes the wanted frames and passes each to `fit`. Errors, for each frame: those of `fit`, `Program`, `Record`, `Stopped`.
-    pub(super) fn read_all(
+impl ImageSource for VideoFrames {
+    /// Decodes the frames one after the other and fits some of them together.
+    fn read_all(
         &self,
         wanted: &[WantedImage<'_>],
         fit: FitImage<'_>,
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
-        let mut stream = self.stream.lock().unwrap_or_else(PoisonError::into_inner);
         let mut fitted = Vec::with_capacity(wanted.len());
         for some in wanted.chunks(DECODED_FRAMES) {
-            let decoded: Vec<_> = some
-                .iter()
-                .map(|wanted| (self.decode(&mut stream, wanted, cancelled), wanted))
-                .collect();
+            let decoded: Vec<_> = some.iter().map(|wanted| self.read(wanted, cancelled)).collect();
             let fit = |(decoded, wanted): (Result<Frame, ImportError>, &WantedImage<'_>)| fit(&decoded?, wanted.place);
-            fitted.par_extend(decoded.into_par_iter().map(fit));
+            fitted.par_extend(decoded.into_par_iter().zip(some).map(fit));
         }
         fitted
     }
 
-    fn decode(
-        &self,
-        stream: &mut Option<FrameStream>,
-        wanted: &WantedImage<'_>,
-        cancelled: &AtomicBool,
-    ) -> Result<Frame, ImportError> {
+    fn read(&self, wanted: &WantedImage<'_>, cancelled: &AtomicBool) -> Result<Frame, ImportError> {
         let (video, frame) = self.places[wanted.image];
         let (path, frames) = &self.videos[video];
-        let stream = match stream {
+        let mut stream = self.stream.lock().unwrap_or_else(PoisonError::into_inner);
+        let stream = match &mut *stream {
             Some(open) if open.video == video && open.can_give(frame) => open,
             other => other.insert(FrameStream::start(video, path)?),
         };

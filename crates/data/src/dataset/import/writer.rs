@@ -9,26 +9,50 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::super::collection::lock_file;
-use super::super::files::{is_unused, write_atomically};
-use super::super::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
-use super::super::shard::{EncodedEpisode, ShardStart, build};
-use super::super::store::{FinishedShard, complete};
-use super::super::{DatasetInfo, EpisodeData};
 use super::recording::{Record, Recording, WantedImage};
-use super::skipped::MAX_ITEMS;
+use super::skipped::{MAX_ITEMS, SkippedItem};
 use super::timing::{ImportPlan, PlannedFrame};
-use super::{ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem};
+use super::{ImportConfig, ImportError, ImportOptions};
+use crate::dataset::info::{DatasetInfo, EpisodeData};
+use crate::dataset::store::arguments::lock_file;
+use crate::dataset::store::files::{is_unused, write_atomically};
+use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
+use crate::dataset::store::shard::EncodedEpisode;
+use crate::dataset::store::writer::{ShardWriter, shard_ranges};
 use foreframe_core::files::remove_partials;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::fit::fit;
 
-/// A shard is closed once it has so many frames. It holds whole episodes.
-const SHARD_FRAMES: usize = 2000;
 /// Images that are decoded in parallel.
 const CHUNK_FRAMES: usize = 256;
 /// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
 const SKIPPED: &str = "meta/skipped.json";
+
+/// What an import made.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    /// The data set.
+    pub info: DatasetInfo,
+    /// What was left out. The last entry can stand for all that are not listed.
+    pub skipped: Vec<SkippedItem>,
+}
+
+impl Imported {
+    /// How many items were left out.
+    #[must_use]
+    pub fn skipped_count(&self) -> u64 {
+        self.skipped.iter().map(|item| item.count).sum()
+    }
+}
+
+/// How many frames are written, of how many.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ImportProgress {
+    /// Frames written, those of an earlier run included.
+    pub done: u64,
+    /// Frames in all.
+    pub total: u64,
+}
 
 /// What decides the bytes of the data set.
 #[derive(Serialize)]
@@ -137,30 +161,26 @@ impl<'a> Directory<'a> {
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
-        let shards = shards(&plan.episodes);
-        let info = description(self.config, plan);
-        let mut writer = ShardWriter {
-            out: &self.config.out,
-            plan,
-            options: &self.config.options,
-            info: &info,
-            written: Vec::new(),
-            start: ShardStart { episode: 0, frame: 0 },
-        };
+        let mut writer = ShardWriter::new(&self.config.out, description(self.config, plan));
         let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
         let mut done = 0;
         // Those that the source's lists have are found again by every run.
         let mut skipped = self.read_skipped()?;
         skipped.retain(|(of, _)| of.is_some());
-        for episodes in shards {
+        for episodes in shard_ranges(plan.episodes.iter().map(Vec::len)) {
             let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
             if cancelled.load(Ordering::Relaxed) {
                 return Err(ImportError::Cancelled { done, total });
             }
-            if !writer.resume() {
-                let shard = writer.written.len();
+            if !writer.resume(None) {
+                let shard = writer.shard_count();
                 skipped.retain(|(of, _)| *of != Some(shard));
-                let (encoded, bad) = writer.encode(episodes, cancelled, &|frames| {
+                let encoder = EpisodeEncoder {
+                    plan,
+                    options: &self.config.options,
+                    writer: &writer,
+                };
+                let (encoded, bad) = encoder.encode(episodes, cancelled, &|frames| {
                     on_progress(ImportProgress {
                         done: done + frames as u64,
                         total,
@@ -181,8 +201,7 @@ impl<'a> Directory<'a> {
             done += frames as u64;
             on_progress(ImportProgress { done, total });
         }
-        let ShardWriter { written, .. } = writer;
-        if written.iter().all(|shard| shard.records.is_empty()) {
+        if writer.episode_count() == 0 {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
         let listed = plan.recording.skipped.items().into_iter();
@@ -190,7 +209,7 @@ impl<'a> Directory<'a> {
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
         remove_partials(&self.config.out);
-        let info = complete(&self.config.out, info, &written)?;
+        let info = writer.complete()?;
         Ok(Imported {
             info,
             skipped: all.into_iter().map(|(_, item)| item).collect(),
@@ -226,52 +245,14 @@ fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
     }
 }
 
-/// Ranges of episodes, each one shard.
-fn shards(episodes: &[Vec<PlannedFrame>]) -> Vec<Range<usize>> {
-    let (mut shards, mut start, mut frames) = (Vec::new(), 0, 0);
-    for (index, episode) in episodes.iter().enumerate() {
-        frames += episode.len();
-        if frames >= SHARD_FRAMES || index + 1 == episodes.len() {
-            shards.push(start..index + 1);
-            (start, frames) = (index + 1, 0);
-        }
-    }
-    shards
-}
-
-struct ShardWriter<'a> {
-    out: &'a Path,
+/// Makes the episodes of the next shard.
+struct EpisodeEncoder<'a> {
     plan: &'a ImportPlan,
     options: &'a ImportOptions,
-    info: &'a DatasetInfo,
-    written: Vec<FinishedShard>,
-    start: ShardStart,
+    writer: &'a ShardWriter,
 }
 
-impl ShardWriter<'_> {
-    /// Takes the next shard from disk if an earlier run wrote it.
-    fn resume(&mut self) -> bool {
-        let found = FinishedShard::read(&self.out.join(shard_path(self.written.len())));
-        found.is_some_and(|shard| {
-            self.push(shard);
-            true
-        })
-    }
-
-    fn push(&mut self, shard: FinishedShard) {
-        self.start = ShardStart {
-            episode: self.start.episode + shard.records.len(),
-            frame: self.start.frame + shard.frames(),
-        };
-        self.written.push(shard);
-    }
-
-    fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), ImportError> {
-        let path = self.out.join(shard_path(self.written.len()));
-        self.push(FinishedShard::write(&path, &build(self.info, self.start, episodes)?)?);
-        Ok(())
-    }
-
+impl EpisodeEncoder<'_> {
     /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
     /// are returned if the import was cancelled.
     fn encode(
@@ -284,11 +265,7 @@ impl ShardWriter<'_> {
         let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
         let resize = |image: &Frame, place: &str| {
             let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
-            fit(image, width, height, self.options.fit).map_err(|source| ImportError::Image {
-                place: place.to_owned(),
-                path: place.into(),
-                source,
-            })
+            fit(image, width, height, self.options.fit).map_err(ImportError::image(place, place))
         };
         for episode in &self.plan.episodes[episodes] {
             let mut data = EpisodeData::default();
@@ -328,8 +305,8 @@ impl ShardWriter<'_> {
     fn close(&self, data: &mut EpisodeData, encoded: &mut Vec<EncodedEpisode>) -> Result<(), ImportError> {
         let data = std::mem::take(data);
         if data.timestamps_s.len() > 1 {
-            let episode = self.start.episode + encoded.len();
-            encoded.push(EncodedEpisode::new(self.info, episode, relative(data))?);
+            let episode = self.writer.episode_count() + encoded.len();
+            encoded.push(EncodedEpisode::new(self.writer.info(), episode, relative(data))?);
         }
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! The camera model of a data set, from a camera's `CameraInfo` and how its images are fitted.
 
 use super::messages::Projection;
-use crate::dataset::import::ImportOptions;
+use crate::dataset::import::options::ImportOptions;
 use foreframe_core::frame::fit::Fit;
 use foreframe_core::frame::warp::CameraModel;
 

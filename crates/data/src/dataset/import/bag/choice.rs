@@ -1,8 +1,9 @@
 //! Which topics become image, action and state: those named by the options, else the only one of its type.
 
-use super::collector::{Collector, Content, Topic, ValueStream};
+use super::index::{BagIndex, Content, Topic, ValueStream};
 use super::messages::{Projection, RosType};
-use crate::dataset::import::{ImportError, ImportOptions, listed};
+use crate::dataset::import::skipped::listed;
+use crate::dataset::import::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
 
 /// In place of a topic: none at all.
@@ -53,8 +54,8 @@ const STATE: Role = Role {
 };
 
 /// Chooses the topics. Errors: `Option`; it lists the topics that there are.
-pub(super) fn choose(collector: &Collector<'_>, options: &ImportOptions) -> Result<ChosenTopics, ImportError> {
-    let choice = Choice { collector, options };
+pub(super) fn choose(index: &BagIndex<'_>, options: &ImportOptions) -> Result<ChosenTopics, ImportError> {
+    let choice = Choice { index, options };
     let image = match &options.image {
         Some(name) => choice.named(name, &IMAGE)?,
         None => choice
@@ -70,13 +71,13 @@ pub(super) fn choose(collector: &Collector<'_>, options: &ImportOptions) -> Resu
 }
 
 struct Choice<'a> {
-    collector: &'a Collector<'a>,
+    index: &'a BagIndex<'a>,
     options: &'a ImportOptions,
 }
 
 impl Choice<'_> {
     fn topics(&self) -> &[Topic] {
-        &self.collector.topics
+        &self.index.topics
     }
 
     fn wrong(&self, what: &str, role: &Role) -> ImportError {

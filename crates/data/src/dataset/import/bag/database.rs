@@ -8,7 +8,8 @@ use rusqlite::config::DbConfig;
 use rusqlite::limits::Limit;
 use rusqlite::{Connection, OpenFlags};
 
-use crate::dataset::import::{ImportError, MAX_FILE_BYTES, open_file};
+use crate::dataset::import::error::ImportError;
+use crate::dataset::import::files::{MAX_FILE_BYTES, open_file};
 
 /// What a database may ask of SQLite. The tables of rosbag2 have less than ten columns and our statements are short; other tables of
 /// the file may be larger.

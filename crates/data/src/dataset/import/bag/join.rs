@@ -6,9 +6,10 @@
 //! how long it holds. An image without an action or a state is left out.
 
 use super::choice::{ChosenTopics, ChosenValues};
-use super::collector::{Collector, Content, ImageEntry, MessageTime, ValueStream};
+use super::index::{BagIndex, Content, ImageEntry, MessageTime, ValueStream};
 use crate::dataset::import::recording::Record;
-use crate::dataset::import::{ImportError, ImportOptions, SkippedItem, SkippedList};
+use crate::dataset::import::skipped::{SkippedItem, SkippedList};
+use crate::dataset::import::{ImportError, ImportOptions};
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
 const SAME_CLOCK_NS: i64 = 1_000_000_000;
@@ -72,12 +73,8 @@ struct HeldValues<'a> {
 
 impl<'a> HeldValues<'a> {
     /// Errors: `Record` if time goes back, unless damage is left out.
-    fn new(
-        collector: &'a Collector<'_>,
-        chosen: &ChosenValues,
-        skipped: &mut SkippedList,
-    ) -> Result<Self, ImportError> {
-        let (topic, options) = (&collector.topics[chosen.topic], collector.options);
+    fn new(index: &'a BagIndex<'_>, chosen: &ChosenValues, skipped: &mut SkippedList) -> Result<Self, ImportError> {
+        let (topic, options) = (&index.topics[chosen.topic], index.options);
         let empty = ValueStream::default();
         let stream = match &topic.content {
             Content::Values(stream) => stream,
@@ -98,7 +95,7 @@ impl<'a> HeldValues<'a> {
                 let error = ImportError::record(
                     format!(
                         "{} message {} of {}",
-                        collector.source.display(),
+                        index.source.display(),
                         stream.numbers[message],
                         topic.name
                     ),
@@ -108,10 +105,7 @@ impl<'a> HeldValues<'a> {
                         seconds(before)
                     ),
                 );
-                match error.skippable().filter(|_| options.skip_bad) {
-                    Some(item) => skipped.push(item),
-                    None => return Err(error),
-                }
+                error.leave_out(options.skip_bad, skipped)?;
                 continue;
             }
             let mut changed = false;
@@ -170,8 +164,8 @@ pub(super) struct JoinedImages {
 }
 
 /// Joins the chosen topics. Errors: `Option`, `Record`.
-pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<JoinedImages, ImportError> {
-    let (topic, options) = (&collector.topics[chosen.image], collector.options);
+pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics) -> Result<JoinedImages, ImportError> {
+    let (topic, options) = (&index.topics[chosen.image], index.options);
     let empty = Vec::new();
     let entries = match &topic.content {
         Content::Images(entries) => entries,
@@ -182,16 +176,16 @@ pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<J
     let times_ns: Vec<i64> = times.into_iter().map(|time| clock.time(time)).collect();
     let mut skipped = SkippedList::default();
     let mut held = |values: &[ChosenValues]| -> Result<Vec<HeldValues<'_>>, ImportError> {
-        let one = |chosen: &ChosenValues| HeldValues::new(collector, chosen, &mut skipped);
+        let one = |chosen: &ChosenValues| HeldValues::new(index, chosen, &mut skipped);
         values.iter().map(one).collect()
     };
     let (actions, states) = (held(&chosen.actions)?, held(&chosen.states)?);
     let period_ns = median_period(&times_ns);
     let (mut joined, mut left_out) = (Vec::new(), LeftOut::default());
     let mut images = Vec::new();
-    for (index, entry) in entries.iter().enumerate() {
-        let start_ns = times_ns[index];
-        let next_ns = times_ns.get(index + 1).copied().unwrap_or(i64::MAX);
+    for (image, entry) in entries.iter().enumerate() {
+        let start_ns = times_ns[image];
+        let next_ns = times_ns.get(image + 1).copied().unwrap_or(i64::MAX);
         let is_next = next_ns > start_ns && next_ns.saturating_sub(start_ns) <= period_ns.saturating_mul(GAP_PERIODS);
         let end_ns = if is_next {
             next_ns
@@ -214,18 +208,18 @@ pub(super) fn join(collector: &Collector<'_>, chosen: &ChosenTopics) -> Result<J
         let state = states.iter().zip(of_states);
         joined.push(Record {
             timestamp_s: seconds(start_ns),
-            session: String::new(),
             action: action
                 .flat_map(|(held, &first)| held.mean(first, start_ns, end_ns))
                 .collect(),
             state: state.flat_map(|(held, &at)| held.row(at).iter().copied()).collect(),
             image: images.len(),
-            place: collector.place(entry.file, topic, entry.number, entry.position),
+            place: index.place(entry.file, topic, entry.number, entry.position),
+            ..Record::default()
         });
-        images.push(index);
+        images.push(image);
     }
     left_out
-        .items(collector, &topic.name)
+        .items(index, &topic.name)
         .into_iter()
         .for_each(|item| skipped.push(item));
     Ok(JoinedImages {
@@ -260,8 +254,8 @@ impl<'a> LeftOut<'a> {
         }
     }
 
-    fn items(self, collector: &Collector<'_>, image_topic: &str) -> Vec<SkippedItem> {
-        let (source, hold_s) = (collector.source.display(), collector.options.hold_s);
+    fn items(self, index: &BagIndex<'_>, image_topic: &str) -> Vec<SkippedItem> {
+        let (source, hold_s) = (index.source.display(), index.options.hold_s);
         let item = |(topic, first, last): (&str, u64, u64)| {
             SkippedItem::new(
                 &format!("{source} messages {first} to {last} of {image_topic}"),

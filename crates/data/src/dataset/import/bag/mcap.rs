@@ -1,5 +1,7 @@
 //! MCAP files: <https://mcap.dev/spec>. Read once from start to end, so that the index at the end is not needed and a file
 //! that was cut off can be read; then message by message at the positions found.
+//!
+//! The crate `mcap` is not used: it does not say where in the file a message lies, and decompresses with libraries in C.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -8,9 +10,10 @@ use std::io::{BufReader, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::collector::{Collector, MAX_NAME_BYTES, Position};
 use super::compression::{self, MAX_RECORD_BYTES};
-use crate::dataset::import::{ImportError, open_file};
+use super::index::{BagIndex, MAX_NAME_BYTES, Position};
+use crate::dataset::import::error::ImportError;
+use crate::dataset::import::files::open_file;
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// The operation code and the length of a record.
@@ -148,11 +151,11 @@ struct McapScan<'a, 'b> {
     reader: BufReader<&'a File>,
     length: u64,
     channels: Channels,
-    collector: &'a mut Collector<'b>,
+    index: &'a mut BagIndex<'b>,
 }
 
-/// Passes every message of a file to the collector. Errors: `Io`, `Stopped`, `Record` where damage may not be left out.
-pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
+/// Passes every message of a file to the index. Errors: `Io`, `Stopped`, `Record` where damage may not be left out.
+pub(super) fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportError> {
     let file = open_file(path)?;
     let length = file.metadata().map_err(ImportError::io("read", path))?.len();
     let mut scan = McapScan {
@@ -160,7 +163,7 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
         reader: BufReader::new(&file),
         length,
         channels: Channels::default(),
-        collector,
+        index,
     };
     let mut magic = [0; 8];
     if length < 8 || scan.reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
@@ -174,14 +177,14 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
 
 impl McapScan<'_, '_> {
     fn fault(&mut self, offset: u64, reason: impl Into<String>) -> Result<(), ImportError> {
-        self.collector
+        self.index
             .fault(format!("{} byte {offset}", self.path.display()), reason.into())
     }
 
     fn records(&mut self) -> Result<(), ImportError> {
         let (mut offset, mut body) = (MAGIC.len() as u64, Vec::new());
         loop {
-            self.collector.check_cancelled()?;
+            self.index.check_cancelled()?;
             let mut header = [0; RECORD_HEADER_BYTES as usize];
             let left = self.length.saturating_sub(offset.saturating_add(RECORD_HEADER_BYTES));
             if offset.saturating_add(RECORD_HEADER_BYTES) > self.length {
@@ -289,7 +292,7 @@ impl McapScan<'_, '_> {
                 match ids.zip(fields.text().zip(fields.text())) {
                     Some(((id, schema), (topic, encoding))) => {
                         let type_name = self.channels.schemas.get(&schema).cloned().unwrap_or_default();
-                        match self.collector.topic(topic, type_name, encoding) {
+                        match self.index.topic(topic, type_name, encoding) {
                             Ok(topic) => drop(self.channels.topics.insert(id, topic)),
                             Err(reason) => self.fault(at, reason)?,
                         }
@@ -319,7 +322,7 @@ impl McapScan<'_, '_> {
                     },
                 };
                 let log_time = i64::try_from(log_time).unwrap_or(i64::MAX);
-                self.collector.message(topic, log_time, position, fields.0);
+                self.index.message(topic, log_time, position, fields.0);
             }
             _ => {}
         }

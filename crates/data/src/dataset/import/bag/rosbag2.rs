@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::dataset::import::images::{entries, inside};
-use crate::dataset::import::{ImportError, extension, read_text};
+use crate::dataset::import::error::ImportError;
+use crate::dataset::import::files::{entries, extension, inside, read_text};
 
 const METADATA: &str = "metadata.yaml";
 /// Endings of files that were compressed as a whole.

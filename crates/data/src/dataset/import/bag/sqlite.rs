@@ -3,18 +3,18 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use super::collector::{Collector, Position};
 use super::database::{BagDatabase, unreadable};
-use crate::dataset::import::ImportError;
+use super::index::{BagIndex, Position};
+use crate::dataset::import::error::ImportError;
 
 const MESSAGES: &str = "SELECT rowid, topic_id, timestamp, data FROM main.messages ORDER BY rowid";
 const TOPICS: &str = "SELECT rowid, id, name, type, serialization_format FROM main.topics ORDER BY rowid";
 
-/// Passes every message of a file to the collector, in the order of recording. Errors: `Io`, `Option`, `Stopped`, `Record` where
+/// Passes every message of a file to the index, in the order of recording. Errors: `Io`, `Option`, `Stopped`, `Record` where
 /// damage may not be left out.
-pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), ImportError> {
-    let database = BagDatabase::open(path, collector.options.skip_bad)?;
-    let topics = topics(&database, path, collector)?;
+pub(super) fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportError> {
+    let database = BagDatabase::open(path, index.options.skip_bad)?;
+    let topics = topics(&database, path, index)?;
     database.begin_row();
     let mut statement = database
         .connection()
@@ -23,7 +23,7 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
     let mut rows = statement.query([]).map_err(|error| unreadable(path, &error))?;
     let mut last = None;
     loop {
-        collector.check_cancelled()?;
+        index.check_cancelled()?;
         database.begin_row();
         let place = |row: i64| format!("{} row {row} of the messages", path.display());
         let row = match rows.next() {
@@ -31,19 +31,19 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
             Ok(None) => return Ok(()),
             Err(error) => {
                 let reason = format!("the database cannot be read after this row: {error}");
-                return collector.fault(place(last.unwrap_or_default()), reason);
+                return index.fault(place(last.unwrap_or_default()), reason);
             }
         };
         let id = row.get(0).map_err(|error| unreadable(path, &error))?;
         if let Some(last) = last.filter(|last| *last >= id) {
-            return collector.fault(place(last), NOT_IN_ORDER.to_owned());
+            return index.fault(place(last), NOT_IN_ORDER.to_owned());
         }
         last = Some(id);
         let read = || Ok::<_, rusqlite::Error>((row.get::<_, i64>(1)?, row.get(2)?, row.get_ref(3)?.as_blob().ok()));
         let (topic, log_ns, data) = match read() {
             Ok(read) => read,
             Err(error) => {
-                collector.fault(place(id), format!("the row cannot be read: {error}"))?;
+                index.fault(place(id), format!("the row cannot be read: {error}"))?;
                 continue;
             }
         };
@@ -51,9 +51,9 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
             .binary_search_by_key(&topic, |(of, _)| *of)
             .map(|at| topics[at].1);
         match (known, data) {
-            (Ok(topic), Some(data)) => collector.message(topic, log_ns, Position::Row(id), data),
-            (Err(_), _) => collector.fault(place(id), format!("its topic_id {topic} is not in the table of topics"))?,
-            (_, None) => collector.fault(place(id), "its data is not a blob".to_owned())?,
+            (Ok(topic), Some(data)) => index.message(topic, log_ns, Position::Row(id), data),
+            (Err(_), _) => index.fault(place(id), format!("its topic_id {topic} is not in the table of topics"))?,
+            (_, None) => index.fault(place(id), "its data is not a blob".to_owned())?,
         }
     }
 }
@@ -62,18 +62,14 @@ pub(super) fn scan(path: &Path, collector: &mut Collector<'_>) -> Result<(), Imp
 const NOT_IN_ORDER: &str = "the database is damaged after this row: the next one has no greater number";
 
 /// The topics by their number in the database, sorted. Errors: `Record`, `Stopped`.
-fn topics(
-    database: &BagDatabase,
-    path: &Path,
-    collector: &mut Collector<'_>,
-) -> Result<Vec<(i64, usize)>, ImportError> {
+fn topics(database: &BagDatabase, path: &Path, index: &mut BagIndex<'_>) -> Result<Vec<(i64, usize)>, ImportError> {
     let wrong = |error: rusqlite::Error| unreadable(path, &error);
     database.begin_row();
     let mut statement = database.connection().prepare(TOPICS).map_err(wrong)?;
     let mut rows = statement.query([]).map_err(wrong)?;
     let (mut topics, mut last) = (Vec::new(), None);
     while let Some(row) = rows.next().map_err(wrong)? {
-        collector.check_cancelled()?;
+        index.check_cancelled()?;
         database.begin_row();
         let number: i64 = row.get(0).map_err(wrong)?;
         if let Some(last) = last.filter(|last| *last >= number) {
@@ -83,9 +79,9 @@ fn topics(
         last = Some(number);
         let read = || Ok((row.get(1)?, row.get(2)?, row.get(3)?, row.get(4)?));
         let (id, name, type_name, encoding) = read().map_err(wrong)?;
-        match collector.topic(name, type_name, encoding) {
+        match index.topic(name, type_name, encoding) {
             Ok(topic) => topics.push((id, topic)),
-            Err(reason) => collector.fault(format!("{} topic {id}", path.display()), reason)?,
+            Err(reason) => index.fault(format!("{} topic {id}", path.display()), reason)?,
         }
     }
     topics.sort_by_key(|(id, _)| *id);

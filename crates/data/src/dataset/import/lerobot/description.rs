@@ -1,41 +1,32 @@
-//! `meta/info.json` and the list of episodes: which features there are, and in which file each episode is.
+//! `meta/info.json`: which features there are, and which of them are chosen.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use arrow_array::RecordBatch;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::super::images::inside;
-use super::super::{ImportError, ImportOptions, listed, read_file, read_text};
-use super::INFO;
-use super::rows::column_numbers;
-use crate::dataset::shard_reader::batches;
+use crate::dataset::import::files::read_file;
+use crate::dataset::import::skipped::listed;
+use crate::dataset::import::{ImportError, ImportOptions};
 
-/// Episodes of version 2.
-const EPISODE_LINES: &str = "meta/episodes.jsonl";
-/// Tables of episodes of version 3.
-const EPISODE_TABLES: &str = "meta/episodes";
-/// Version 2 without this field puts so many episodes into a directory.
-const CHUNK_EPISODES: usize = 1000;
+/// The description, which every data set of `LeRobot` has.
+pub(super) const INFO: &str = "meta/info.json";
 /// The greatest size of a vector feature.
 const MAX_COMPONENTS: usize = 10_000;
-/// The most digits of a number in a path.
-const MAX_DIGITS: usize = 20;
 /// Types whose values are read as numbers.
 const NUMBERS: [&str; 11] = [
     "float32", "float64", "float16", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool",
 ];
 
 #[derive(Deserialize)]
-struct InfoFile {
+pub(super) struct InfoFile {
     codebase_version: String,
-    data_path: String,
+    pub(super) data_path: String,
     #[serde(default)]
-    video_path: Option<String>,
+    pub(super) video_path: Option<String>,
     #[serde(default)]
-    chunks_size: Option<usize>,
+    pub(super) chunks_size: Option<usize>,
     features: BTreeMap<String, Feature>,
 }
 
@@ -53,8 +44,8 @@ struct Feature {
 
 /// What a data set describes about itself.
 pub(super) struct Description {
-    source: PathBuf,
-    info: InfoFile,
+    pub(super) source: PathBuf,
+    pub(super) info: InfoFile,
 }
 
 /// The feature with the images.
@@ -69,23 +60,6 @@ pub(super) struct Component {
     pub(super) feature: String,
     pub(super) index: usize,
     pub(super) name: String,
-}
-
-/// One episode: its rows, and where they and its frames are.
-pub(super) struct EpisodeEntry {
-    pub(super) index: usize,
-    pub(super) length: usize,
-    /// Below the data set's directory.
-    pub(super) table: PathBuf,
-    pub(super) video: Option<VideoPart>,
-}
-
-/// The part of a video that belongs to an episode.
-pub(super) struct VideoPart {
-    /// Below the data set's directory.
-    pub(super) path: PathBuf,
-    /// Where the episode begins in the video, in seconds.
-    pub(super) from_s: f64,
 }
 
 impl Description {
@@ -119,7 +93,7 @@ impl Description {
         })
     }
 
-    fn is_version_2(&self) -> bool {
+    pub(super) fn is_version_2(&self) -> bool {
         self.info.codebase_version.starts_with("v2.")
     }
 
@@ -193,129 +167,6 @@ impl Description {
         }
         Ok(components)
     }
-
-    /// Every episode, in order. Errors: `Io`, `Record`.
-    pub(super) fn episodes(&self, image: &ImageFeature) -> Result<Vec<EpisodeEntry>, ImportError> {
-        if self.is_version_2() {
-            self.episodes_of_lines(image)
-        } else {
-            self.episodes_of_tables(image)
-        }
-    }
-
-    fn episodes_of_lines(&self, image: &ImageFeature) -> Result<Vec<EpisodeEntry>, ImportError> {
-        #[derive(Deserialize)]
-        struct Line {
-            episode_index: usize,
-            length: usize,
-        }
-        let path = self.source.join(EPISODE_LINES);
-        let text = read_text(&path)?;
-        let entry = |(number, line): (usize, &str)| {
-            let place = format!("{} line {}", path.display(), number + 1);
-            let line: Line =
-                serde_json::from_str(line).map_err(|error| ImportError::record(&place, error.to_string()))?;
-            let index = line.episode_index;
-            let chunk = index / self.info.chunks_size.unwrap_or(CHUNK_EPISODES).max(1);
-            let fields = [("episode_chunk", chunk), ("episode_index", index)];
-            Ok(EpisodeEntry {
-                index,
-                length: line.length,
-                table: self.path(&self.info.data_path, &image.name, &fields, &place)?,
-                video: self.video(image, &fields, 0.0, &place)?,
-            })
-        };
-        let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-        lines.map(entry).collect()
-    }
-
-    fn episodes_of_tables(&self, image: &ImageFeature) -> Result<Vec<EpisodeEntry>, ImportError> {
-        let mut episodes = Vec::new();
-        for path in parquet_files(&self.source.join(EPISODE_TABLES))? {
-            for batch in batches(&path)? {
-                self.entries(&batch, &path, image, &mut episodes)?;
-            }
-        }
-        Ok(episodes)
-    }
-
-    fn entries(
-        &self,
-        batch: &RecordBatch,
-        path: &Path,
-        image: &ImageFeature,
-        episodes: &mut Vec<EpisodeEntry>,
-    ) -> Result<(), ImportError> {
-        let numbers = |column: &str| {
-            column_numbers(batch, column).ok_or_else(|| {
-                ImportError::record(
-                    path.display().to_string(),
-                    format!("it has no column {column:?} of numbers"),
-                )
-            })
-        };
-        let of_video = |what: &str| numbers(&format!("videos/{}/{what}", image.name));
-        let (indexes, lengths) = (numbers("episode_index")?, numbers("length")?);
-        let (chunks, files) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
-        let videos = if image.is_video {
-            Some((
-                of_video("chunk_index")?,
-                of_video("file_index")?,
-                of_video("from_timestamp")?,
-            ))
-        } else {
-            None
-        };
-        for row in 0..batch.num_rows() {
-            let place = format!("{} row {row}", path.display());
-            let fields = |chunk: f64, file: f64| [("chunk_index", chunk as usize), ("file_index", file as usize)];
-            let video = match &videos {
-                Some((chunks, files, starts)) => {
-                    self.video(image, &fields(chunks[row], files[row]), starts[row], &place)?
-                }
-                None => None,
-            };
-            episodes.push(EpisodeEntry {
-                index: indexes[row] as usize,
-                length: lengths[row] as usize,
-                table: self.path(
-                    &self.info.data_path,
-                    &image.name,
-                    &fields(chunks[row], files[row]),
-                    &place,
-                )?,
-                video,
-            });
-        }
-        Ok(())
-    }
-
-    fn video(
-        &self,
-        image: &ImageFeature,
-        fields: &[(&str, usize)],
-        from_s: f64,
-        place: &str,
-    ) -> Result<Option<VideoPart>, ImportError> {
-        if !image.is_video {
-            return Ok(None);
-        }
-        let template = self.info.video_path.as_deref().ok_or_else(|| {
-            ImportError::record(
-                self.source.join(INFO).display().to_string(),
-                format!("\"{}\" is a video, but \"video_path\" is missing", image.name),
-            )
-        })?;
-        let path = self.path(template, &image.name, fields, place)?;
-        Ok(Some(VideoPart { path, from_s }))
-    }
-
-    /// A path of the data set: the template with its fields filled in, below the data set's directory.
-    fn path(&self, template: &str, image: &str, fields: &[(&str, usize)], place: &str) -> Result<PathBuf, ImportError> {
-        let name = filled(template, image, fields);
-        inside(&self.source, &name, place)?;
-        Ok(PathBuf::from(name))
-    }
 }
 
 impl Feature {
@@ -369,54 +220,9 @@ fn is_named(feature: &str, name: &str) -> bool {
     feature == name || feature.strip_suffix(name).is_some_and(|before| before.ends_with('.'))
 }
 
-/// The template with `{name}` and `{name:03d}` filled in.
-fn filled(template: &str, image: &str, fields: &[(&str, usize)]) -> String {
-    let mut text = template.replace("{video_key}", image).replace("{image_key}", image);
-    for (name, value) in fields {
-        while let Some(start) = text.find(&format!("{{{name}")) {
-            let Some(length) = text[start..].find('}') else { break };
-            let field = &text[start..=start + length];
-            let width = field.trim_end_matches(['}', 'd']).rsplit(':').next();
-            let width = width.and_then(|width| width.parse().ok()).unwrap_or(0).min(MAX_DIGITS);
-            text = text.replace(field, &format!("{value:0width$}"));
-        }
-    }
-    text
-}
-
-/// All Parquet files below a directory, in order of their paths.
-fn parquet_files(dir: &Path) -> Result<Vec<PathBuf>, ImportError> {
-    let mut found = Vec::new();
-    let mut open = vec![dir.to_owned()];
-    while let Some(dir) = open.pop() {
-        let entries = std::fs::read_dir(&dir).map_err(ImportError::io("list", &dir))?;
-        for entry in entries {
-            let path = entry.map_err(ImportError::io("list", &dir))?.path();
-            if path.is_dir() {
-                open.push(path);
-            } else if path.is_file() && path.extension().is_some_and(|extension| extension == "parquet") {
-                found.push(path);
-            }
-        }
-    }
-    found.sort();
-    Ok(found)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn templates_of_both_versions_are_filled() {
-        let fields = [("chunk_index", 0), ("file_index", 12)];
-        let path = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
-        assert_eq!(filled(path, "cam", &fields), "videos/cam/chunk-000/file-012.mp4");
-        let fields = [("episode_chunk", 1), ("episode_index", 1234)];
-        let path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet";
-        assert_eq!(filled(path, "", &fields), "data/chunk-001/episode_001234.parquet");
-        assert_eq!(filled("{episode_index:099999d}", "", &fields).len(), MAX_DIGITS);
-    }
 
     #[test]
     fn components_have_the_names_of_the_data_set_or_numbers() {

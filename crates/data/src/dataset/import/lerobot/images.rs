@@ -2,16 +2,18 @@
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, PoisonError};
 
 use arrow_array::cast::AsArray;
 use arrow_array::{Array, RecordBatch};
 use parquet::arrow::ProjectionMask;
 
-use super::super::images::inside;
-use super::super::recording::read_image;
-use super::super::{ImportError, open_file};
-use crate::dataset::parquet_file;
+use crate::dataset::import::error::ImportError;
+use crate::dataset::import::files::{inside, open_file};
+use crate::dataset::import::image_files::read_image;
+use crate::dataset::import::recording::{ImageSource, WantedImage};
+use crate::dataset::store::parquet_file;
 use foreframe_core::frame::{Frame, codec};
 
 /// Rows that are read together.
@@ -24,7 +26,7 @@ const BLOCK_BYTES: usize = 64 << 20;
 const BATCH_ROWS: usize = 8;
 
 /// Images in a column of tables.
-pub(in super::super) struct ImageTable {
+pub(super) struct ImageTable {
     source: PathBuf,
     column: String,
     tables: Vec<PathBuf>,
@@ -67,27 +69,6 @@ impl ImageTable {
             places,
             blocks: Mutex::new(VecDeque::new()),
         }
-    }
-
-    /// Decodes an image as gray. Errors: `Image`, `Io`, `Record`.
-    pub(in super::super) fn read(&self, image: usize, place: &str) -> Result<Frame, ImportError> {
-        let (table, row) = self.places[image];
-        let path = &self.tables[table];
-        let (bytes, path) = match self.stored(table, row)? {
-            StoredImage::Bytes(bytes) => (bytes, path.clone()),
-            StoredImage::File(name) => {
-                let path = inside(&self.source, &name, place)?;
-                (read_image(&path, place)?, path)
-            }
-            StoredImage::Missing => {
-                return Err(ImportError::record(place, format!("{} has no image", self.column)));
-            }
-        };
-        codec::decode(&bytes).map_err(|source| ImportError::Image {
-            place: place.to_owned(),
-            path,
-            source,
-        })
     }
 
     fn stored(&self, table: usize, row: usize) -> Result<StoredImage, ImportError> {
@@ -157,6 +138,25 @@ impl ImageTable {
             }
         }
         Ok(images)
+    }
+}
+
+impl ImageSource for ImageTable {
+    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let WantedImage { image, place } = *wanted;
+        let (table, row) = self.places[image];
+        let path = &self.tables[table];
+        let (bytes, path) = match self.stored(table, row)? {
+            StoredImage::Bytes(bytes) => (bytes, path.clone()),
+            StoredImage::File(name) => {
+                let path = inside(&self.source, &name, place)?;
+                (read_image(&path, place)?, path)
+            }
+            StoredImage::Missing => {
+                return Err(ImportError::record(place, format!("{} has no image", self.column)));
+            }
+        };
+        codec::decode(&bytes).map_err(ImportError::image(place, path))
     }
 }
 

@@ -10,9 +10,10 @@ use arrow_array::{Array, ArrayRef, RecordBatch};
 use arrow_schema::DataType;
 use parquet::arrow::ProjectionMask;
 
-use super::super::{ImportError, open_file};
 use super::description::Component;
-use crate::dataset::parquet_file;
+use crate::dataset::import::error::ImportError;
+use crate::dataset::import::files::open_file;
+use crate::dataset::store::parquet_file;
 
 /// The numbers of one row.
 pub(super) struct Row {

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::DatasetError;
 use super::layout::INFO;
+use crate::dataset::error::DatasetError;
 
 /// Whether a directory holds a finished data set. The file that it checks is written last.
 #[must_use]

@@ -16,38 +16,38 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 use serde::{Deserialize, Serialize};
 
-use super::check::check_episode;
 use super::layout::{ACTION, COUNTERS, IMAGE, MASK, STATE, TIMESTAMP, huggingface_features};
 use super::stats::ChannelStats;
-use super::{DatasetError, DatasetInfo, EpisodeData};
+use crate::dataset::check::check_episode;
+use crate::dataset::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_core::frame::{Frame, codec};
 
 /// Key of the episode records in a shard's footer.
-pub(super) const RECORDS_KEY: &str = "foreframe.episodes";
+pub(crate) const RECORDS_KEY: &str = "foreframe.episodes";
 
 /// Data of an episode besides its frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct EpisodeRecord {
-    pub(super) frames: usize,
+pub(crate) struct EpisodeRecord {
+    pub(crate) frames: usize,
     /// Parameters of the trial as JSON; none for recordings.
-    pub(super) trial: Option<String>,
+    pub(crate) trial: Option<String>,
     /// Statistics of the columns whose values do not follow from the episode's position.
-    pub(super) stats: BTreeMap<String, ChannelStats>,
+    pub(crate) stats: BTreeMap<String, ChannelStats>,
 }
 
 /// An episode with encoded frames, ready to be written.
-pub(super) struct EncodedEpisode {
-    pub(super) images: Vec<Vec<u8>>,
-    pub(super) masks: Option<Vec<Vec<u8>>>,
-    pub(super) actions: Vec<f32>,
-    pub(super) states: Vec<f32>,
-    pub(super) timestamps_s: Vec<f32>,
-    pub(super) record: EpisodeRecord,
+pub(crate) struct EncodedEpisode {
+    pub(crate) images: Vec<Vec<u8>>,
+    pub(crate) masks: Option<Vec<Vec<u8>>>,
+    pub(crate) actions: Vec<f32>,
+    pub(crate) states: Vec<f32>,
+    pub(crate) timestamps_s: Vec<f32>,
+    pub(crate) record: EpisodeRecord,
 }
 
 impl EncodedEpisode {
-    /// Checks an episode as [`super::Dataset::from_episodes`] does, and encodes its frames. `episode` is its position.
-    pub(super) fn new(info: &DatasetInfo, episode: usize, data: EpisodeData) -> Result<Self, DatasetError> {
+    /// Checks an episode as [`crate::dataset::Dataset::from_episodes`] does, and encodes its frames. `episode` is its position.
+    pub(crate) fn new(info: &DatasetInfo, episode: usize, data: EpisodeData) -> Result<Self, DatasetError> {
         check_episode(info, episode, &data)?;
         let frames = data.timestamps_s.len();
         let timestamps_s: Vec<f32> = data.timestamps_s.iter().map(|&time| time as f32).collect();
@@ -104,21 +104,21 @@ fn encode_frames(info: &DatasetInfo, pixels: &[u8]) -> Result<Vec<Vec<u8>>, Data
 
 /// Position of a shard in its data set.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ShardStart {
+pub(crate) struct ShardStart {
     /// Number of episodes before it.
-    pub(super) episode: usize,
+    pub(crate) episode: usize,
     /// Number of frames before it.
-    pub(super) frame: usize,
+    pub(crate) frame: usize,
 }
 
 /// The bytes of a shard, and its episode records as JSON.
-pub(super) struct ShardBytes {
-    pub(super) bytes: Vec<u8>,
-    pub(super) records: String,
+pub(crate) struct ShardBytes {
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) records: String,
 }
 
 /// Writes a shard's episodes as a Parquet file in memory. Errors: `Build`, `Description`.
-pub(super) fn build(
+pub(crate) fn build(
     info: &DatasetInfo,
     start: ShardStart,
     episodes: &[EncodedEpisode],
@@ -184,7 +184,7 @@ fn vector_type(size: usize) -> DataType {
 }
 
 /// The columns of a shard.
-pub(super) fn schema(info: &DatasetInfo) -> SchemaRef {
+pub(crate) fn schema(info: &DatasetInfo) -> SchemaRef {
     let mut fields = vec![Field::new(IMAGE, DataType::Struct(image_fields()), true)];
     if info.has_masks {
         fields.push(Field::new(MASK, DataType::Struct(image_fields()), true));
@@ -201,7 +201,7 @@ pub(super) fn schema(info: &DatasetInfo) -> SchemaRef {
 }
 
 /// The rows of one episode.
-pub(super) fn batch(
+pub(crate) fn batch(
     info: &DatasetInfo,
     schema: &SchemaRef,
     start: ShardStart,

@@ -8,47 +8,43 @@ use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
 use arrow_array::{Array, BinaryArray, RecordBatch, StructArray};
 use parquet::arrow::ProjectionMask;
 
-use super::check::Numbers;
-use super::frame_file::{FrameFileWriter, FrameImage};
 use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
+use super::parquet_file;
 use super::parquet_file::Batches;
 use super::shard::{EpisodeRecord, RECORDS_KEY};
-use super::{DatasetError, DatasetInfo, Episode, parquet_file};
+use crate::dataset::check::Numbers;
+use crate::dataset::frame_store::frame_file::{FrameFileWriter, FrameImage};
+use crate::dataset::{DatasetError, DatasetInfo, Episode};
 use foreframe_core::frame::codec;
 
 /// Rows that are read at a time, with their images.
 const IMAGE_ROWS: usize = 64;
 
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
-pub(super) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
+pub(crate) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let builder = parquet_file::open(file).map_err(|error| corrupt(path, &error))?;
+    let builder = parquet_file::open(file).map_err(|error| DatasetError::corrupt(path, &error))?;
     let pairs = builder.metadata().file_metadata().key_value_metadata();
     let text = pairs
         .and_then(|pairs| pairs.iter().find(|pair| pair.key == RECORDS_KEY))
         .and_then(|pair| pair.value.as_deref())
-        .ok_or_else(|| corrupt(path, &format!("its footer has no \"{RECORDS_KEY}\"")))?;
-    serde_json::from_str(text).map_err(|error| corrupt(path, &error))
+        .ok_or_else(|| DatasetError::corrupt(path, &format!("its footer has no \"{RECORDS_KEY}\"")))?;
+    serde_json::from_str(text).map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 /// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
-pub(super) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
+pub(crate) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     let reader = parquet_file::open(file)
         .and_then(parquet_file::batches)
-        .map_err(|error| corrupt(path, &error))?;
-    reader.collect::<Result<_, _>>().map_err(|error| corrupt(path, &error))
-}
-
-fn corrupt(path: &Path, reason: &impl ToString) -> DatasetError {
-    DatasetError::Corrupt {
-        path: path.to_owned(),
-        reason: reason.to_string().trim().to_owned(),
-    }
+        .map_err(|error| DatasetError::corrupt(path, &error))?;
+    reader
+        .collect::<Result<_, _>>()
+        .map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 /// Where the decoded frames of a shard go.
-pub(super) enum FrameTarget<'a> {
+pub(crate) enum FrameTarget<'a> {
     /// The memory of the shard's frames.
     Memory {
         pixels: &'a mut [u8],
@@ -61,25 +57,25 @@ pub(super) enum FrameTarget<'a> {
 }
 
 /// A shard to read, the expected number of frames, and where the frames go.
-pub(super) struct ShardSlot<'a> {
-    pub(super) path: PathBuf,
-    pub(super) frames: usize,
+pub(crate) struct ShardSlot<'a> {
+    pub(crate) path: PathBuf,
+    pub(crate) frames: usize,
     /// Its first frame, counted over the whole data set.
-    pub(super) first_frame: usize,
-    pub(super) target: FrameTarget<'a>,
+    pub(crate) first_frame: usize,
+    pub(crate) target: FrameTarget<'a>,
 }
 
 /// Actions, states and timestamps of frames.
 #[derive(Default)]
-pub(super) struct ShardNumbers {
-    pub(super) actions: Vec<f32>,
-    pub(super) states: Vec<f32>,
-    pub(super) timestamps_s: Vec<f64>,
+pub(crate) struct ShardNumbers {
+    pub(crate) actions: Vec<f32>,
+    pub(crate) states: Vec<f32>,
+    pub(crate) timestamps_s: Vec<f64>,
 }
 
 impl ShardNumbers {
     /// The numbers of a whole data set from those of its shards.
-    pub(super) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
+    pub(crate) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
         let mut all = Self {
             actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
             states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
@@ -94,7 +90,7 @@ impl ShardNumbers {
     }
 
     /// The numbers of an episode from those of its data set.
-    pub(super) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
+    pub(crate) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
         let frames = episode.frames();
         let (actions, states) = (info.action_channels.len(), info.state_channels.len());
         Numbers {
@@ -107,12 +103,12 @@ impl ShardNumbers {
 
 /// Reads a shard, a few rows at a time, and decodes its frames into the slot's target.
 /// Errors: `Io`, `Corrupt`, `CorruptFrame`, `FrameFile`.
-pub(super) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
+pub(crate) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
     let mut numbers = ShardNumbers::default();
     let mut row = 0;
     let with_images = !matches!(slot.target, FrameTarget::Nothing);
     for batch in reader(&slot.path, with_images)? {
-        let batch = batch.map_err(|error| corrupt(&slot.path, &error))?;
+        let batch = batch.map_err(|error| DatasetError::corrupt(&slot.path, &error))?;
         if row + batch.num_rows() > slot.frames {
             return Err(wrong_rows(slot, row + batch.num_rows()));
         }
@@ -137,11 +133,11 @@ fn reader(path: &Path, with_images: bool) -> Result<Batches, DatasetError> {
         let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
         parquet_file::batches(builder.with_projection(columns))
     });
-    built.map_err(|error| corrupt(path, &error))
+    built.map_err(|error| DatasetError::corrupt(path, &error))
 }
 
 fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
-    corrupt(
+    DatasetError::corrupt(
         &slot.path,
         &format!("it has {found} or more rows; its metadata states {}", slot.frames),
     )
@@ -198,7 +194,7 @@ fn read_batch(
     let first = (slot.first_frame + row) as i64;
     let indexes = column.numbers::<Int64Type>(INDEX)?;
     if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(corrupt(
+        return Err(DatasetError::corrupt(
             &slot.path,
             &"its column \"index\" does not number the frames one after another",
         ));
@@ -223,7 +219,7 @@ impl ImageBatch<'_> {
         mut take: impl FnMut(usize, &[u8]) -> Result<(), DatasetError>,
     ) -> Result<(), DatasetError> {
         let images = image_bytes(self.batch, key)
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
         let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
         for index in 0..images.len() {
             let row = self.row + index;
@@ -239,7 +235,7 @@ impl ImageBatch<'_> {
                     frame.width(),
                     frame.height()
                 );
-                return Err(corrupt(self.path, &reason));
+                return Err(DatasetError::corrupt(self.path, &reason));
             }
             take(row, frame.pixels())?;
         }
@@ -247,31 +243,31 @@ impl ImageBatch<'_> {
     }
 }
 
-pub(super) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
+pub(crate) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
     let images: &StructArray = batch.column_by_name(key)?.as_struct_opt()?;
     let bytes = images.column_by_name("bytes")?.as_binary_opt::<i32>()?;
     (bytes.null_count() == 0).then_some(bytes)
 }
 
 /// The columns of a batch. Errors name the file and the column.
-pub(super) struct Column<'a> {
-    pub(super) batch: &'a RecordBatch,
-    pub(super) path: &'a Path,
+pub(crate) struct Column<'a> {
+    pub(crate) batch: &'a RecordBatch,
+    pub(crate) path: &'a Path,
 }
 
 impl<'a> Column<'a> {
     /// The numbers of a column without null values. Errors: `Corrupt`.
-    pub(super) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
+    pub(crate) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
         self.batch
             .column_by_name(key)
             .and_then(|column| column.as_primitive_opt::<T>())
             .filter(|column| column.null_count() == 0)
             .map(|column| &column.values()[..])
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
     }
 
     /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
-    pub(super) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
+    pub(crate) fn vectors(&self, key: &str, size: usize) -> Result<&'a [f32], DatasetError> {
         match size {
             0 => return Ok(&[]),
             1 => return self.numbers::<Float32Type>(key),
@@ -282,13 +278,13 @@ impl<'a> Column<'a> {
             .column_by_name(key)
             .and_then(|column| column.as_fixed_size_list_opt())
             .filter(|list| list.null_count() == 0)
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
         if list.value_length() as usize != size {
             let reason = format!(
                 "column \"{key}\" has {} components; the metadata states {size}",
                 list.value_length()
             );
-            return Err(corrupt(self.path, &reason));
+            return Err(DatasetError::corrupt(self.path, &reason));
         }
         let values = list.values().as_primitive_opt::<Float32Type>();
         // A slice of a list array still refers to all values. Select those of its rows.
@@ -298,7 +294,7 @@ impl<'a> Column<'a> {
             .filter(|values| values.null_count() == 0)
             .and_then(|values| values.values().get(rows))
             .ok_or_else(|| {
-                corrupt(
+                DatasetError::corrupt(
                     self.path,
                     &format!("column \"{key}\" does not contain 32-bit floating-point numbers"),
                 )
@@ -306,11 +302,11 @@ impl<'a> Column<'a> {
     }
 
     /// The texts of a column; null values become none. Errors: `Corrupt`.
-    pub(super) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
+    pub(crate) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
         self.batch
             .column_by_name(key)
             .and_then(|column| column.as_string_opt::<i32>())
             .map(|column| column.iter().collect())
-            .ok_or_else(|| corrupt(self.path, &format!("it has no column \"{key}\" of text")))
+            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of text")))
     }
 }

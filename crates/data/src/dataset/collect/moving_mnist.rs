@@ -1,7 +1,7 @@
 //! Makes a data set of moving digits, as Moving MNIST, from files of digits. What is on disk depends only on the digits, the
 //! seed and the numbers of trials and frames; if it is stopped, the same call continues after the last whole shard.
 //!
-//! Such a data set is split by whole trials in their order (see [`sampler`](super::sampler)), so the last tenth of the trials
+//! Such a data set is split by whole trials in their order (see [`sampler`](crate::dataset::sampler)), so the last tenth of the trials
 //! gets the digits for test, the tenth before it those for validation.
 
 use std::fs::File;
@@ -13,13 +13,13 @@ use rand::seq::IndexedRandom;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::collect::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
-use super::collection::{arguments_text, finished_shard, has_arguments, lock};
+use super::config::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
 use super::digits::DigitPools;
-use super::layout::{DatasetMetadata, INFO, shard_path};
-use super::shard::{EncodedEpisode, ShardStart, build};
-use super::store::{FinishedShard, complete};
-use super::{DatasetError, DatasetInfo, EpisodeData, Split};
+use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
+use crate::dataset::store::layout::{DatasetMetadata, INFO};
+use crate::dataset::store::shard::EncodedEpisode;
+use crate::dataset::store::writer::ShardWriter;
+use crate::dataset::{DatasetError, DatasetInfo, EpisodeData, Split};
 use foreframe_core::types::Seed;
 use foreframe_sim::moving_digits::{DIGITS_FRAME_SIDE_PX, moving_digits};
 
@@ -137,29 +137,22 @@ pub fn collect_digits(
     if config.out.join(INFO).exists() {
         return DatasetMetadata::read(&config.out)?.info_in(&config.out);
     }
-    let info = config.info();
-    let mut finished: Vec<FinishedShard> = Vec::new();
-    let mut start = ShardStart { episode: 0, frame: 0 };
+    let mut writer = ShardWriter::new(&config.out, config.info());
     for shard in config.shards() {
-        on_progress(CollectProgress {
-            done: start.episode as u64,
-            total: config.trials,
-        });
+        let (done, total) = (writer.episode_count() as u64, config.trials);
+        on_progress(CollectProgress { done, total });
         if cancelled.load(Ordering::Relaxed) {
-            return Err(DatasetError::Cancelled {
-                done: start.episode as u64,
-                total: config.trials,
-            });
+            return Err(DatasetError::Cancelled { done, total });
         }
-        let written = match finished_shard(&config.out, shard, config.shard_trials(shard).count()) {
-            Some(written) => written,
-            None => write_shard(config, &info, &pools, (shard, start))?,
-        };
-        start.episode += written.records.len();
-        start.frame += written.frames();
-        finished.push(written);
+        let trials = config.shard_trials(shard);
+        if !writer.resume(Some(trials.clone().count())) {
+            let info = writer.info();
+            let encode = |trial| EncodedEpisode::new(info, trial as usize, config.trial(&pools, trial));
+            let episodes: Result<Vec<_>, _> = trials.into_par_iter().map(encode).collect();
+            writer.write(&episodes?)?;
+        }
     }
-    complete(&config.out, info, &finished)
+    writer.complete()
 }
 
 /// Takes an unused directory, or one with the same arguments, and locks it.
@@ -174,18 +167,4 @@ fn claim(config: &MovingMnistConfig, digits_sha256: &str) -> Result<File, Datase
     })?;
     has_arguments(&config.out, &arguments)?;
     lock(&config.out, &arguments)
-}
-
-fn write_shard(
-    config: &MovingMnistConfig,
-    info: &DatasetInfo,
-    pools: &DigitPools,
-    (shard, start): (usize, ShardStart),
-) -> Result<FinishedShard, DatasetError> {
-    let trials: Vec<u64> = config.shard_trials(shard).collect();
-    let episodes: Vec<EncodedEpisode> = trials
-        .into_par_iter()
-        .map(|trial| EncodedEpisode::new(info, trial as usize, config.trial(pools, trial)))
-        .collect::<Result<_, _>>()?;
-    FinishedShard::write(&config.out.join(shard_path(shard)), &build(info, start, &episodes)?)
 }

@@ -6,20 +6,38 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use super::DatasetError;
+use crate::dataset::error::DatasetError;
 use foreframe_core::files::{self, hex, is_partial_of};
 
 /// Writes a file atomically. Creates its directory if it is missing. Errors: `Io`.
-pub(super) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory)
         .and_then(|()| files::write_atomically(path, bytes))
         .map_err(DatasetError::io("write", path))
 }
 
+/// Writes a file that appears when it is whole. Creates its directory if it is missing. `write` gets the name of the file to
+/// write, which ends with `ending`. Errors: `Io`, and those of `write`.
+pub(crate) fn write_whole(
+    path: &Path,
+    ending: &str,
+    write: impl FnOnce(&Path) -> Result<(), DatasetError>,
+) -> Result<(), DatasetError> {
+    let directory = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(directory).map_err(DatasetError::io("make", directory))?;
+    let partial = path.with_extension(ending);
+    let written = write(&partial).and_then(|()| fs::rename(&partial, path).map_err(DatasetError::io("write", path)));
+    if written.is_err() {
+        // A later run overwrites it if it stays.
+        let _ = fs::remove_file(&partial);
+    }
+    written
+}
+
 /// Whether a directory is missing, empty, or contains only what was left by a program that was killed while it wrote the first
 /// file, `meta/…`. Errors: `Io`.
-pub(super) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
+pub(crate) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
     if !out.exists() {
         return Ok(true);
     }
@@ -43,7 +61,7 @@ pub(super) fn is_unused(out: &Path, first: &str) -> Result<bool, DatasetError> {
 }
 
 /// The SHA-256 of a file in hexadecimal. Errors: `Io`.
-pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
+pub(crate) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
     let mut hasher = Sha256::new();
     File::open(path)
         .and_then(|mut file| io::copy(&mut file, &mut hasher))
@@ -52,7 +70,7 @@ pub(super) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
 }
 
 /// Errors: `HashDiffers` unless the file has this SHA-256 (hexadecimal).
-pub(super) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
+pub(crate) fn verify(path: &Path, expected: &str) -> Result<(), DatasetError> {
     let found = sha256_of_file(path)?;
     if found == expected {
         return Ok(());

@@ -4,10 +4,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
-use super::shard::{EncodedEpisode, ShardStart, build};
-use super::shard_reader::{Column, batches, image_bytes, records};
-use super::{DatasetError, DatasetInfo, files};
+use crate::dataset::store::files;
+use crate::dataset::store::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
+use crate::dataset::store::shard::{EncodedEpisode, ShardStart, build};
+use crate::dataset::store::shard_reader::{Column, batches, image_bytes, records};
+use crate::dataset::{DatasetError, DatasetInfo};
 
 /// Their directory in the data set's.
 const DIRECTORY: &str = "unfinished";
@@ -17,7 +18,7 @@ fn path(out: &Path, shard: usize) -> PathBuf {
 }
 
 /// Saves the first trials of a shard; `first` is the number of its first trial. Errors: `Io`.
-pub(super) fn save(
+pub(crate) fn save(
     info: &DatasetInfo,
     out: &Path,
     (shard, first): (usize, u64),
@@ -31,12 +32,12 @@ pub(super) fn save(
 }
 
 /// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
-pub(super) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedEpisode> {
+pub(crate) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedEpisode> {
     read(info, &path(out, shard)).unwrap_or_default()
 }
 
 /// How many trials of a shard are saved.
-pub(super) fn count(out: &Path, shard: usize) -> usize {
+pub(crate) fn count(out: &Path, shard: usize) -> usize {
     let path = path(out, shard);
     if path.is_file() {
         records(&path).map_or(0, |records| records.len())
@@ -46,7 +47,7 @@ pub(super) fn count(out: &Path, shard: usize) -> usize {
 }
 
 /// Deletes the saved trials of all shards, after every shard is complete. Errors: `Io`.
-pub(super) fn remove_all(out: &Path) -> Result<(), DatasetError> {
+pub(crate) fn remove_all(out: &Path) -> Result<(), DatasetError> {
     let dir = out.join(DIRECTORY);
     match fs::remove_dir_all(&dir) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(DatasetError::io("delete", &dir)(error)),
@@ -55,10 +56,6 @@ pub(super) fn remove_all(out: &Path) -> Result<(), DatasetError> {
 }
 
 fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetError> {
-    let corrupt = |reason: &str| DatasetError::Corrupt {
-        path: path.to_owned(),
-        reason: reason.to_owned(),
-    };
     let mut rows = Rows::default();
     for batch in &batches(path)? {
         let column = Column { batch, path };
@@ -73,7 +70,7 @@ fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetE
     }
     let records = records(path)?;
     if records.iter().map(|record| record.frames).sum::<usize>() != rows.images.len() {
-        return Err(corrupt("its records do not count its rows"));
+        return Err(DatasetError::corrupt(path, &"its records do not count its rows"));
     }
     let episodes = records.into_iter().map(|record| {
         let frames = record.frames;
@@ -100,10 +97,8 @@ struct Rows {
 }
 
 fn image_column(column: &Column<'_>, key: &str) -> Result<Vec<Vec<u8>>, DatasetError> {
-    let images = image_bytes(column.batch, key).ok_or_else(|| DatasetError::Corrupt {
-        path: column.path.to_owned(),
-        reason: format!("it has no column \"{key}\" of images"),
-    })?;
+    let missing = || DatasetError::corrupt(column.path, &format!("it has no column \"{key}\" of images"));
+    let images = image_bytes(column.batch, key).ok_or_else(missing)?;
     Ok((0..column.batch.num_rows())
         .map(|row| images.value(row).to_vec())
         .collect())

@@ -1,9 +1,11 @@
-//! The small tables of a data set: tasks, episodes and statistics of every column.
+//! The small tables of a data set: tasks, episodes and statistics of every column; writes them, and reads the episodes.
 
 use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
 use std::sync::Arc;
 
 use arrow_array::builder::{Float64Builder, ListBuilder, StringBuilder};
+use arrow_array::types::Int64Type;
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema};
 use parquet::arrow::ArrowWriter;
@@ -14,13 +16,16 @@ use serde_json::{Value, json};
 
 use super::layout::{COUNTERS, IMAGE, MASK, shard_location};
 use super::shard::EpisodeRecord;
+use super::shard_reader::{Column, batches};
 use super::stats::ChannelStats;
+use crate::dataset::{DatasetError, DatasetInfo, Episode};
+use foreframe_sim::TrialParameters;
 
 /// One row of the table of episodes: the record, the shard and the first frame.
-pub(super) struct EpisodeRow<'a> {
-    pub(super) record: &'a EpisodeRecord,
-    pub(super) shard: usize,
-    pub(super) first_frame: usize,
+pub(crate) struct EpisodeRow<'a> {
+    pub(crate) record: &'a EpisodeRecord,
+    pub(crate) shard: usize,
+    pub(crate) first_frame: usize,
 }
 
 impl EpisodeRow<'_> {
@@ -37,7 +42,7 @@ impl EpisodeRow<'_> {
 }
 
 /// A table with one task, in the format of a pandas index named `task`, because LeRobot uses it to find tasks.
-pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
+pub(crate) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
     let column = |name: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
     let pandas = json!({
         "index_columns": ["task"],
@@ -54,12 +59,12 @@ pub(super) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
 }
 
 /// The table of episodes: position, trial parameters and statistics of every column.
-pub(super) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
+pub(crate) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
     write(episode_columns(rows, task), &[])
 }
 
 /// The same of a data set whose frames are videos, one for each shard.
-pub(super) fn episodes_with_videos(
+pub(crate) fn episodes_with_videos(
     rows: &[EpisodeRow<'_>],
     task: &str,
     frame_period_s: f64,
@@ -193,7 +198,7 @@ fn image_lists(lists: &[&[f64]]) -> ArrayRef {
 }
 
 /// LeRobot's `stats.json`: the statistics of every column over all episodes.
-pub(super) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
+pub(crate) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
     let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
     let mut features = serde_json::Map::new();
     for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
@@ -232,4 +237,38 @@ fn write(columns: Vec<(String, ArrayRef)>, metadata: &[(&str, String)]) -> Resul
     let mut writer = ArrowWriter::try_new(Vec::new(), schema, Some(properties))?;
     writer.write(&batch)?;
     writer.into_inner()
+}
+
+/// Reads the table of episodes. Errors: `Io`, `Corrupt`.
+pub(crate) fn read_episodes(path: &Path, info: &DatasetInfo) -> Result<Vec<Episode>, DatasetError> {
+    let corrupt = |reason: String| DatasetError::corrupt(path, &reason);
+    let mut episodes = Vec::with_capacity(info.episode_count);
+    let mut first_frame = 0;
+    for batch in &batches(path)? {
+        let column = Column { batch, path };
+        let lengths = column.numbers::<Int64Type>("length")?;
+        for (&length, trial) in lengths.iter().zip(column.texts("trial")?) {
+            let frame_count = usize::try_from(length).map_err(|error| corrupt(error.to_string()))?;
+            let trial: Option<TrialParameters> = trial
+                .map(serde_json::from_str)
+                .transpose()
+                .map_err(|error| corrupt(format!("trial of episode {}: {error}", episodes.len())))?;
+            episodes.push(Episode {
+                index: episodes.len(),
+                first_frame,
+                frame_count,
+                trial,
+            });
+            first_frame += frame_count;
+        }
+    }
+    if (episodes.len(), first_frame) != (info.episode_count, info.frame_count) {
+        return Err(corrupt(format!(
+            "it has {} episodes with {first_frame} frames in total; the metadata states {} episodes with {} frames",
+            episodes.len(),
+            info.episode_count,
+            info.frame_count
+        )));
+    }
+    Ok(episodes)
 }

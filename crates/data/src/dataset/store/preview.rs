@@ -5,8 +5,8 @@ use std::path::Path;
 use super::files::verify;
 use super::layout::{DatasetMetadata, EPISODES};
 use super::shard_reader::{FrameTarget, ShardSlot, read};
-use super::store::read_episodes;
-use super::{Dataset, DatasetError, DatasetInfo};
+use super::tables::read_episodes;
+use crate::dataset::{Dataset, DatasetError, DatasetInfo};
 use foreframe_core::frame::Frame;
 
 /// The description of the finished data set in a directory, without reading its frames.
@@ -15,7 +15,7 @@ pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
     DatasetMetadata::read(directory)?.info_in(directory)
 }
 
-/// The description of a data set from the text of its metadata file ([`super::METADATA`]). Errors: `Corrupt`; they name
+/// The description of a data set from the text of its metadata file ([`METADATA`](super::layout::METADATA)). Errors: `Corrupt`; they name
 /// `path`.
 pub fn describe_metadata(path: &Path, text: &[u8]) -> Result<DatasetInfo, DatasetError> {
     Ok(DatasetMetadata::parse(path, text)?.info())

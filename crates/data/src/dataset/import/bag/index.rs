@@ -1,4 +1,4 @@
-//! What one pass over a bag collects: where the images are, and the values and times of everything else that may be used.
+//! The index of a bag, made by one pass over its files: where the images are, and the values and times of everything else that may be used.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
-use crate::dataset::import::{ImportError, ImportOptions, SkippedItem, SkippedList};
+use crate::dataset::import::skipped::{SkippedItem, SkippedList};
+use crate::dataset::import::{ImportError, ImportOptions};
 
 /// The maximum number of topics that can be imported, and of others.
 const MAX_TOPICS: usize = 4096;
@@ -40,7 +41,7 @@ pub(super) struct ImageEntry {
     pub(super) time: MessageTime,
     /// Its number in its topic, from 0.
     pub(super) number: u64,
-    /// Position of its file in [`Collector::files`].
+    /// Position of its file in [`BagIndex::files`].
     pub(super) file: usize,
     pub(super) position: Position,
 }
@@ -125,8 +126,8 @@ pub(super) struct Topic {
     pub(super) faults: SkippedList,
 }
 
-/// Receives all messages of a bag's files, one file after the other.
-pub(super) struct Collector<'a> {
+/// The index of a bag. It receives the messages of the bag's files, one file after the other.
+pub(super) struct BagIndex<'a> {
     pub(super) source: &'a Path,
     pub(super) options: &'a ImportOptions,
     cancelled: &'a AtomicBool,
@@ -139,7 +140,7 @@ pub(super) struct Collector<'a> {
     pub(super) skipped: SkippedList,
 }
 
-impl<'a> Collector<'a> {
+impl<'a> BagIndex<'a> {
     pub(super) fn new(source: &'a Path, options: &'a ImportOptions, cancelled: &'a AtomicBool) -> Self {
         Self {
             source,
@@ -169,11 +170,7 @@ impl<'a> Collector<'a> {
 
     /// Lists damage, or refuses it. Errors: `Record`.
     pub(super) fn fault(&mut self, place: String, reason: String) -> Result<(), ImportError> {
-        if !self.options.skip_bad {
-            return Err(ImportError::Record { place, reason });
-        }
-        self.skipped.push(SkippedItem::new(&place, &reason));
-        Ok(())
+        ImportError::record(place, reason).leave_out(self.options.skip_bad, &mut self.skipped)
     }
 
     /// The number of a topic, the same for the same name and type. Errors: why it is refused.

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::{DatasetError, DatasetInfo};
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::{PositionedFile, is_partial, open_lock, partial_path};
 
 /// The directory in a data set's directory. Backups leave out hidden directories.
@@ -26,7 +26,7 @@ const LOG_EVERY: Duration = Duration::from_secs(10);
 
 /// An image of a frame: what the camera saw, or which pixels show which robot.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum FrameImage {
+pub(crate) enum FrameImage {
     Pixels,
     Mask,
 }
@@ -70,13 +70,13 @@ impl FileLayout {
 }
 
 /// The place of a data set's file of decoded frames.
-pub(super) struct FrameFilePlace {
+pub(crate) struct FrameFilePlace {
     path: PathBuf,
     layout: FileLayout,
 }
 
 impl FrameFilePlace {
-    pub(super) fn of(directory: &Path, info: &DatasetInfo) -> Self {
+    pub(crate) fn of(directory: &Path, info: &DatasetInfo) -> Self {
         let hash = info.content_hash.get(..HASH_DIGITS).unwrap_or(&info.content_hash);
         let name = format!("frames-{}x{}-{hash}", info.frame_width_px, info.frame_height_px);
         Self {
@@ -86,7 +86,7 @@ impl FrameFilePlace {
     }
 
     /// The file, if it is complete. Errors: `Io`.
-    pub(super) fn open(&self) -> Result<Option<FrameFile>, DatasetError> {
+    pub(crate) fn open(&self) -> Result<Option<FrameFile>, DatasetError> {
         let opened = File::open(&self.path).and_then(|file| Ok((file.metadata()?.len(), file)));
         match opened {
             Ok((length, file)) if length == self.layout.total_bytes() => Ok(Some(FrameFile {
@@ -107,7 +107,7 @@ impl FrameFilePlace {
     }
 
     /// Locks the directory, creating it if it is missing. Waits while another process decodes. Errors: `FrameFile`.
-    pub(super) fn lock(&self) -> Result<File, DatasetError> {
+    pub(crate) fn lock(&self) -> Result<File, DatasetError> {
         let directory = self.path.parent().unwrap_or(Path::new("."));
         let opened = fs::create_dir_all(directory).and_then(|()| open_lock(&directory.join(LOCK)));
         let lock = opened.map_err(|error| self.failed(error))?;
@@ -121,7 +121,7 @@ impl FrameFilePlace {
 
     /// Starts to write the file. Deletes those of other data and of killed writers; the caller holds the lock.
     /// Errors: `FrameFile`.
-    pub(super) fn create(&self) -> Result<FrameFileWriter<'_>, DatasetError> {
+    pub(crate) fn create(&self) -> Result<FrameFileWriter<'_>, DatasetError> {
         let directory = self.path.parent().unwrap_or(Path::new("."));
         for entry in fs::read_dir(directory).map_err(|error| self.failed(error))?.flatten() {
             let name = entry.file_name();
@@ -154,7 +154,7 @@ impl FrameFilePlace {
 }
 
 /// A file of decoded frames that is being written.
-pub(super) struct FrameFileWriter<'a> {
+pub(crate) struct FrameFileWriter<'a> {
     place: &'a FrameFilePlace,
     file: PositionedFile,
     partial: PathBuf,
@@ -163,7 +163,7 @@ pub(super) struct FrameFileWriter<'a> {
 
 impl FrameFileWriter<'_> {
     /// Writes a frame; threads may write different frames at the same time. Errors: `FrameFile`.
-    pub(super) fn write(&self, image: FrameImage, frame: usize, pixels: &[u8]) -> Result<(), DatasetError> {
+    pub(crate) fn write(&self, image: FrameImage, frame: usize, pixels: &[u8]) -> Result<(), DatasetError> {
         let mut record = Vec::with_capacity(self.place.layout.record_bytes());
         record.extend_from_slice(pixels);
         record.extend_from_slice(&crc32fast::hash(pixels).to_le_bytes());
@@ -176,7 +176,7 @@ impl FrameFileWriter<'_> {
     }
 
     /// Completes the file after all frames are written. Errors: `FrameFile`, `Io`.
-    pub(super) fn finish(self) -> Result<FrameFile, DatasetError> {
+    pub(crate) fn finish(self) -> Result<FrameFile, DatasetError> {
         let place = self.place;
         let finished = self.file.sync().and_then(|()| fs::rename(&self.partial, &place.path));
         finished.map_err(|error| place.failed(error))?;
@@ -227,7 +227,7 @@ impl DecodingProgress {
 
 /// A complete file of decoded frames.
 #[derive(Debug)]
-pub(super) struct FrameFile {
+pub(crate) struct FrameFile {
     path: PathBuf,
     file: PositionedFile,
     layout: FileLayout,
@@ -235,7 +235,7 @@ pub(super) struct FrameFile {
 
 impl FrameFile {
     /// The pixels of a frame, row by row. Panics if there is no such frame. Errors: `Io`, `Corrupt`.
-    pub(super) fn read(&self, image: FrameImage, frame: usize) -> Result<Vec<u8>, DatasetError> {
+    pub(crate) fn read(&self, image: FrameImage, frame: usize) -> Result<Vec<u8>, DatasetError> {
         let frames = self.layout.frames;
         assert!(frame < frames, "frame {frame} of {frames} frames is a bug");
         let mut record = vec![0; self.layout.record_bytes()];
@@ -246,13 +246,11 @@ impl FrameFile {
         if checksum == crc32fast::hash(&record).to_le_bytes() {
             return Ok(record);
         }
-        Err(DatasetError::Corrupt {
-            path: self.path.clone(),
-            reason: format!("frame {frame} has another checksum; delete this file, and it is written again"),
-        })
+        let reason = format!("frame {frame} has another checksum; delete this file, and it is written again");
+        Err(DatasetError::corrupt(&self.path, &reason))
     }
 
-    pub(super) fn has_masks(&self) -> bool {
+    pub(crate) fn has_masks(&self) -> bool {
         self.layout.has_masks
     }
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{DatasetError, DatasetInfo};
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::{Channel, Seed};
@@ -16,37 +16,37 @@ pub const INFO: &str = "meta/info.json";
 /// Foreframe's metadata: hashes and exact values.
 pub const METADATA: &str = "meta/foreframe.json";
 /// The arguments of the collection. They are written first.
-pub(super) const ARGUMENTS: &str = "meta/collect.json";
+pub(crate) const ARGUMENTS: &str = "meta/collect.json";
 /// The source and options of an import. They are written first.
 pub const IMPORT_ARGUMENTS: &str = "meta/import.json";
 /// Statistics of every column.
-pub(super) const STATS: &str = "meta/stats.json";
+pub(crate) const STATS: &str = "meta/stats.json";
 /// The table of tasks, with one task.
-pub(super) const TASKS: &str = "meta/tasks.parquet";
+pub(crate) const TASKS: &str = "meta/tasks.parquet";
 /// The table of episodes.
-pub(super) const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
+pub(crate) const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
 
 /// Largest number of files in one chunk directory.
 const CHUNK_FILES: usize = 1000;
 
 /// Names of the columns.
-pub(super) const IMAGE: &str = "observation.image";
-pub(super) const MASK: &str = "observation.mask";
-pub(super) const STATE: &str = "observation.state";
-pub(super) const ACTION: &str = "action";
-pub(super) const TIMESTAMP: &str = "timestamp";
+pub(crate) const IMAGE: &str = "observation.image";
+pub(crate) const MASK: &str = "observation.mask";
+pub(crate) const STATE: &str = "observation.state";
+pub(crate) const ACTION: &str = "action";
+pub(crate) const TIMESTAMP: &str = "timestamp";
 /// The number of a frame in the data set.
-pub(super) const INDEX: &str = "index";
+pub(crate) const INDEX: &str = "index";
 /// Counters that LeRobot stores for every frame.
-pub(super) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", INDEX, "task_index"];
+pub(crate) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", INDEX, "task_index"];
 
 /// Number of a shard's chunk directory, and of its file in that directory.
-pub(super) fn shard_location(shard: usize) -> (usize, usize) {
+pub(crate) fn shard_location(shard: usize) -> (usize, usize) {
     (shard / CHUNK_FILES, shard % CHUNK_FILES)
 }
 
 /// Path of a shard in the data set's directory.
-pub(super) fn shard_path(shard: usize) -> PathBuf {
+pub(crate) fn shard_path(shard: usize) -> PathBuf {
     let (chunk, file) = shard_location(shard);
     PathBuf::from(format!("data/chunk-{chunk:03}/file-{file:03}.parquet"))
 }
@@ -54,39 +54,39 @@ pub(super) fn shard_path(shard: usize) -> PathBuf {
 /// One shard in the metadata.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ShardEntry {
-    pub(super) path: PathBuf,
-    pub(super) sha256: String,
-    pub(super) episodes: usize,
-    pub(super) frames: usize,
+pub(crate) struct ShardEntry {
+    pub(crate) path: PathBuf,
+    pub(crate) sha256: String,
+    pub(crate) episodes: usize,
+    pub(crate) frames: usize,
 }
 
 /// The content of `meta/foreframe.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct DatasetMetadata {
-    pub(super) program_version: String,
-    pub(super) name: String,
-    pub(super) scenario: Option<String>,
-    pub(super) seed: Option<Seed>,
-    pub(super) frame_width_px: u32,
-    pub(super) frame_height_px: u32,
-    pub(super) frame_period_s: f64,
-    pub(super) action_channels: Vec<Channel>,
-    pub(super) state_channels: Vec<Channel>,
-    pub(super) has_masks: bool,
+pub(crate) struct DatasetMetadata {
+    pub(crate) program_version: String,
+    pub(crate) name: String,
+    pub(crate) scenario: Option<String>,
+    pub(crate) seed: Option<Seed>,
+    pub(crate) frame_width_px: u32,
+    pub(crate) frame_height_px: u32,
+    pub(crate) frame_period_s: f64,
+    pub(crate) action_channels: Vec<Channel>,
+    pub(crate) state_channels: Vec<Channel>,
+    pub(crate) has_masks: bool,
     /// Absent in data sets that were collected before it was recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) camera: Option<CameraModel>,
-    pub(super) content_hash: String,
-    pub(super) episodes_sha256: String,
-    pub(super) shards: Vec<ShardEntry>,
+    pub(crate) camera: Option<CameraModel>,
+    pub(crate) content_hash: String,
+    pub(crate) episodes_sha256: String,
+    pub(crate) shards: Vec<ShardEntry>,
 }
 
 impl DatasetMetadata {
     /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotADataset`, `OtherTool`,
     /// `Corrupt`.
-    pub(super) fn read(directory: &Path) -> Result<Self, DatasetError> {
+    pub(crate) fn read(directory: &Path) -> Result<Self, DatasetError> {
         let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
             let found = std::fs::read_to_string(arguments);
@@ -114,7 +114,7 @@ impl DatasetMetadata {
 
     /// The description of the data set in that directory. Metadata of older data sets have no camera model; it is then taken
     /// from the arguments of the collection. Errors: `Corrupt`, `Io`.
-    pub(super) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
+    pub(crate) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
         let mut info = self.info();
         info.world = collected_world(directory)?;
         let camera = info.world.as_ref().map(|world| &world.camera);
@@ -123,22 +123,17 @@ impl DatasetMetadata {
     }
 
     /// Parses and checks the text of a metadata file. Errors: `Corrupt`; they name `path`.
-    pub(super) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
-        let corrupt = |reason| DatasetError::Corrupt {
-            path: path.to_owned(),
-            reason,
-        };
-        let metadata: Self = serde_json::from_slice(text).map_err(|error| corrupt(error.to_string()))?;
+    pub(crate) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
+        let metadata: Self = serde_json::from_slice(text).map_err(|error| DatasetError::corrupt(path, &error))?;
         if metadata.content_hash != content_hash(&metadata.shards) {
-            return Err(corrupt(
-                "its content hash does not match the shards that it lists".to_owned(),
-            ));
+            let reason = "its content hash does not match the shards that it lists";
+            return Err(DatasetError::corrupt(path, &reason));
         }
         Ok(metadata)
     }
 
     /// The description of the data set.
-    pub(super) fn info(&self) -> DatasetInfo {
+    pub(crate) fn info(&self) -> DatasetInfo {
         DatasetInfo {
             name: self.name.clone(),
             frame_width_px: self.frame_width_px,
@@ -173,15 +168,13 @@ fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError
         return Ok(None);
     }
     let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
-    let arguments: CollectedWith = serde_json::from_slice(&text).map_err(|error| DatasetError::Corrupt {
-        path,
-        reason: error.to_string(),
-    })?;
+    let arguments: CollectedWith =
+        serde_json::from_slice(&text).map_err(|error| DatasetError::corrupt(&path, &error))?;
     Ok(arguments.world)
 }
 
 /// The SHA-256 of the shards' hexadecimal hashes, one after another, in hexadecimal.
-pub(super) fn content_hash(shards: &[ShardEntry]) -> String {
+pub(crate) fn content_hash(shards: &[ShardEntry]) -> String {
     let hashes: String = shards.iter().map(|shard| shard.sha256.as_str()).collect();
     sha256_hex(hashes.as_bytes())
 }
@@ -192,7 +185,7 @@ fn one_line(text: &str) -> String {
 }
 
 /// LeRobot's `info.json` of a data set.
-pub(super) fn lerobot_info(info: &DatasetInfo) -> Value {
+pub(crate) fn lerobot_info(info: &DatasetInfo) -> Value {
     json!({
         "codebase_version": "v3.0",
         "robot_type": "turtlebot",
@@ -249,7 +242,7 @@ fn lerobot_features(info: &DatasetInfo) -> Value {
 }
 
 /// The columns in the format of the `datasets` library, for the Parquet schema's `huggingface` entry.
-pub(super) fn huggingface_features(info: &DatasetInfo) -> Value {
+pub(crate) fn huggingface_features(info: &DatasetInfo) -> Value {
     let value = |dtype: &str| json!({"dtype": dtype, "_type": "Value"});
     let mut features = serde_json::Map::new();
     features.insert(IMAGE.to_owned(), json!({"_type": "Image"}));

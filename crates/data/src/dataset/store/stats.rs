@@ -4,18 +4,18 @@ use serde::{Deserialize, Serialize};
 
 /// Statistics of one column, with one value for each component.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct ChannelStats {
-    pub(super) min: Vec<f64>,
-    pub(super) max: Vec<f64>,
-    pub(super) mean: Vec<f64>,
-    pub(super) std: Vec<f64>,
+pub(crate) struct ChannelStats {
+    pub(crate) min: Vec<f64>,
+    pub(crate) max: Vec<f64>,
+    pub(crate) mean: Vec<f64>,
+    pub(crate) std: Vec<f64>,
     /// Number of frames.
-    pub(super) count: u64,
+    pub(crate) count: u64,
 }
 
 impl ChannelStats {
     /// Statistics of rows of `size` numbers, one row for each frame.
-    pub(super) fn of_rows(rows: &[f64], size: usize) -> Self {
+    pub(crate) fn of_rows(rows: &[f64], size: usize) -> Self {
         let count = rows.len() / size.max(1);
         let mut stats = Self::with_components(size, count as u64);
         for component in 0..size {
@@ -31,7 +31,7 @@ impl ChannelStats {
     }
 
     /// Statistics of the pixels of `frames` frames, scaled so that 255 is 1.
-    pub(super) fn of_pixels(pixels: &[u8], frames: usize) -> Self {
+    pub(crate) fn of_pixels(pixels: &[u8], frames: usize) -> Self {
         let mut histogram = [0u64; 256];
         for &pixel in pixels {
             histogram[usize::from(pixel)] += 1;
@@ -54,7 +54,7 @@ impl ChannelStats {
     }
 
     /// Statistics of all parts together, each weighted by its number of frames.
-    pub(super) fn merged(parts: &[&Self]) -> Self {
+    pub(crate) fn merged(parts: &[&Self]) -> Self {
         let size = parts.first().map_or(0, |part| part.mean.len());
         let count: u64 = parts.iter().map(|part| part.count).sum();
         let mut stats = Self::with_components(size, count);

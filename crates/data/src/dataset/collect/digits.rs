@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use flate2::read::MultiGzDecoder;
 use sha2::{Digest, Sha256};
 
-use super::{DatasetError, Split};
+use crate::dataset::{DatasetError, Split};
 use foreframe_core::files::{files_below, hex};
 use foreframe_core::frame::codec;
 use foreframe_sim::moving_digits::{DIGIT_PIXELS, DIGIT_SIDE_PX};
@@ -29,10 +29,10 @@ const MAX_FILE_BYTES: u64 = 1 << 28;
 const PART: usize = 10;
 
 /// A digit's intensities, row by row, 0 for black.
-pub(super) type DigitImage = [u8; DIGIT_PIXELS];
+pub(crate) type DigitImage = [u8; DIGIT_PIXELS];
 
 /// Digits for each split. No digit is in two of them.
-pub(super) struct DigitPools {
+pub(crate) struct DigitPools {
     train: Vec<DigitImage>,
     validation: Vec<DigitImage>,
     test: Vec<DigitImage>,
@@ -42,7 +42,7 @@ impl DigitPools {
     /// Reads digits from an IDX file, a folder with MNIST's two IDX files, a folder of PNG images, or one with folders
     /// `train` and `test` of them. Of files for training and test, a tenth of those for training is for validation; of a
     /// single file or folder, a tenth each is for validation and test. Errors: `Io`, `Digits`.
-    pub(super) fn read(path: &Path) -> Result<Self, DatasetError> {
+    pub(crate) fn read(path: &Path) -> Result<Self, DatasetError> {
         let found = |names: &[&str]| names.iter().map(|name| path.join(name)).find(|file| file.exists());
         let parts = found(&TRAIN_FILES)
             .zip(found(&TEST_FILES))
@@ -82,7 +82,7 @@ impl DigitPools {
     }
 
     /// The digits for the trials of a split.
-    pub(super) fn of(&self, split: Split) -> &[DigitImage] {
+    pub(crate) fn of(&self, split: Split) -> &[DigitImage] {
         match split {
             Split::Train => &self.train,
             Split::Validation => &self.validation,
@@ -91,7 +91,7 @@ impl DigitPools {
     }
 
     /// SHA-256 of all digits, in hexadecimal.
-    pub(super) fn hash(&self) -> String {
+    pub(crate) fn hash(&self) -> String {
         let mut hasher = Sha256::new();
         for pool in [&self.train, &self.validation, &self.test] {
             hasher.update((pool.len() as u64).to_le_bytes());

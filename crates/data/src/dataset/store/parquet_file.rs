@@ -13,7 +13,7 @@ use parquet::errors::ParquetError;
 
 /// A reader of the file, which still has to be built with [`batches`]. Errors: the file is not Parquet, is damaged, or a column is
 /// outside of it.
-pub(super) fn open(file: File) -> Result<ParquetRecordBatchReaderBuilder<File>, ParquetError> {
+pub(crate) fn open(file: File) -> Result<ParquetRecordBatchReaderBuilder<File>, ParquetError> {
     let length = file.metadata()?.len();
     let builder = guarded(|| ParquetRecordBatchReaderBuilder::try_new(file)).map_err(ParquetError::General)??;
     for (number, group) in builder.metadata().row_groups().iter().enumerate() {
@@ -37,13 +37,13 @@ pub(super) fn open(file: File) -> Result<ParquetRecordBatchReaderBuilder<File>, 
 }
 
 /// The rows of the builder's file. Errors: the file is damaged.
-pub(super) fn batches(builder: ParquetRecordBatchReaderBuilder<File>) -> Result<Batches, ParquetError> {
+pub(crate) fn batches(builder: ParquetRecordBatchReaderBuilder<File>) -> Result<Batches, ParquetError> {
     let reader = guarded(|| builder.build()).map_err(ParquetError::General)??;
     Ok(Batches(Some(reader)))
 }
 
 /// Rows of a file, some at a time. Ends after a panic of the library.
-pub(super) struct Batches(Option<ParquetRecordBatchReader>);
+pub(crate) struct Batches(Option<ParquetRecordBatchReader>);
 
 impl Iterator for Batches {
     type Item = Result<RecordBatch, ArrowError>;

@@ -1,0 +1,143 @@
+//! Errors of imports, and which of them are damage that may be left out.
+
+use std::path::{Path, PathBuf};
+
+use super::skipped::{SkippedItem, SkippedList};
+use crate::dataset::error::DatasetError;
+use foreframe_core::frame::FrameError;
+
+/// Why a recording could not be imported: file and place, what was wrong, what would be right.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ImportError {
+    /// The source is of no known kind.
+    #[error(
+        "{} is not a recording that can be imported; give a folder of PNG or JPEG images (with or without a CSV), a \
+         Donkeycar tub (manifest.json), a LeRobot data set (meta/info.json), a bag of ROS 2 (.mcap, .db3 or its directory), a .npy \
+         or .npz file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
+        .0.display()
+    )]
+    UnknownSource(PathBuf),
+    /// An option does not fit the source.
+    #[error("{0}")]
+    Option(String),
+    /// An option's value is out of range.
+    #[error("--{option} is {value}; {right}")]
+    OptionValue {
+        /// The option of `foreframe import`, without dashes.
+        option: &'static str,
+        /// Its value.
+        value: String,
+        /// What would be right.
+        right: String,
+    },
+    /// A file could not be read or written.
+    #[error("could not {action} {}", path.display())]
+    Io {
+        /// `read`, `write`, …
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A record is wrong.
+    #[error("{place}: {reason}; mend it, or leave out what is damaged with --skip-bad")]
+    Record {
+        /// File and line, frame or position.
+        place: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// An image cannot be decoded.
+    #[error("{place}: {} is damaged; replace it, or leave out what is damaged with --skip-bad", path.display())]
+    Image {
+        /// File and line of the record.
+        place: String,
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: FrameError,
+    },
+    /// Nothing is left to import.
+    #[error("{} holds no two consecutive frames; a data set needs more", .0.display())]
+    Empty(PathBuf),
+    /// Another import uses the directory with other options, or it holds something else.
+    #[error("{} exists and belongs to something else ({what}); name a new directory", path.display())]
+    OutExists {
+        /// The directory.
+        path: PathBuf,
+        /// What is there.
+        what: String,
+    },
+    /// A program that is needed is missing or failed.
+    #[error("{0}")]
+    Program(String),
+    /// It was cancelled; what was written stays.
+    #[error("stopped after {done} of {total} frames; the same command continues")]
+    Cancelled {
+        /// Frames written.
+        done: u64,
+        /// Frames in all.
+        total: u64,
+    },
+    /// It was cancelled before the first frame.
+    #[error("stopped while the recording was read; the same command reads it again")]
+    Stopped,
+    /// The frames need more room beside the data set than they may have.
+    #[error(
+        "the compressed frames need {needed_mib} MiB of disk space during the import; the setting import_disk_mib allows \
+         {limit_mib} MiB: raise it, or save the array without compression"
+    )]
+    Disk {
+        /// What they need.
+        needed_mib: u64,
+        /// What they may have.
+        limit_mib: u64,
+    },
+    /// The data set could not be written.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+}
+
+impl ImportError {
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+
+    pub(super) fn image(place: &str, path: impl Into<PathBuf>) -> impl FnOnce(FrameError) -> Self {
+        let (place, path) = (place.to_owned(), path.into());
+        move |source| Self::Image { place, path, source }
+    }
+
+    pub(super) fn record(place: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Record {
+            place: place.into(),
+            reason: reason.into(),
+        }
+    }
+
+    /// The item to list when what is damaged is left out; `None` if it is no damage of a single item.
+    pub(super) fn skippable(&self) -> Option<SkippedItem> {
+        match self {
+            Self::Record { place, reason } => Some(SkippedItem::new(place, reason)),
+            Self::Image { place, path, source } => {
+                let reason = format!("{} is damaged: {source}", path.display());
+                Some(SkippedItem::new(place, &reason))
+            }
+            _ => None,
+        }
+    }
+
+    /// Lists what is damaged, if it may be left out. Errors: itself, if not.
+    pub(super) fn leave_out(self, skip_bad: bool, skipped: &mut SkippedList) -> Result<(), Self> {
+        match self.skippable().filter(|_| skip_bad) {
+            Some(item) => {
+                skipped.push(item);
+                Ok(())
+            }
+            None => Err(self),
+        }
+    }
+}

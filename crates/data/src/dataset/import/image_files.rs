@@ -1,0 +1,34 @@
+//! Images in files of their own.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use super::error::ImportError;
+use super::files::read_file;
+use super::recording::{ImageSource, WantedImage};
+use foreframe_core::files::is_transient;
+use foreframe_core::frame::{Frame, codec};
+
+/// Image files, by image number.
+pub(super) struct ImageFiles(pub(super) Vec<PathBuf>);
+
+impl ImageSource for ImageFiles {
+    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let WantedImage { image, place } = *wanted;
+        let path = &self.0[image];
+        codec::decode(&read_image(path, place)?).map_err(ImportError::image(place, path))
+    }
+}
+
+/// The bytes of an image file. Errors: `Record` if it is missing or cannot be read, `Io` where trying again may help.
+pub(super) fn read_image(path: &Path, place: &str) -> Result<Vec<u8>, ImportError> {
+    read_file(path).map_err(|error| match error {
+        ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
+            ImportError::record(place, format!("the image {} is missing", path.display()))
+        }
+        ImportError::Io { source, .. } if !is_transient(&source) => {
+            ImportError::record(place, format!("the image {} cannot be read: {source}", path.display()))
+        }
+        other => other,
+    })
+}

@@ -1,0 +1,149 @@
+//! What is imported, and how a recording is read.
+
+use std::fmt::Display;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::error::ImportError;
+use foreframe_core::frame::MAX_SIDE_PX;
+use foreframe_core::frame::fit::Fit;
+
+/// The largest [`ImportOptions::every`].
+const MAX_EVERY: usize = 1_000_000;
+
+/// What to import, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImportConfig {
+    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a bag, a `NumPy` file or a video.
+    pub source: PathBuf,
+    /// The data set's directory.
+    pub out: PathBuf,
+    /// How its records are read.
+    pub options: ImportOptions,
+    /// Disk space for frames that are decompressed before they are imported, in MiB.
+    pub disk_mib: u64,
+}
+
+/// The default of [`ImportConfig::disk_mib`].
+pub const DEFAULT_DISK_MIB: u64 = 16 << 10;
+
+/// How a recording is read. All of it has defaults. With the feature `cli`, the fields are options of `foreframe import`, whose
+/// help is what is written above them; the program sets width and height.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
+pub struct ImportOptions {
+    /// Width of the data set's frames in pixels
+    #[cfg_attr(feature = "cli", arg(skip))]
+    pub frame_width_px: u32,
+    /// Height of the data set's frames in pixels
+    #[cfg_attr(feature = "cli", arg(skip))]
+    pub frame_height_px: u32,
+    /// How images of another shape are fitted: crop, letterbox or stretch
+    #[cfg_attr(feature = "cli", arg(long, default_value = "crop"))]
+    pub fit: Fit,
+    /// Frames per second: of the data set or, where the source has no times, of the recording
+    #[cfg_attr(feature = "cli", arg(long = "rate", value_name = "HZ"))]
+    pub rate_hz: Option<f64>,
+    /// Keep every Nth frame, 1 to 1000000
+    // Actions in between are averaged.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N", default_value_t = 1))]
+    pub every: usize,
+    /// The CSV file, if it is not the only one in the folder
+    #[cfg_attr(feature = "cli", arg(long, value_name = "FILE"))]
+    pub csv: Option<PathBuf>,
+    /// The column, input, camera, array or topic with the images [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long, value_name = "NAME"))]
+    pub image: Option<String>,
+    /// The column or array with the times [default: found by name]; for a bag, `header` or `log` [default: header if near log]
+    // In seconds, unless its name ends with _ms, _us or _ns.
+    #[cfg_attr(feature = "cli", arg(long, value_name = "NAME"))]
+    pub time: Option<String>,
+    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long = "action", value_name = "NAME"))]
+    pub actions: Vec<String>,
+    /// A component of the state, or a topic as for the action; may be given many times [default: found by name or type]
+    #[cfg_attr(feature = "cli", arg(long = "state", value_name = "NAME"))]
+    pub states: Vec<String>,
+    /// The unit of an action or state, as in speed=m/s; may be given many times
+    #[cfg_attr(feature = "cli", arg(long = "unit", value_name = "NAME=UNIT"))]
+    pub units: Vec<String>,
+    /// For how long the last action and state of a bag hold
+    #[cfg_attr(feature = "cli", arg(long = "hold", value_name = "SECONDS", default_value_t = 1.0))]
+    pub hold_s: f64,
+    /// Leave out what is damaged and list it, instead of stopping there
+    #[cfg_attr(feature = "cli", arg(long))]
+    pub skip_bad: bool,
+}
+
+impl Default for ImportOptions {
+    fn default() -> Self {
+        Self {
+            frame_width_px: 64,
+            frame_height_px: 64,
+            fit: Fit::Crop,
+            rate_hz: None,
+            every: 1,
+            csv: None,
+            image: None,
+            time: None,
+            actions: Vec::new(),
+            states: Vec::new(),
+            units: Vec::new(),
+            hold_s: 1.0,
+            skip_bad: false,
+        }
+    }
+}
+
+/// Width and height in pixels, written as in `64x64`. Errors: `OptionValue`.
+pub fn parse_size(text: &str) -> Result<(u32, u32), ImportError> {
+    let sides = text
+        .split_once('x')
+        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    sides.ok_or_else(|| ImportError::OptionValue {
+        option: "size",
+        value: format!("\"{}\"", text.escape_default()),
+        right: "write WIDTHxHEIGHT, as in 64x64".to_owned(),
+    })
+}
+
+impl ImportOptions {
+    /// Checks what can be checked without the source. Errors: `OptionValue`.
+    pub fn validate(&self) -> Result<(), ImportError> {
+        let wrong = |option, value: &dyn Display, right: &str| {
+            Err(ImportError::OptionValue {
+                option,
+                value: value.to_string(),
+                right: right.to_owned(),
+            })
+        };
+        if !(1..=MAX_EVERY).contains(&self.every) {
+            return wrong("every", &self.every, &format!("it must be 1 to {MAX_EVERY}"));
+        }
+        if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
+            return wrong("rate", &rate, "it must be 0.01 to 1000 frames per second");
+        }
+        if !(0.0..=3600.0).contains(&self.hold_s) {
+            return wrong("hold", &self.hold_s, "it must be 0 to 3600 seconds");
+        }
+        let (width, height) = (self.frame_width_px, self.frame_height_px);
+        let sides = 1..=MAX_SIDE_PX;
+        if !(sides.contains(&width) && sides.contains(&height)) {
+            let right = format!("each side must be 1 to {MAX_SIDE_PX} px");
+            return wrong("size", &format!("{width}x{height}"), &right);
+        }
+        if let Some(unit) = self.units.iter().find(|unit| !unit.contains('=')) {
+            let given = format!("\"{}\"", unit.escape_default());
+            return wrong("unit", &given, "write NAME=UNIT, as in speed=m/s");
+        }
+        Ok(())
+    }
+
+    /// The unit that `--unit NAME=UNIT` gives a channel; empty if none does.
+    pub(super) fn unit(&self, name: &str) -> String {
+        let mut given = self.units.iter().filter_map(|unit| unit.split_once('='));
+        let found = given.find(|(channel, _)| *channel == name);
+        found.map_or_else(String::new, |(_, unit)| unit.to_owned())
+    }
+}

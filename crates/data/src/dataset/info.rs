@@ -1,0 +1,93 @@
+//! What a data set and its episodes consist of.
+
+use std::ops::Range;
+
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::types::{Channel, Seed};
+use foreframe_sim::{TrialParameters, WorldConfig};
+
+/// Description of a data set: frame size, frame period, channels, origin and the hash of its content.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct DatasetInfo {
+    /// Its name, for reports.
+    pub name: String,
+    /// Width of every frame in pixels.
+    pub frame_width_px: u32,
+    /// Height of every frame in pixels.
+    pub frame_height_px: u32,
+    /// Seconds from one frame to the next.
+    pub frame_period_s: f64,
+    /// Components of an action. Action t acts from frame t to frame t + 1.
+    pub action_channels: Vec<Channel>,
+    /// Components of a state.
+    pub state_channels: Vec<Channel>,
+    /// SHA-256 of the content, in hexadecimal. [`Dataset::from_episodes`](super::Dataset::from_episodes) computes it if this is empty.
+    pub content_hash: String,
+    /// The simulated scenario; none for recordings.
+    pub scenario: Option<String>,
+    /// The seed it was simulated from; none for recordings.
+    pub seed: Option<Seed>,
+    /// Number of frames of all episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
+    pub frame_count: usize,
+    /// Number of episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
+    pub episode_count: usize,
+    /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
+    pub has_masks: bool,
+    /// How the camera projects; none where that is not known.
+    pub camera: Option<CameraModel>,
+    /// How the simulated world was run and seen; none for recordings.
+    pub world: Option<WorldConfig>,
+}
+
+impl DatasetInfo {
+    /// Pixels of one frame.
+    #[must_use]
+    pub fn frame_pixels(&self) -> usize {
+        self.frame_width_px as usize * self.frame_height_px as usize
+    }
+
+    /// Bytes of all frames, decoded, with their masks.
+    #[must_use]
+    pub fn decoded_bytes(&self) -> u64 {
+        let images = 1 + u64::from(self.has_masks);
+        self.frame_count as u64 * self.frame_pixels() as u64 * images
+    }
+}
+
+/// One trial or recording, and which frames of the data set belong to it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Episode {
+    /// Its position among the episodes.
+    pub index: usize,
+    /// Its first frame, counted over the whole data set.
+    pub first_frame: usize,
+    /// Its number of frames.
+    pub frame_count: usize,
+    /// Parameters of the trial; none for recordings.
+    pub trial: Option<TrialParameters>,
+}
+
+impl Episode {
+    /// Its frames, counted over the whole data set.
+    #[must_use]
+    pub fn frames(&self) -> Range<usize> {
+        self.first_frame..self.first_frame + self.frame_count
+    }
+}
+
+/// The data of one episode. Each field holds one item per frame, one after another.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EpisodeData {
+    /// Seconds since the start of the episode, increasing.
+    pub timestamps_s: Vec<f64>,
+    /// Intensities, frame by frame, row by row.
+    pub pixels: Vec<u8>,
+    /// Segmentation masks (0 = scene, 1 = Tb2, 2… = other robots), in the layout of `pixels`.
+    pub masks: Option<Vec<u8>>,
+    /// Actions, frame by frame.
+    pub actions: Vec<f32>,
+    /// States, frame by frame.
+    pub states: Vec<f32>,
+    /// Parameters of the trial; none for recordings.
+    pub trial: Option<TrialParameters>,
+}

@@ -1,0 +1,316 @@
+//! Writes the shards of a data set in order, and the tables and metadata that complete it.
+
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use parquet::errors::ParquetError;
+
+use super::files::{sha256_of_file, write_atomically};
+use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, ShardEntry, TASKS, shard_path};
+use super::shard::{EncodedEpisode, EpisodeRecord, ShardStart, build};
+use super::shard_reader::records;
+use super::tables::{self, EpisodeRow};
+use crate::dataset::{DatasetError, DatasetInfo};
+use foreframe_core::files::sha256_hex;
+
+/// A shard is closed once it has so many frames. It holds whole episodes.
+const SHARD_FRAMES: usize = 2000;
+
+/// A data set that is being written. Its finished shards are the first ones, without gaps.
+pub(crate) struct ShardWriter {
+    out: PathBuf,
+    /// The description, without counts and hash.
+    info: DatasetInfo,
+    shards: Vec<FinishedShard>,
+    start: ShardStart,
+}
+
+/// A shard that has been written to disk.
+struct FinishedShard {
+    sha256: String,
+    records: Vec<EpisodeRecord>,
+}
+
+impl FinishedShard {
+    /// Number of frames in the shard.
+    fn frames(&self) -> usize {
+        self.records.iter().map(|record| record.frames).sum()
+    }
+}
+
+impl ShardWriter {
+    /// A data set in the directory `out` without shards.
+    pub(crate) fn new(out: &Path, info: DatasetInfo) -> Self {
+        Self {
+            out: out.to_owned(),
+            info,
+            shards: Vec::new(),
+            start: ShardStart { episode: 0, frame: 0 },
+        }
+    }
+
+    /// The description of the data set, without counts and hash.
+    pub(crate) fn info(&self) -> &DatasetInfo {
+        &self.info
+    }
+
+    /// Number of finished shards.
+    pub(crate) fn shard_count(&self) -> usize {
+        self.shards.len()
+    }
+
+    /// Number of episodes in the finished shards.
+    pub(crate) fn episode_count(&self) -> usize {
+        self.start.episode
+    }
+
+    /// Takes the next shard from disk if an earlier call wrote it, with this number of episodes if one is given. False if it is
+    /// missing, damaged or another.
+    pub(crate) fn resume(&mut self, episodes: Option<usize>) -> bool {
+        let path = self.out.join(shard_path(self.shards.len()));
+        let Ok(records) = records(&path) else {
+            return false;
+        };
+        if episodes.is_some_and(|episodes| records.len() != episodes) {
+            return false;
+        }
+        let Ok(sha256) = sha256_of_file(&path) else {
+            return false;
+        };
+        self.push(FinishedShard { sha256, records });
+        true
+    }
+
+    /// Writes the next shard. Errors: `Build`, `Description`, `Io`.
+    pub(crate) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
+        let built = build(&self.info, self.start, episodes)?;
+        write_atomically(&self.out.join(shard_path(self.shards.len())), &built.bytes)?;
+        // Parse the text as a resumed run would, so that a resumed data set has the same digits.
+        let records = serde_json::from_str(&built.records);
+        self.push(FinishedShard {
+            sha256: sha256_hex(&built.bytes),
+            records: records.map_err(|error| DatasetError::Description(error.to_string()))?,
+        });
+        Ok(())
+    }
+
+    fn push(&mut self, shard: FinishedShard) {
+        self.start.episode += shard.records.len();
+        self.start.frame += shard.frames();
+        self.shards.push(shard);
+    }
+
+    /// Writes the tables and metadata after all shards are written, `meta/info.json` last. Returns the description with counts and
+    /// hash filled in. Errors: `Build`, `Io`.
+    pub(crate) fn complete(self) -> Result<DatasetInfo, DatasetError> {
+        let (directory, shards) = (&self.out, &self.shards);
+        let mut rows = Vec::new();
+        let mut first_frame = 0;
+        for (shard, finished) in shards.iter().enumerate() {
+            for record in &finished.records {
+                rows.push(EpisodeRow {
+                    record,
+                    shard,
+                    first_frame,
+                });
+                first_frame += record.frames;
+            }
+        }
+        let episodes = write_tables(directory, &self.info, &rows, tables::episodes)?;
+        let world = self.info.world.clone();
+        let metadata = metadata(self.info, shards, sha256_hex(&episodes));
+        let info = DatasetInfo {
+            world,
+            ..metadata.info()
+        };
+        write_json(&directory.join(METADATA), &metadata)?;
+        write_json(&directory.join(INFO), &layout::lerobot_info(&info))?;
+        Ok(info)
+    }
+}
+
+/// Divides episodes of these lengths among shards.
+pub(crate) fn shard_ranges(lengths: impl ExactSizeIterator<Item = usize>) -> Vec<Range<usize>> {
+    let (mut shards, mut start, mut frames, count) = (Vec::new(), 0, 0, lengths.len());
+    for (end, length) in (1..).zip(lengths) {
+        frames += length;
+        if frames >= SHARD_FRAMES || end == count {
+            shards.push(start..end);
+            (start, frames) = (end, 0);
+        }
+    }
+    shards
+}
+
+/// Writes the tables of episodes (made by `episodes`), tasks and statistics. Returns the bytes of the first.
+/// Errors: `Build`, `Io`.
+pub(crate) fn write_tables(
+    directory: &Path,
+    info: &DatasetInfo,
+    rows: &[EpisodeRow<'_>],
+    episodes: impl FnOnce(&[EpisodeRow<'_>], &str) -> Result<Vec<u8>, ParquetError>,
+) -> Result<Vec<u8>, DatasetError> {
+    let task = info.scenario.as_ref().unwrap_or(&info.name);
+    let episodes = episodes(rows, task).map_err(DatasetError::Build)?;
+    write_atomically(&directory.join(EPISODES), &episodes)?;
+    let tasks = tables::tasks(task).map_err(DatasetError::Build)?;
+    write_atomically(&directory.join(TASKS), &tasks)?;
+    write_json(&directory.join(STATS), &tables::stats_json(rows))?;
+    Ok(episodes)
+}
+
+fn metadata(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> DatasetMetadata {
+    let entries: Vec<_> = shards
+        .iter()
+        .enumerate()
+        .map(|(shard, finished)| ShardEntry {
+            path: layout::shard_path(shard),
+            sha256: finished.sha256.clone(),
+            episodes: finished.records.len(),
+            frames: finished.frames(),
+        })
+        .collect();
+    DatasetMetadata {
+        program_version: env!("CARGO_PKG_VERSION").to_owned(),
+        name: info.name,
+        scenario: info.scenario,
+        seed: info.seed,
+        frame_width_px: info.frame_width_px,
+        frame_height_px: info.frame_height_px,
+        frame_period_s: info.frame_period_s,
+        action_channels: info.action_channels,
+        state_channels: info.state_channels,
+        has_masks: info.has_masks,
+        camera: info.camera,
+        content_hash: layout::content_hash(&entries),
+        episodes_sha256,
+        shards: entries,
+    }
+}
+
+pub(crate) fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetError> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|error| DatasetError::Description(error.to_string()))?;
+    text.push('\n');
+    write_atomically(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::Dataset;
+    use crate::dataset::info::EpisodeData;
+    use foreframe_core::types::Channel;
+
+    fn info() -> DatasetInfo {
+        DatasetInfo {
+            name: "made-up".to_owned(),
+            frame_width_px: 4,
+            frame_height_px: 2,
+            frame_period_s: 0.2,
+            action_channels: vec![Channel::new("linear", "m/s")],
+            ..DatasetInfo::default()
+        }
+    }
+
+    fn episode(frames: usize) -> EpisodeData {
+        EpisodeData {
+            timestamps_s: (0..frames).map(|frame| f64::from(frame as f32) * 0.25).collect(),
+            pixels: (0..frames * 8).map(|i| i as u8).collect(),
+            actions: (0..frames).map(|frame| frame as f32).collect(),
+            ..EpisodeData::default()
+        }
+    }
+
+    /// Writes a data set with one shard after two changes, and opens it with the description `described`.
+    fn open_changed(
+        described: DatasetInfo,
+        change: impl Fn(&mut EncodedEpisode),
+        change_bytes: impl Fn(&mut Vec<u8>),
+    ) -> Result<Dataset, DatasetError> {
+        let directory = tempfile::tempdir().unwrap();
+        let mut encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
+        change(&mut encoded);
+        let mut writer = ShardWriter::new(directory.path(), info());
+        writer.write(&[encoded]).unwrap();
+        let path = directory.path().join(shard_path(0));
+        let mut bytes = std::fs::read(&path).unwrap();
+        change_bytes(&mut bytes);
+        std::fs::write(&path, &bytes).unwrap();
+        writer.info = described;
+        writer.shards[0].sha256 = sha256_hex(&bytes);
+        writer.complete().unwrap();
+        Dataset::open(directory.path())
+    }
+
+    #[test]
+    fn one_component_actions_without_states_are_read_back() {
+        let read = open_changed(info(), |_| {}, |_| {}).unwrap();
+        let mut made = Dataset::from_episodes(info(), vec![episode(5)]).unwrap();
+        made.info.content_hash = read.info.content_hash.clone();
+        assert_eq!(read, made);
+    }
+
+    #[test]
+    fn actions_that_are_not_finite_are_refused() {
+        let error = open_changed(info(), |episode| episode.actions[2] = f32::INFINITY, |_| {}).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "episode 0, frame 2: action is inf; every number must be finite"
+        );
+    }
+
+    #[test]
+    fn frames_of_another_size_are_refused() {
+        let described = DatasetInfo {
+            frame_width_px: 2,
+            frame_height_px: 4,
+            ..info()
+        };
+        let message = open_changed(described, |_| {}, |_| {}).unwrap_err().to_string();
+        assert!(
+            message.contains("row 0 is 4×2 px; the data set has frames of 2×4 px"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn actions_of_another_dimension_are_refused() {
+        let two = vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")];
+        let described = DatasetInfo {
+            action_channels: two,
+            ..info()
+        };
+        let message = open_changed(described, |_| {}, |_| {}).unwrap_err().to_string();
+        assert!(message.contains("no column \"action\" of vectors"), "{message}");
+    }
+
+    #[test]
+    fn errors_about_damaged_files_name_the_file() {
+        for kept in [0, 3, 40, 400] {
+            let error = open_changed(info(), |_| {}, |bytes| bytes.truncate(kept)).unwrap_err();
+            assert!(error.to_string().contains("file-000.parquet is damaged"), "{error}");
+        }
+        let error = open_changed(info(), |_| {}, |bytes| bytes[40..120].fill(0xA5)).unwrap_err();
+        assert!(error.to_string().contains("file-000.parquet"), "{error}");
+    }
+
+    #[test]
+    fn the_error_for_an_invalid_image_names_its_cause() {
+        let error = open_changed(info(), |episode| episode.images[3] = vec![1, 2, 3], |_| {}).unwrap_err();
+        let sentence = foreframe_core::error_text::with_causes(&error);
+        let expected = "file-000.parquet, row 3: observation.image is damaged: not a readable PNG or JPEG image: ";
+        assert!(sentence.contains(expected), "{sentence}");
+    }
+
+    #[test]
+    fn the_content_hash_is_the_hash_of_the_shard_hashes() {
+        let read = open_changed(info(), |_| {}, |_| {}).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
+        let built = build(&info(), ShardStart { episode: 0, frame: 0 }, &[encoded]).unwrap();
+        let path = directory.path().join("shard");
+        std::fs::write(&path, &built.bytes).unwrap();
+        let digest = sha256_hex(super::super::files::sha256_of_file(&path).unwrap().as_bytes());
+        assert_eq!(read.info().content_hash, digest);
+    }
+}

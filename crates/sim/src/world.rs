@@ -1,0 +1,282 @@
+//! One trial of the simulated world: robots, physics, camera and the end of the trial.
+
+use foreframe_core::frame::Frame;
+use foreframe_core::types::{Action, Channel, RobotState, Seed};
+
+use super::appearance::{self, RobotAppearance};
+use super::arena;
+use super::camera::Camera;
+use super::config::WorldConfig;
+use super::driver::Driver;
+use super::error::SimError;
+use super::navigator::Navigator;
+use super::physics::PhysicsScene;
+use super::rendered_robot::RenderedRobot;
+use super::robot::PlanarPose;
+use super::scenario::{Scenario, TrialParameters};
+
+/// Longest physics step, in seconds. A frame period is divided into equal steps that are not longer than this.
+const PHYSICS_STEP_S: f32 = 0.02;
+/// In a scenario that does not end at a goal, a robot that touches something for this long gets a new goal, in seconds.
+const BLOCKED_LIMIT_S: f32 = 1.0;
+
+/// What Tb1 perceives at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Observation {
+    /// The camera image.
+    pub frame: Frame,
+    /// The segmentation mask, row by row: 0 = scene, 1 = Tb2, 2… = the other robots.
+    pub mask: Vec<u8>,
+    /// Tb1's wheel odometry, with the components of [`state_channels`].
+    pub state: RobotState,
+    /// Time since the start of the trial, in seconds.
+    pub time_s: f64,
+}
+
+/// The result of one step.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StepResult {
+    /// The observation at the end of the step.
+    pub observation: Observation,
+    /// How well Tb1 keeps Tb2 in view: 1 if Tb2 is in the middle of the image, 0 if it is at the left or right edge, outside
+    /// or hidden. If Tb1 touched anything during the step, 1 is subtracted.
+    pub reward: f32,
+    /// Whether Tb2 reached its goal (`static-observer` only).
+    pub terminated: bool,
+    /// Whether the time limit of the trial was reached.
+    pub truncated: bool,
+}
+
+/// Components of an action: Tb1's velocity command from this frame to the next.
+#[must_use]
+pub fn action_channels() -> Vec<Channel> {
+    vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")]
+}
+
+/// Components of a state: the pose from Tb1's wheel odometry and the velocity from its wheel speeds. The odometry starts at
+/// the true pose and drifts when wheels slip.
+#[must_use]
+pub fn state_channels() -> Vec<Channel> {
+    vec![
+        Channel::new("x", "m"),
+        Channel::new("y", "m"),
+        Channel::new("heading_cos", ""),
+        Channel::new("heading_sin", ""),
+        Channel::new("linear", "m/s"),
+        Channel::new("angular", "rad/s"),
+    ]
+}
+
+/// Another robot: its appearance and its controller.
+struct OtherRobot {
+    appearance: &'static RobotAppearance,
+    navigator: Navigator,
+    blocked_s: f32,
+}
+
+/// One running trial.
+pub struct World {
+    config: WorldConfig,
+    parameters: TrialParameters,
+    physics: PhysicsScene,
+    others: Vec<OtherRobot>,
+    driver: Driver,
+    frame_index: u64,
+    observation: Observation,
+    policy_action: Action,
+    ended: bool,
+}
+
+impl World {
+    /// Starts trial number `trial` of the seed. Errors: as [`WorldConfig::validate`].
+    pub fn new(scenario: Scenario, config: &WorldConfig, seed: Seed, trial: u64) -> Result<Self, SimError> {
+        Self::from_parameters(TrialParameters::draw(scenario, seed, trial), config)
+    }
+
+    /// Starts a trial with the given parameters, to repeat a trial or to set one up by hand. Errors: as
+    /// [`WorldConfig::validate`] and [`TrialParameters::validate`].
+    pub fn from_parameters(parameters: TrialParameters, config: &WorldConfig) -> Result<Self, SimError> {
+        config.validate()?;
+        parameters.validate()?;
+        let mut physics = PhysicsScene::new();
+        physics.add_robot(parameters.observer, appearance::TURTLEBOT.radius_m);
+        let mut others = Vec::new();
+        for (index, route) in parameters.routes().into_iter().enumerate() {
+            let appearance = appearance::of_other_robot(index);
+            physics.add_robot(route.pose, appearance.radius_m);
+            let random = parameters.stream("route", index as u64);
+            others.push(OtherRobot {
+                appearance,
+                navigator: Navigator::new(route, random),
+                blocked_s: 0.0,
+            });
+        }
+        let observation = Observation {
+            frame: Frame::new(1, 1, vec![0])?,
+            mask: Vec::new(),
+            state: RobotState::try_from(Vec::new())?,
+            time_s: 0.0,
+        };
+        let mut world = Self {
+            config: config.clone(),
+            driver: Driver::new(parameters.stream("driver", 0)),
+            parameters,
+            physics,
+            others,
+            frame_index: 0,
+            observation,
+            policy_action: Action::try_from(vec![0.0, 0.0])?,
+            ended: false,
+        };
+        world.update_observation()?;
+        Ok(world)
+    }
+
+    /// The parameters of the trial.
+    #[must_use]
+    pub fn parameters(&self) -> &TrialParameters {
+        &self.parameters
+    }
+
+    /// What Tb1 perceives now. Repeated calls return the same observation.
+    #[must_use]
+    pub fn observe(&self) -> Observation {
+        self.observation.clone()
+    }
+
+    /// The next action of Tb1's built-in driving policy; zero if Tb1 stands still in this scenario.
+    #[must_use]
+    pub fn policy_action(&self) -> Action {
+        self.policy_action.clone()
+    }
+
+    /// The camera at its current pose.
+    #[must_use]
+    pub fn camera(&self) -> Camera {
+        Camera::new(&self.config, self.physics.pose(0))
+    }
+
+    /// True poses of the other robots, Tb2 first.
+    #[must_use]
+    pub fn other_robot_poses(&self) -> Vec<PlanarPose> {
+        (1..=self.others.len()).map(|robot| self.physics.pose(robot)).collect()
+    }
+
+    /// True pose of Tb1.
+    #[must_use]
+    pub fn observer_pose(&self) -> PlanarPose {
+        self.physics.pose(0)
+    }
+
+    /// Renders the current camera image and its segmentation mask again: the same bytes as in [`World::observe`].
+    pub fn render(&self) -> Result<(Frame, Vec<u8>), SimError> {
+        let robots: Vec<RenderedRobot> = self
+            .others
+            .iter()
+            .zip(self.other_robot_poses())
+            .zip(1..)
+            .map(|((robot, pose), id)| RenderedRobot::new(robot.appearance, pose, id))
+            .collect();
+        let noise = self.parameters.stream("noise", self.frame_index);
+        self.camera().capture(&robots, noise)
+    }
+
+    /// Simulates one frame period with this action. Commands beyond Tb1's limits are clamped to [`super::robot::MAX_LINEAR_M_S`] and
+    /// [`super::robot::MAX_ANGULAR_RAD_S`]. In `static-observer` Tb1 does not move and the action is ignored.
+    /// Errors: `ActionLength`, and `Ended` after the trial's last frame.
+    pub fn step(&mut self, action: &Action) -> Result<StepResult, SimError> {
+        let &[linear, angular] = action.as_slice() else {
+            return Err(SimError::ActionLength {
+                found: action.as_slice().len(),
+            });
+        };
+        if self.ended {
+            return Err(SimError::Ended);
+        }
+        if self.parameters.scenario.observer_drives() {
+            self.physics.command(0, [linear, angular]);
+        }
+        let touched = self.advance();
+        self.frame_index += 1;
+        self.update_observation()?;
+        let terminated = !self.parameters.scenario.observer_drives() && self.has_arrived(0);
+        let truncated = self.frame_index + 1 >= self.config.frame_limit();
+        self.ended = terminated || truncated;
+        Ok(StepResult {
+            observation: self.observe(),
+            reward: self.view_score() - if touched { 1.0 } else { 0.0 },
+            terminated,
+            truncated,
+        })
+    }
+
+    /// Simulates the physics for one frame period; returns true if Tb1 touched something.
+    fn advance(&mut self) -> bool {
+        let period = self.config.frame_period_s as f32;
+        let steps = (period / PHYSICS_STEP_S).ceil().max(1.0);
+        let dt = period / steps;
+        let mut touched = false;
+        for _ in 0..steps as usize {
+            for index in 0..self.others.len() {
+                self.control(index, dt);
+            }
+            self.physics.advance(dt);
+            touched |= self.physics.is_touching(0);
+        }
+        touched
+    }
+
+    /// Gives another robot its next command, and a new goal where the scenario continues after a goal.
+    fn control(&mut self, index: usize, dt: f32) {
+        let robot = index + 1;
+        let ends_at_goal = !self.parameters.scenario.observer_drives();
+        let arrived = self.has_arrived(index);
+        let touching = self.physics.is_touching(robot);
+        let Some(other) = self.others.get_mut(index) else {
+            return;
+        };
+        other.blocked_s = if touching { other.blocked_s + dt } else { 0.0 };
+        if !ends_at_goal && (arrived || other.blocked_s > BLOCKED_LIMIT_S) {
+            other.navigator.choose_goal(self.physics.pose(robot));
+            other.blocked_s = 0.0;
+        }
+        let command = other.navigator.command(self.physics.pose(robot), dt);
+        self.physics.command(robot, command);
+    }
+
+    fn has_arrived(&self, index: usize) -> bool {
+        let pose = self.physics.pose(index + 1);
+        self.others
+            .get(index)
+            .is_some_and(|other| other.navigator.has_arrived(pose))
+    }
+
+    /// How well Tb2 is in view, 0…1: from its bearing, and 0 if none of its pixels is visible.
+    fn view_score(&self) -> f32 {
+        if !self.observation.mask.contains(&1) {
+            return 0.0;
+        }
+        let bearing = arena::bearing(self.physics.pose(0), arena::position(self.physics.pose(1)));
+        let half_view = self.config.camera.horizontal_fov_rad as f32 / 2.0;
+        (1.0 - bearing.abs() / half_view).clamp(0.0, 1.0)
+    }
+
+    /// Renders the current observation and plans the next action of Tb1's driving policy.
+    fn update_observation(&mut self) -> Result<(), SimError> {
+        let (frame, mask) = self.render()?;
+        self.observation = Observation {
+            frame,
+            mask,
+            state: RobotState::try_from(self.physics.odometry(0))?,
+            time_s: self.frame_index as f64 * self.config.frame_period_s,
+        };
+        if self.parameters.scenario.observer_drives() {
+            let others: Vec<[f32; 2]> = self.other_robot_poses().into_iter().map(arena::position).collect();
+            let command = self
+                .driver
+                .plan(self.physics.pose(0), &others, self.config.frame_period_s as f32);
+            self.policy_action = Action::try_from(command.to_vec())?;
+        }
+        Ok(())
+    }
+}
