@@ -6,7 +6,7 @@ mod images;
 use std::path::PathBuf;
 
 use self::actions::ActionsFile;
-use self::images::ImageFiles;
+use self::images::ImagePaths;
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::print_line;
@@ -132,7 +132,7 @@ fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
 /// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its
 /// horizon.
 fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, CliError> {
-    let mut images = ImageFiles::list(&args.frames, args.fit)?;
+    let mut images = ImagePaths::list(&args.frames, args.fit)?;
     let count = images.count();
     if count < spec.context {
         return Err(CliError::Usage(format!(

@@ -16,14 +16,14 @@ use crate::nn::ModelSpec;
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// The image files of a directory.
-pub(super) struct ImageFiles {
+pub(super) struct ImagePaths {
     paths: Vec<PathBuf>,
     fit: Option<Fit>,
     /// Whether it was said that color images are converted.
     has_reported_color: bool,
 }
 
-impl ImageFiles {
+impl ImagePaths {
     /// Lists the images of a directory; `fit` says what to do with images of another size than the model's.
     pub(super) fn list(dir: &Path, fit: Option<Fit>) -> Result<Self, CliError> {
         let unreadable = |error| CliError::io("read", dir, &error);

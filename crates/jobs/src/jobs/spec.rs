@@ -284,7 +284,7 @@ impl TrainSpec {
         })?;
         let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
         let config = layered.map_err(|error| match error {
-            TrainError::UnknownPreset(_) => JobError::Invalid {
+            TrainError::UnknownPreset { .. } => JobError::Invalid {
                 field: "preset",
                 reason: error.to_string(),
             },

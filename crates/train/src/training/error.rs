@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use super::config::TrainConfig;
 use super::observer::TrainingStage;
 use super::optimizer::OptimizerError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
@@ -17,8 +16,13 @@ use foreframe_data::dataset::DatasetError;
 #[non_exhaustive]
 pub enum TrainError {
     /// No preset has this name.
-    #[error("there is no preset {0:?}; there are: {names}", names = TrainConfig::preset_names().join(", "))]
-    UnknownPreset(String),
+    #[error("there is no preset {name:?}; there are: {}", known.join(", "))]
+    UnknownPreset {
+        /// The name that was given.
+        name: String,
+        /// The names of the presets.
+        known: Vec<&'static str>,
+    },
     /// A setting is unknown or out of range.
     #[error("{0}")]
     Config(String),
@@ -151,7 +155,7 @@ impl HasErrorKind for TrainError {
             Self::Dataset(error) => error.kind(),
             Self::Registry(error) => error.kind(),
             Self::Network(error) => error.kind(),
-            Self::UnknownPreset(_)
+            Self::UnknownPreset { .. }
             | Self::Config(_)
             | Self::ConstantActions { .. }
             | Self::OtherUnits { .. }

@@ -46,7 +46,10 @@ impl TrainConfig {
         let (_, text) = PRESETS
             .iter()
             .find(|(name, _)| *name == preset)
-            .ok_or_else(|| TrainError::UnknownPreset(preset.to_owned()))?;
+            .ok_or_else(|| TrainError::UnknownPreset {
+                name: preset.to_owned(),
+                known: Self::preset_names(),
+            })?;
         let origin = format!("preset {preset}");
         let written = SettingsLayer::toml(&origin, text).map_err(|error| config_error(&error))?;
         Self::over(written, origin, layers)

@@ -1,6 +1,7 @@
 //! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
 
 use candle_core::Tensor;
+use candle_nn::Module as _;
 
 use super::lstm::unroll;
 use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
@@ -68,12 +69,12 @@ impl DenseModel {
 
     /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`.
     pub(in crate::nn) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
-        self.frame_encoder.forward(frames)
+        Ok(self.frame_encoder.forward(frames)?)
     }
 
     /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped.
     pub(in crate::nn) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
-        self.frame_decoder.forward(features)
+        Ok(self.frame_decoder.forward(features)?)
     }
 
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The

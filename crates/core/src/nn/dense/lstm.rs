@@ -1,6 +1,7 @@
 //! An LSTM over a sequence of inputs, or over its own output.
 
 use candle_core::Tensor;
+use candle_nn::Module as _;
 
 use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
 use super::recurrence::{decode_autoregressive, forward_sequence};

@@ -2,6 +2,7 @@
 //! ([`wheel_dynamics`]), corrected by a small learned network.
 
 use candle_core::{DType, Device, Tensor};
+use candle_nn::Module as _;
 
 use super::future_rows::FutureRows;
 use super::state_channels::StateChannels;

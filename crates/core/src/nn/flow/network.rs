@@ -1,6 +1,7 @@
 //! The layers of the flow network, and the parts of a prediction that both of its forms share.
 
 use candle_core::{Device, Tensor};
+use candle_nn::Module as _;
 
 use super::encoder_views::EncoderViews;
 use super::future_rows::FutureRows;
@@ -106,7 +107,7 @@ impl FlowModel {
     ) -> Result<Tensor, NnError> {
         let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(state)?, quarter)?)?;
         let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
-        self.head.forward(&silu(&self.fine.forward(&inputs)?)?)
+        Ok(self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?)
     }
 
     /// Features of each context `[contexts, H/4, W/4, C]`.
@@ -133,7 +134,7 @@ impl FlowModel {
             known
         };
         let [inputs_layer, output_layer] = &self.modulation;
-        output_layer.forward(&silu(&inputs_layer.forward(&inputs)?)?)
+        Ok(output_layer.forward(&silu(&inputs_layer.forward(&inputs)?)?)?)
     }
 
     /// A linear layer at each place of `[M, h, w, …]`.

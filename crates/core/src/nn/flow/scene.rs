@@ -5,6 +5,7 @@
 //! learned image.
 
 use candle_core::{Device, Tensor};
+use candle_nn::Module as _;
 
 use super::blocks::centred;
 use super::encoder_views::EncoderViews;

@@ -7,8 +7,8 @@
 
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_nn::Module;
 
-use crate::nn::error::NnError;
 use crate::nn::tensors::{add_columns, slice, with_values};
 use crate::vectorized::vectorized;
 
@@ -69,14 +69,16 @@ impl Convolution3 {
         Self { weight, bias, shape }
     }
 
-    /// The convolution of x, see [`convolve`].
-    pub(in crate::nn) fn forward(&self, x: &Tensor) -> std::result::Result<Tensor, NnError> {
-        Ok(convolve(x, &self.weight, &self.bias, self.shape)?)
-    }
-
     /// Whether gradients go to the weight.
     pub(in crate::nn) fn is_trained(&self) -> bool {
         self.weight.track_op()
+    }
+}
+
+impl Module for Convolution3 {
+    /// The convolution of x, see [`convolve`].
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        convolve(x, &self.weight, &self.bias, self.shape)
     }
 }
 

@@ -5,9 +5,9 @@
 
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
+use candle_nn::Module;
 
 use super::activation::tanh;
-use crate::nn::error::NnError;
 use crate::nn::tensors::{add_columns, matrix, slice, with_values};
 use crate::vectorized::vectorized;
 
@@ -37,19 +37,21 @@ impl Linear {
             activation,
         }
     }
+}
 
+impl Module for Linear {
     /// The layer's output `[N, O]` for x `[N, D]`, all f32.
-    pub(in crate::nn) fn forward(&self, x: &Tensor) -> Result<Tensor, NnError> {
+    fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
         let fused = FusedLinear {
             activation: self.activation,
             wants_input_gradient: x.track_op(),
         };
         let x = x.contiguous()?;
-        Ok(if x.track_op() || self.weight.track_op() || self.bias.track_op() {
-            x.apply_op3(&self.weight, &self.bias, fused)?
+        if x.track_op() || self.weight.track_op() || self.bias.track_op() {
+            x.apply_op3(&self.weight, &self.bias, fused)
         } else {
-            x.apply_op3_no_bwd(&self.weight, &self.bias, &fused)?
-        })
+            x.apply_op3_no_bwd(&self.weight, &self.bias, &fused)
+        }
     }
 }
 
