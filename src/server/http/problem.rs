@@ -6,13 +6,17 @@ use axum::body::Body;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use tracing::error;
+use tracing::{error, warn};
 
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::{with_causes, without_middle};
+use crate::files::is_transient;
 
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
+
+const FILES_AWAY: &str =
+    "the server cannot read or write its files now, for example because its disk is full; try again later";
 
 /// An error as a client sees it: problem details, RFC 9457.
 #[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
@@ -53,21 +57,26 @@ pub(in crate::server) enum ApiError {
 
 impl ApiError {
     /// The answer for an error of that kind.
-    pub(in crate::server) fn of(error: &impl HasErrorKind) -> Self {
+    pub(in crate::server) fn of(error: &(impl HasErrorKind + 'static)) -> Self {
         Self::of_kind(error.kind(), error)
     }
 
     /// The answer for an error of our own data, which the client did not name: its text may name paths of this machine.
-    pub(in crate::server) fn of_own_data(error: &impl HasErrorKind) -> Self {
+    pub(in crate::server) fn of_own_data(error: &(impl HasErrorKind + 'static)) -> Self {
         Self::of_kind(error.kind().of_own_data(), error)
     }
 
-    fn of_kind(kind: ErrorKind, error: &dyn Error) -> Self {
+    fn of_kind(kind: ErrorKind, error: &(dyn Error + 'static)) -> Self {
         match kind {
             ErrorKind::NotFound => Self::NotFound(error.to_string()),
             ErrorKind::Usage | ErrorKind::Unusable => Self::Unprocessable(error.to_string()),
             ErrorKind::Conflict => Self::Conflict(error.to_string()),
             ErrorKind::Busy => Self::unavailable(error.to_string()),
+            // The error names a file of this machine.
+            ErrorKind::Away if is_transient(error) => {
+                warn!(cause = with_causes(error), "a file cannot be read or written now");
+                Self::unavailable(FILES_AWAY)
+            }
             ErrorKind::Away => Self::unavailable(with_causes(error)),
             ErrorKind::Cancelled | ErrorKind::Internal => Self::Internal(with_causes(error)),
         }
@@ -233,6 +242,7 @@ pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::StoreError;
 
     #[derive(Debug, thiserror::Error)]
     #[error("of a test")]
@@ -259,5 +269,16 @@ mod tests {
         let answer = |kind| ApiError::of_own_data(&ClassifiedError(kind));
         assert_eq!(answer(ErrorKind::NotFound), ApiError::Internal("of a test".to_owned()));
         assert_eq!(answer(ErrorKind::Away), ApiError::unavailable("of a test"));
+    }
+
+    #[test]
+    fn an_answer_names_no_file_of_a_full_disk() {
+        let error = StoreError::Io {
+            action: "write",
+            path: "/private/file".into(),
+            source: std::io::ErrorKind::StorageFull.into(),
+        };
+        assert_eq!(ApiError::of(&error), ApiError::unavailable(FILES_AWAY));
+        assert_eq!(ApiError::of_own_data(&error), ApiError::unavailable(FILES_AWAY));
     }
 }
