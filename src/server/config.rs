@@ -97,8 +97,8 @@ pub struct ServerConfig {
     pub max_job_log_lines: usize,
     /// Number of threads for jobs.
     pub job_threads: usize,
-    /// Number of threads that decode and encode the images of predictions; more such work waits. As many again simulate,
-    /// and read files.
+    /// Number of threads that decode and encode the images of predictions; more such work waits. A second pool of the
+    /// same size simulates and reads files.
     pub request_threads: usize,
     /// Number of threads that make pictures of data sets, models and predictions, and read reports; more such work waits. On
     /// Linux, they run at lower priority.

@@ -17,7 +17,7 @@ pub(crate) fn short_training() -> Value {
     training(24)
 }
 
-/// The same with so many steps, each of a few milliseconds.
+/// The same with this number of steps, each of a few milliseconds.
 pub(crate) fn training(steps: u32) -> Value {
     let settings = json!({
         "model": {"features": 16, "hidden": 16},

@@ -44,7 +44,7 @@ impl MessageBytes {
         Ok(())
     }
 
-    /// A ping or pong with so much content was read. It can come in the middle of a message.
+    /// A ping or pong with `content_bytes` of content was read. It can come in the middle of a message.
     pub(in crate::server) fn control_read(&self, content_bytes: usize) {
         /// Flags, length and mask.
         const HEAD_BYTES: usize = 6;

@@ -200,7 +200,7 @@ impl RolloutRequest {
     }
 }
 
-/// The conditioning input of each plan of so many steps.
+/// The conditioning input of each plan.
 fn conditioning(
     (candidates, steps): (Vec<Vec<Vec<f32>>>, Option<usize>),
     state: Option<RobotState>,

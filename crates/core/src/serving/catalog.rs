@@ -7,7 +7,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 use super::error::ServingError;
 use crate::registry::LoadedModel;
 
-/// After so many panics in a row the predictor is not ready.
+/// Number of panics in a row after which the predictor is not ready.
 const MAX_PANICS: u32 = 3;
 
 pub(super) struct Catalog {

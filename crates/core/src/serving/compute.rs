@@ -134,7 +134,7 @@ struct Windows<'a> {
 }
 
 impl Windows<'_> {
-    /// Rollouts of so many steps: the window and the conditioning input of each.
+    /// Rollouts of `steps` frames. A row is the index of a window and a conditioning input.
     fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
         let (loaded, spec) = (self.loaded, self.loaded.model.spec());
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
@@ -159,7 +159,7 @@ impl Windows<'_> {
         .map_err(tensor_error)
     }
 
-    /// A rollout with what its calibration says of it. `seen`: the features of all windows.
+    /// A rollout with its expected errors and its novelty. `seen`: the features of all windows.
     fn rollout(
         &self,
         (window, input): (u32, &ConditioningInput),

@@ -15,8 +15,7 @@ const MAX_DELAY_S: f64 = 2.0;
 const FRAMES_LOOKED_AT: std::ops::RangeInclusive<i64> = 4..=20;
 /// A weaker correlation says nothing.
 const LEAST_CORRELATION: f64 = 0.25;
-/// In few frames, even signals that have nothing in common correlate: about so much in one frame, less with the root of their
-/// number.
+/// Signals without anything in common still correlate by chance: about this divided by the square root of the number of frames.
 const CHANCE_CORRELATION: f64 = 6.0;
 /// Delays from here on are worth a warning, in frames…
 const LONG_DELAY_FRAMES: f64 = 1.0;

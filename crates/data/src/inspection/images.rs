@@ -8,20 +8,21 @@ use super::places::{FramePlace, counted, listed};
 use super::timing::FrameTiming;
 use crate::dataset::{Dataset, DatasetError};
 
-/// Pixels that differ by at most so many gray levels count as equal.
+/// The largest difference of two pixels, in gray levels, that counts as equal.
 const EQUAL_LEVELS: u8 = 1;
-/// A run of so many equal frames, the first one included, is frozen.
+/// The least number of equal frames in a row, the first one included, that is called frozen.
 const FROZEN_FRAMES: usize = 3;
 /// The least jump of the mean brightness, in gray levels.
 const JUMP_LEVELS: f64 = 10.0;
 /// A jump is also this many times the usual change of the mean brightness.
 const JUMP_FACTOR: f64 = 8.0;
-/// A change of the exposure changes so many pixels in one direction, and so few in the other. Motion changes both.
+/// At a change of the exposure, at least this share of the pixels changes in one direction, and at most the next share in the
+/// other. Motion changes both.
 const SAME_SHARE: f64 = 0.6;
 const OPPOSITE_SHARE: f64 = 0.1;
 /// A pixel that differs by more than this has changed.
 const CHANGED_LEVELS: i16 = 2;
-/// The image before and after a jump shows the same: its pixels correlate at least so much.
+/// The least correlation of the pixels before and after a jump that shows the same view.
 const SAME_VIEW: f64 = 0.8;
 /// Warn beyond these.
 const DARK_MEAN: f64 = 25.0;

@@ -93,7 +93,7 @@ pub enum EnqueueResult {
     Same(JobRow),
     /// The queue is full.
     Full,
-    /// The submitter's share of the queue is full: so many jobs of one API key can wait.
+    /// The submitter's share of the queue is full: the number of waiting jobs that one API key may have.
     ShareFull(i64),
     /// A queued or running job has the same output.
     Taken,

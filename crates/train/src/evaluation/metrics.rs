@@ -134,7 +134,7 @@ pub struct BenchmarkScores {
     pub ssim: StepCurve,
 }
 
-/// Adds the benchmark's scores to the rows of [`summarize`], for frames of so many pixels.
+/// Adds the benchmark's scores to the rows of [`summarize`], for frames of `frame_pixels` pixels.
 pub fn add_benchmark(rows: &mut [MethodScores], windows: &[WindowScores], frame_pixels: usize) {
     for (row, scores) in rows.iter_mut().enumerate() {
         scores.benchmark = Some(BenchmarkScores {

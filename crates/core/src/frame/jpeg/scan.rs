@@ -294,8 +294,8 @@ impl UnitPart<'_> {
         Ok(())
     }
 
-    /// Reads a bit for each coefficient that is not 0, up to the zero coefficient that follows so many others; gives its
-    /// index.
+    /// Reads a bit for each coefficient that is not 0, and skips the given number of zero coefficients; gives the index of the
+    /// next zero.
     fn refine_until(
         &self,
         reader: &mut BitReader<'_>,

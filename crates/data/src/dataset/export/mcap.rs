@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::ops::Range;
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
-/// A chunk is closed once it has so many bytes.
+/// Number of bytes after which a chunk is closed.
 const CHUNK_BYTES: usize = 1 << 20;
 
 mod operation {

@@ -13,7 +13,7 @@ use super::tables::{self, EpisodeRow};
 use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::sha256_hex;
 
-/// A shard is closed once it has so many frames. It holds whole episodes.
+/// Number of frames after which a shard is closed. It holds whole episodes.
 const SHARD_FRAMES: usize = 2000;
 
 /// A data set that is being written. Its finished shards are the first ones, without gaps.

@@ -13,7 +13,7 @@ use crate::dataset::import::{ImportError, ImportOptions};
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
 const SAME_CLOCK_NS: i64 = 1_000_000_000;
-/// A jump of the images' time by more than so many median periods is a gap.
+/// Number of median periods beyond which a jump of the images' time is a gap.
 const GAP_PERIODS: i64 = 3;
 
 /// Which of a message's times counts.

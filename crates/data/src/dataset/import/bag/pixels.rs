@@ -47,7 +47,7 @@ pub(super) struct RawImage<'a> {
 enum PixelLayout {
     Gray8,
     Gray16,
-    /// Positions of red, green and blue in a pixel of that many bytes.
+    /// Positions of red, green and blue in a pixel of `bytes` bytes.
     Color {
         bytes: usize,
         red: usize,

@@ -15,7 +15,7 @@ use crate::dataset::store::shard_reader::batches;
 const EPISODE_LINES: &str = "meta/episodes.jsonl";
 /// Tables of episodes of version 3.
 const EPISODE_TABLES: &str = "meta/episodes";
-/// Version 2 without this field puts so many episodes into a directory.
+/// Number of episodes in a directory of version 2, if the description has no `chunks_size`.
 const CHUNK_EPISODES: usize = 1000;
 /// The most digits of a number in a path.
 const MAX_DIGITS: usize = 20;
