@@ -10,7 +10,6 @@ mod error;
 mod files;
 mod image_files;
 mod images;
-mod kind;
 mod lerobot;
 mod npz;
 mod numpy;

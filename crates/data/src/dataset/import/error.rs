@@ -1,10 +1,23 @@
-//! Errors of imports, and which of them are damage that may be left out.
+//! Errors of imports: what they mean for the caller, and which of them are damage that may be left out.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use super::skipped::{SkippedItem, SkippedList};
 use crate::dataset::error::DatasetError;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
+
+/// Errors of reading that say something about the recording, not about the machine.
+const DAMAGED_INPUT: [io::ErrorKind; 6] = [
+    io::ErrorKind::NotFound,
+    io::ErrorKind::NotADirectory,
+    io::ErrorKind::IsADirectory,
+    io::ErrorKind::InvalidInput,
+    io::ErrorKind::InvalidData,
+    io::ErrorKind::UnexpectedEof,
+];
 
 /// Why a recording could not be imported: file and place, what was wrong, what would be right.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +52,7 @@ pub enum ImportError {
         /// The file.
         path: PathBuf,
         /// The system's reason.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// A record is wrong.
     #[error("{place}: {reason}; mend it, or leave out what is damaged with --skip-bad")]
@@ -100,8 +113,30 @@ pub enum ImportError {
     Dataset(#[from] DatasetError),
 }
 
+impl HasErrorKind for ImportError {
+    fn kind(&self) -> ErrorKind {
+        if is_transient(self) {
+            return ErrorKind::Away;
+        }
+        match self {
+            Self::Dataset(error) => error.kind(),
+            Self::UnknownSource(_)
+            | Self::Option(_)
+            | Self::OptionValue { .. }
+            | Self::Record { .. }
+            | Self::Image { .. }
+            | Self::Disk { .. }
+            | Self::Empty(_) => ErrorKind::Usage,
+            Self::OutExists { .. } => ErrorKind::Conflict,
+            Self::Io { source, .. } if DAMAGED_INPUT.contains(&source.kind()) => ErrorKind::Usage,
+            Self::Cancelled { .. } | Self::Stopped => ErrorKind::Cancelled,
+            Self::Io { .. } | Self::Program(_) => ErrorKind::Internal,
+        }
+    }
+}
+
 impl ImportError {
-    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }
