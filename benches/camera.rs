@@ -4,8 +4,8 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use foreframe::sim::{Scenario, World, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_sim::{Scenario, World, WorldConfig};
 
 fn camera(criterion: &mut Criterion) {
     let config = WorldConfig::default();

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use foreframe::dataset::{CollectConfig, Dataset, DatasetInfo, collect};
-use foreframe::sim::Scenario;
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, collect};
+use foreframe_sim::Scenario;
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;

@@ -4,14 +4,14 @@
 
 use candle_core::{DType, Device, Tensor};
 use criterion::{Criterion, criterion_group};
-use foreframe::frame::warp::CameraModel;
-use foreframe::nn::{
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, FlowSpec, Loss, Model, ModelSpec,
     Parameters,
 };
-use foreframe::training::TrainConfig;
-use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig};
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_train::training::TrainConfig;
+use foreframe_train::training::optimizer::{Gradients, Optimizer, OptimizerConfig};
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;

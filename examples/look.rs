@@ -5,9 +5,9 @@
 
 use std::error::Error;
 
-use foreframe::frame::{Frame, codec};
+use foreframe::images::encode_png;
 use foreframe::sim::{Scenario, World, WorldConfig};
-use foreframe::types::Seed;
+use foreframe::{Frame, Seed};
 
 const EVERY: usize = 3;
 
@@ -40,7 +40,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     std::fs::write(
         path,
-        codec::encode_png(&Frame::new(width as u32, (trials * side) as u32, sheet)?)?,
+        encode_png(&Frame::new(width as u32, (trials * side) as u32, sheet)?)?,
     )?;
     Ok(())
 }

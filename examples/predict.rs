@@ -6,7 +6,7 @@
 use std::error::Error;
 use std::path::PathBuf;
 
-use foreframe::frame::codec;
+use foreframe::images::{decode, encode_png};
 use foreframe::{Action, PredictionInput, RobotState, load, predict};
 use serde::Deserialize;
 
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut frames = Vec::new();
     for i in 0..spec.context {
         let path = root.join(format!("examples/frames/frame-{i:03}.png"));
-        frames.push(codec::decode(&std::fs::read(path)?)?);
+        frames.push(decode(&std::fs::read(path)?)?);
     }
     let last = spec.context - 1;
     let input = PredictionInput {
@@ -42,7 +42,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let rollout = predict(&model, &[&input])?.remove(0);
     for (number, frame) in (1..).zip(rollout.frames) {
         let path = out.join(format!("predicted-{number}.png"));
-        std::fs::write(&path, codec::encode_png(&frame)?)?;
+        std::fs::write(&path, encode_png(&frame)?)?;
         println!("{}", path.display());
     }
     Ok(())

@@ -5,9 +5,10 @@
 
 use std::error::Error;
 use std::path::PathBuf;
+use std::sync::Arc;
 
-use foreframe::frame::{codec, quality};
-use foreframe::{Action, ConditioningInput, Frame, RobotState, SessionState, load};
+use foreframe::images::{decode, mse, psnr_db};
+use foreframe::{Action, Frame, RobotState, Session, load};
 use serde::Deserialize;
 
 const FRAMES: usize = 15;
@@ -25,18 +26,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     let horizon = model.model.spec().horizon;
     let recording: Recording = serde_json::from_slice(&std::fs::read(root.join("examples/frames/actions.json"))?)?;
 
-    let mut session = SessionState::default();
+    let mut session = Session::new(Arc::new(model));
     let mut predicted: Option<Frame> = None;
     for i in 0..FRAMES {
-        let frame = codec::decode(&std::fs::read(root.join(format!("examples/frames/frame-{i:03}.png")))?)?;
+        let frame = decode(&std::fs::read(root.join(format!("examples/frames/frame-{i:03}.png")))?)?;
         if let Some(predicted) = &predicted {
-            let error = quality::mse(&intensities(predicted), &intensities(&frame));
-            println!("frame {i}: PSNR of the prediction {:.1} dB", quality::psnr_db(error));
+            let error = mse(&intensities(predicted), &intensities(&frame));
+            println!("frame {i}: PSNR of the prediction {:.1} dB", psnr_db(error));
         }
         // The robot plans to go on as it does now.
         let plan = vec![recording.actions[i].clone(); horizon];
-        let conditioning = ConditioningInput::for_model(&model, Some(&plan), Some(&recording.states[i]))?;
-        let prediction = session.predict_next(&model, frame, &conditioning)?;
+        let prediction = session.step(frame, Some(&recording.states[i]), Some(&plan))?;
         predicted = prediction.and_then(|rollout| rollout.frames.into_iter().next());
     }
     println!(

@@ -37,9 +37,9 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use self::error::CliError;
-use crate::dataset::silence_caught_panics;
-use crate::error_text::printable;
 use crate::program;
+use foreframe_core::error_text::printable;
+use foreframe_data::dataset::silence_caught_panics;
 
 /// Predicts the next camera frames of a robot from its frames, its state and its actions.
 ///

@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::server::ServerConfig;
-use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
 use crate::telemetry::LogFormat;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_train::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// The file that is read if it exists and no other is named.
 pub const DEFAULT_FILE: &str = "foreframe.toml";

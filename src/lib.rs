@@ -1,8 +1,9 @@
 //! Foreframe predicts the next camera frames of a robot from its frames, actions and state.
 //!
-//! A robot's own program needs no server: `foreframe = { version = "0.1", default-features = false }` gives it the models,
-//! the state of a session, the [`Predictor`] for many clients, and frames. Feature `sim` adds the simulated room, `train`
-//! data sets, training and evaluation, `server` (the default) the server and the program.
+//! A robot's own program needs no server: `foreframe = { version = "0.1", default-features = false }` gives it models
+//! ([`load`], [`Model`]), the prediction of a window ([`predict`]), the [`Session`] of one camera, the [`Predictor`] for many
+//! clients, and [`images`]. Feature `sim` adds the simulated room, `train` data sets, training and evaluation, `server` (the
+//! default) the server and the program.
 //!
 //! Predict the frames that follow five from a camera:
 //!
@@ -16,7 +17,7 @@
 //! let model = load(Path::new("models/moving"))?;
 //! let mut frames = Vec::new();
 //! for i in 0..model.model.spec().context {
-//!     frames.push(codec::decode(&std::fs::read(format!("examples/frames/frame-{i:03}.png"))?)?);
+//!     frames.push(decode(&std::fs::read(format!("examples/frames/frame-{i:03}.png"))?)?);
 //! }
 //! // This model is conditioned on the robot's state at the last frame and on its next actions. `GET /v1/models/moving`
 //! // and `foreframe inspect moving` list their components and units.
@@ -32,44 +33,124 @@
 //! # }
 //! ```
 //!
-//! The modules in reading order; each uses only those above it. The first ones are in crates of their own, one a layer:
-//! `foreframe-core`, `foreframe-sim`, `foreframe-data`, `foreframe-train` and `foreframe-jobs`.
+//! What stands here is the interface that versions keep; `.ci/public-api.txt` lists it. The crates below, `foreframe-core`,
+//! `foreframe-sim`, `foreframe-data`, `foreframe-train` and `foreframe-jobs`, one a layer, change as the program needs it.
 #![deny(unsafe_code)]
 
-pub use foreframe_core::{error_kind, error_text, files, frame, metric_names, nn, registry, serving, types};
+#[doc(inline)]
+pub use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+#[doc(inline)]
+pub use foreframe_core::frame::{Frame, FrameError};
+#[doc(inline)]
+pub use foreframe_core::nn::{
+    Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec, NnError,
+    PredictorOutput, Reconstruction,
+};
+#[doc(inline)]
+pub use foreframe_core::registry::calibration::{
+    Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,
+};
+#[doc(inline)]
+pub use foreframe_core::registry::{DatasetStamp, LoadedModel, Manifest, ProgramStamp, RegistryError, load, load_as};
+#[doc(inline)]
+pub use foreframe_core::serving::session::{MemoryError, SessionMemory};
+#[doc(inline)]
+pub use foreframe_core::serving::{
+    InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError, Session, Timing,
+    predict,
+};
+#[doc(inline)]
+pub use foreframe_core::types::{Action, Channel, RobotState, Seed, ValueError};
 
+/// Image files, the fitting of images to a model, and the measures of a prediction's error.
+pub mod images {
+    #[doc(inline)]
+    pub use foreframe_core::frame::codec::{decode, encode_gif, encode_png};
+    #[doc(inline)]
+    pub use foreframe_core::frame::fit::{Fit, FitError, fit};
+    #[doc(inline)]
+    pub use foreframe_core::frame::preprocess::Preprocess;
+    #[doc(inline)]
+    pub use foreframe_core::frame::quality::{mse, psnr_db, ssim};
+    #[doc(inline)]
+    pub use foreframe_core::frame::warp::CameraModel;
+}
+
+/// The simulated room: robots, physics and a camera.
 #[cfg(feature = "sim")]
-pub use foreframe_sim as sim;
+pub mod sim {
+    #[doc(inline)]
+    pub use foreframe_sim::{
+        CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, Scenario, SimError, StepResult,
+        TrialParameters, World, WorldConfig, action_channels, state_channels,
+    };
+}
 
+/// Data sets: simulated, imported, opened, inspected and exported.
 #[cfg(feature = "train")]
-pub use foreframe_data::{dataset, inspection};
+pub mod dataset {
+    #[doc(inline)]
+    pub use foreframe_data::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mcap, to_mp4};
+    #[doc(inline)]
+    pub use foreframe_data::dataset::import::{
+        ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, import,
+    };
+    #[doc(inline)]
+    pub use foreframe_data::dataset::{
+        CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, Episode, EpisodeData, Split, Splits,
+        Window, WindowShape, collect,
+    };
+    #[doc(inline)]
+    pub use foreframe_data::inspection::{Inspection, inspect, page};
+}
+
+/// Training on a data set.
 #[cfg(feature = "train")]
-pub use foreframe_train::{evaluation, settings, training};
+pub mod training {
+    #[doc(inline)]
+    pub use foreframe_core::registry::{StoredWeights, load_weights};
+    #[doc(inline)]
+    pub use foreframe_train::settings::{SettingsError, SettingsLayer};
+    #[doc(inline)]
+    pub use foreframe_train::training::{
+        Observer, TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, TrainingStage, run,
+    };
+}
 
-#[cfg(feature = "server")]
-pub use foreframe_jobs::{jobs, store, versions};
+/// The scores of a model beside simple baselines.
+#[cfg(feature = "train")]
+pub mod evaluation {
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::bootstrap::Interval;
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::metrics::{MethodScores, StepCurve};
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::skill::Skill;
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::{
+        EvaluateConfig, EvaluationError, EvaluationProgress, EvaluationReport, EvaluationStage, ScoredSplit, calibrate,
+        run, write,
+    };
+}
 
+// The program and its tests: no promise to anyone else.
 #[cfg(feature = "server")]
 mod program;
 
 #[cfg(feature = "server")]
+#[doc(hidden)]
 pub mod telemetry;
 
 #[cfg(feature = "server")]
+#[doc(hidden)]
 pub mod server;
 
 #[cfg(feature = "server")]
+#[doc(hidden)]
 pub mod config;
 
 #[cfg(feature = "server")]
+#[doc(hidden)]
 pub mod cli;
-
-pub use frame::{Frame, FrameError};
-pub use nn::{Model, ModelSpec, NnError};
-pub use registry::{LoadedModel, Manifest, RegistryError, load};
-pub use serving::session::{MemoryError, SessionMemory, SessionState};
-pub use serving::{
-    ConditioningInput, InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError,
-    predict,
-};
-pub use types::{Action, RobotState, Seed};

@@ -1,6 +1,6 @@
 //! What the program carries: a model, and the commit from which it was built.
 
-use crate::registry::{self, EmbeddedModel};
+use foreframe_core::registry::{self, EmbeddedModel};
 
 /// The commit; empty if it is not known.
 pub(crate) const GIT_COMMIT: &str = env!("GIT_COMMIT_AT_BUILD");

@@ -1,5 +1,5 @@
 //! Logs, metrics and traces. Logs go to standard error, at level `info` and above unless `RUST_LOG` sets another level.
-//! Metrics have the names of [`metric_names`](crate::metric_names); [`install_recorder`] starts to record them and [`render`] writes them for
+//! Metrics have the names of [`metric_names`](foreframe_core::metric_names); [`install_recorder`] starts to record them and [`render`] writes them for
 //! Prometheus. With the feature `otlp`, spans are sent as traces.
 
 #[cfg(feature = "otlp")]
@@ -8,7 +8,7 @@ mod prometheus;
 
 use serde::{Deserialize, Serialize};
 
-use crate::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 
 pub use prometheus::{install_recorder, render, run_upkeep};
 

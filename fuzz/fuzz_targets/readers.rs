@@ -8,16 +8,16 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{LazyLock, OnceLock};
 
 use axum::extract::ws::Message;
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
-use foreframe::dataset::{CollectConfig, Dataset, collect, silence_caught_panics};
-use foreframe::files::sha256_hex;
-use foreframe::frame::codec;
-use foreframe::nn::ModelSpec;
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::{CollectConfig, Dataset, collect, silence_caught_panics};
+use foreframe_core::files::sha256_hex;
+use foreframe_core::frame::codec;
+use foreframe_core::nn::ModelSpec;
 use foreframe::server::protocol::{ClientMessage, Codec};
-use foreframe::serving::{SessionMemory, SessionState};
-use foreframe::sim::{Scenario, WorldConfig};
-use foreframe::training::{self, CHECKPOINT_FILE, CheckpointPosition, TrainConfig, Training};
-use foreframe::types::Seed;
+use foreframe_core::serving::{SessionMemory, SessionState};
+use foreframe_sim::{Scenario, WorldConfig};
+use foreframe_train::training::{self, CHECKPOINT_FILE, CheckpointPosition, TrainConfig, Training};
+use foreframe_core::types::Seed;
 use libfuzzer_sys::fuzz_target;
 
 #[allow(dead_code)]
@@ -99,7 +99,7 @@ fn states(bytes: &[u8]) {
     static SPEC: OnceLock<ModelSpec> = OnceLock::new();
     let spec = SPEC.get_or_init(|| {
         let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/moving");
-        foreframe::registry::load(Path::new(model))
+        foreframe_core::registry::load(Path::new(model))
             .unwrap()
             .manifest
             .spec
@@ -159,7 +159,7 @@ fn shard_set() -> ShardSet {
     let dir = in_memory();
     let out = dir.path().join("set");
     simulate(1, &out);
-    let (metadata, shard) = (out.join(foreframe::dataset::METADATA), find_shard(&out.join("data")));
+    let (metadata, shard) = (out.join(foreframe_data::dataset::METADATA), find_shard(&out.join("data")));
     let text = std::fs::read_to_string(&metadata).unwrap();
     let hash = sha256_hex(&std::fs::read(&shard).unwrap());
     ShardSet {

@@ -8,8 +8,8 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
-use crate::evaluation::{self, EvaluateConfig};
-use crate::registry;
+use foreframe_core::registry;
+use foreframe_train::evaluation::{self, EvaluateConfig};
 
 /// Measure on the validation split which errors to expect of a model, and write it into the model's manifest.
 ///

@@ -12,14 +12,16 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::dataset::collect::{CollectConfig, CollectProgress, collect};
-use crate::dataset::moving_mnist::{DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits};
-use crate::dataset::{Dataset, DatasetInfo, Split, Splits};
-use crate::jobs::spec::MAX_TRIALS;
-use crate::sim::{Look, Scenario, SimError, WorldConfig};
-use crate::training::TrainConfig;
-use crate::training::config::WindowBudget;
-use crate::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::collect::{CollectConfig, CollectProgress, collect};
+use foreframe_data::dataset::moving_mnist::{
+    DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits,
+};
+use foreframe_data::dataset::{Dataset, DatasetInfo, Split, Splits};
+use foreframe_jobs::jobs::spec::MAX_TRIALS;
+use foreframe_sim::{Look, Scenario, SimError, WorldConfig};
+use foreframe_train::training::TrainConfig;
+use foreframe_train::training::config::WindowBudget;
 
 /// More threads would only wait for each other.
 const MAX_THREADS: i64 = 256;

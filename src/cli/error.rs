@@ -6,9 +6,9 @@ use std::io;
 use std::path::Path;
 use std::process::ExitCode;
 
-use crate::error_kind::{ErrorKind, HasErrorKind};
-use crate::error_text;
-use crate::evaluation::EvaluationError;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::error_text;
+use foreframe_train::evaluation::EvaluationError;
 
 /// Why a subcommand ended, as a sentence for the user.
 pub(super) enum CliError {

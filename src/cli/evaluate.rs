@@ -10,11 +10,11 @@ use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
-use crate::dataset::Dataset;
-use crate::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
-use crate::jobs::spec::MAX_RESAMPLES;
-use crate::registry::{self, LoadedModel};
-use crate::types::Seed;
+use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::Dataset;
+use foreframe_jobs::jobs::spec::MAX_RESAMPLES;
+use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
 
 /// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///

@@ -11,13 +11,13 @@ use super::output::OutputDirectory;
 use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::dataset::export::{
+use foreframe_core::frame::codec;
+use foreframe_core::types::Channel;
+use foreframe_data::dataset::export::{
     ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_lerobot_images, to_lerobot_videos, to_mcap, to_mp4,
 };
-use crate::dataset::{Dataset, Episode};
-use crate::evaluation::figures::animation::enlarged_gif;
-use crate::frame::codec;
-use crate::types::Channel;
+use foreframe_data::dataset::{Dataset, Episode};
+use foreframe_train::evaluation::figures::animation::enlarged_gif;
 
 /// Write an episode as images or MP4, or a data set for LeRobot or ROS 2.
 ///

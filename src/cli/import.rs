@@ -8,9 +8,9 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
-use crate::dataset::{DatasetInfo, is_finished};
-use crate::registry::is_valid_name;
+use foreframe_core::registry::is_valid_name;
+use foreframe_data::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
+use foreframe_data::dataset::{DatasetInfo, is_finished};
 
 /// How many left-out items are printed.
 const LISTED_ITEMS: usize = 10;

@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use super::error::CliError;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::dataset;
-use crate::error_text::existing;
-use crate::registry;
+use foreframe_core::error_text::existing;
+use foreframe_core::registry;
+use foreframe_data::dataset;
 
 /// Describe a model or a data set.
 ///

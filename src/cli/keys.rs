@@ -5,7 +5,7 @@ use super::process::print_line;
 use super::settings::{CommonArgs, open_store};
 use super::workspace::block_on;
 use crate::server::keys::NewKey;
-use crate::store::{Author, KeyRow, KeyScope, Store};
+use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store};
 
 const SECONDS_PER_DAY: f64 = 86_400.0;
 

@@ -4,8 +4,8 @@ use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on, split_version};
-use crate::registry::{self, RegistryError};
-use crate::versions::Versions;
+use foreframe_core::registry::{self, RegistryError};
+use foreframe_jobs::versions::Versions;
 
 /// List, activate and remove versions of models.
 ///

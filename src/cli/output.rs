@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::error::CliError;
-use crate::files::write_atomically;
+use foreframe_core::files::write_atomically;
 
 /// The beginning of the name of the directory in which the files are written first.
 const PARTIAL: &str = ".partial-";

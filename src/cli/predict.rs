@@ -12,12 +12,12 @@ use super::output::OutputDirectory;
 use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::error_text;
-use crate::evaluation::figures::{animation, montage};
-use crate::frame::fit::Fit;
-use crate::frame::{Frame, FrameError, codec};
-use crate::nn::ModelSpec;
-use crate::serving::{self, PredictionInput, Rollout};
+use foreframe_core::error_text;
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::{Frame, FrameError, codec};
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::serving::{self, PredictionInput, Rollout};
+use foreframe_train::evaluation::figures::{animation, montage};
 
 /// Predict the frames that follow the images in a directory.
 ///

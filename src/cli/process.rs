@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::io::Write as _;
 
 use super::error::CliError;
-use crate::error_text::printable;
+use foreframe_core::error_text::printable;
 
 /// Writes a line to standard output.
 pub(super) fn print_line(line: impl Display) -> Result<(), CliError> {

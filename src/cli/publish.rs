@@ -6,7 +6,7 @@ use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on};
-use crate::registry::{self, MANIFEST_FILE, RegistryError};
+use foreframe_core::registry::{self, MANIFEST_FILE, RegistryError};
 
 /// The directory of the model in a run's directory.
 const RUN_MODEL: &str = "model";

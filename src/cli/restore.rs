@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::error::CliError;
 use super::process::print_line;
 use super::settings::CommonArgs;
-use crate::store::restore;
+use foreframe_jobs::store::restore;
 
 /// Restore a backup into a new data directory.
 ///

@@ -10,8 +10,8 @@ use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App, ServerListeners, ServerTls};
-use crate::store::Store;
 use crate::telemetry;
+use foreframe_jobs::store::Store;
 
 /// Serve models over HTTP and WebSocket (the default command).
 ///

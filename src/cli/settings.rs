@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use super::error::CliError;
 use crate::config::{Config, LoadedConfig};
-use crate::settings::SettingsLayer;
-use crate::store::Store;
 use crate::telemetry;
+use foreframe_jobs::store::Store;
+use foreframe_train::settings::SettingsLayer;
 
 /// The heading of these flags in every help text.
 const HEADING: &str = "Settings";

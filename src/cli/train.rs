@@ -8,10 +8,10 @@ use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
-use crate::evaluation;
-use crate::registry::StoredWeights;
-use crate::settings::SettingsLayer;
-use crate::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
+use foreframe_core::registry::StoredWeights;
+use foreframe_train::evaluation;
+use foreframe_train::settings::SettingsLayer;
+use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
 /// Train a model on a data set.
 ///

@@ -10,11 +10,11 @@ use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
-use crate::jobs::pipeline::Pipeline;
-use crate::jobs::{Jobs, child};
 use crate::server::serve_worker_health;
 use crate::telemetry;
-use crate::versions::Versions;
+use foreframe_jobs::jobs::pipeline::Pipeline;
+use foreframe_jobs::jobs::{Jobs, child};
+use foreframe_jobs::versions::Versions;
 
 /// Run jobs without serving.
 ///

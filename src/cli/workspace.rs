@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use super::error::CliError;
 use super::settings::open_store;
 use crate::config::Config;
-use crate::dataset::{self, Dataset};
-use crate::jobs;
-use crate::registry::{self, LoadedModel, RegistryError, StoredWeights};
 use crate::server::ServerConfig;
-use crate::versions::{VersionError, Versions};
+use foreframe_core::registry::{self, LoadedModel, RegistryError, StoredWeights};
+use foreframe_data::dataset::{self, Dataset};
+use foreframe_jobs::jobs;
+use foreframe_jobs::versions::{VersionError, Versions};
 
 /// The directories of a configuration.
 pub(super) struct Workspace {

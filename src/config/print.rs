@@ -7,7 +7,7 @@ use utoipa::openapi::{RefOr, Schema};
 
 use super::{Config, range};
 use crate::server::ServerConfig;
-use crate::settings::LayeredSettings;
+use foreframe_train::settings::LayeredSettings;
 
 /// What each setting means, from its documentation.
 pub(super) fn meanings() -> HashMap<String, String> {

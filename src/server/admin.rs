@@ -20,7 +20,7 @@ use super::http::origin::{self, OriginPolicy};
 use super::http::problem::ApiError;
 use super::routes::{health, metrics};
 use super::state::App;
-use crate::store::Store;
+use foreframe_jobs::store::Store;
 
 /// What the handlers of a worker share.
 #[derive(Clone)]

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use tokio::sync::{Semaphore, oneshot};
 
 use super::http::problem::ApiError;
-use crate::jobs::priority;
+use foreframe_jobs::jobs::priority;
 
 /// Work that could not be done.
 #[derive(Debug, thiserror::Error)]

@@ -8,12 +8,12 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 pub use self::bounds::SettingError;
-use crate::dataset::import::DEFAULT_DISK_MIB;
-use crate::jobs::JobLimits;
-use crate::jobs::child::JobProcess;
-use crate::jobs::memory::{self, JobMemory};
-use crate::serving::PredictorConfig;
-use crate::store::StoreConfig;
+use foreframe_core::serving::PredictorConfig;
+use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
+use foreframe_jobs::jobs::JobLimits;
+use foreframe_jobs::jobs::child::JobProcess;
+use foreframe_jobs::jobs::memory::{self, JobMemory};
+use foreframe_jobs::store::StoreConfig;
 
 /// All settings of the server, with their defaults.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]

@@ -10,7 +10,7 @@ use super::config::ServerConfig;
 use super::http::keys::Caller;
 use super::http::problem::ApiError;
 use super::token::Token;
-use crate::sim::Environment;
+use foreframe_sim::Environment;
 
 /// An environment that one request at a time can step.
 pub(super) type SharedEnvironment = Arc<Mutex<Environment>>;
@@ -135,7 +135,7 @@ impl Environments {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sim::{Scenario, WorldConfig};
+    use foreframe_sim::{Scenario, WorldConfig};
 
     fn environment() -> Environment {
         Environment::new(Scenario::Crowded, WorldConfig::default()).unwrap()

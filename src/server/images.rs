@@ -5,12 +5,12 @@ use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
 use super::http::problem::ApiError;
-use crate::error_text::with_causes;
-use crate::frame::fit::{Fit, fit};
-use crate::frame::{Frame, FrameError, codec};
-use crate::nn::ModelSpec;
-use crate::registry::Manifest;
-use crate::serving::{InputError, check_size};
+use foreframe_core::error_text::with_causes;
+use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::{Frame, FrameError, codec};
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::Manifest;
+use foreframe_core::serving::{InputError, check_size};
 
 /// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
 /// small body can take.

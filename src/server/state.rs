@@ -20,13 +20,13 @@ use super::http::tls::ServerTls;
 use super::render_cache::RenderCache;
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
-use crate::jobs::child;
-use crate::jobs::pipeline::Pipeline;
-use crate::jobs::{JobError, Jobs};
-use crate::registry::LoadedModel;
-use crate::serving::{Predictor, ServingError};
-use crate::store::{Store, StoreError};
-use crate::versions::{VersionError, Versions};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::{Predictor, ServingError};
+use foreframe_jobs::jobs::child;
+use foreframe_jobs::jobs::pipeline::Pipeline;
+use foreframe_jobs::jobs::{JobError, Jobs};
+use foreframe_jobs::store::{Store, StoreError};
+use foreframe_jobs::versions::{VersionError, Versions};
 
 /// How often the server checks which versions other servers of the same store activated.
 const FOLLOW_EVERY: Duration = Duration::from_secs(1);

@@ -8,8 +8,8 @@ use metrics::gauge;
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
 use tracing::error;
 
-use crate::metric_names;
 use crate::program::GIT_COMMIT;
+use foreframe_core::metric_names;
 
 /// Histogram buckets in seconds: from half a millisecond (a small model) to the longest sensible deadline.
 const SECONDS: [f64; 16] = [

@@ -6,10 +6,10 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::time::Duration;
 
-use foreframe::nn::Conditioning;
 use foreframe::server::ServerConfig;
-use foreframe::store::Store;
-use foreframe::versions::Versions;
+use foreframe_core::nn::Conditioning;
+use foreframe_jobs::store::Store;
+use foreframe_jobs::versions::Versions;
 use serde_json::{Value, json};
 
 use crate::service::{app, get, model, post, run, spec, store};
@@ -110,13 +110,15 @@ fn job(number: u64) -> Value {
 
 /// The ids of the jobs in a state.
 async fn jobs_in(store: &Store, state: &str) -> BTreeSet<String> {
-    let page = foreframe::store::JobPage {
+    let page = foreframe_jobs::store::JobPage {
         state: Some(state.to_owned()),
         limit: 1000,
         ..Default::default()
     };
     let jobs = store.jobs(page).await.unwrap();
-    jobs.iter().map(|job| foreframe::store::job_id(job.number)).collect()
+    jobs.iter()
+        .map(|job| foreframe_jobs::store::job_id(job.number))
+        .collect()
 }
 
 /// Queues jobs, and cancels them if `cancelled`.

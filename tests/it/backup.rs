@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use foreframe::store::{Store, StoreConfig};
+use foreframe_jobs::store::{Store, StoreConfig};
 use serde_json::{Value, json};
 
 use crate::process::{RunningServer, output, text};

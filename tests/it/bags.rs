@@ -4,10 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::Dataset;
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
-use foreframe::error_text::with_causes;
-use foreframe::frame::{Frame, codec};
+use foreframe_core::error_text::with_causes;
+use foreframe_core::frame::{Frame, codec};
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 
 use crate::bag_files::{
     BagMessage, Chunks, camera_info, compressed_image, image, joint_state, mcap, odometry, twist, twist_stamped,
@@ -92,7 +92,7 @@ fn bag(dir: &Path, name: &str, bytes: &[u8]) -> PathBuf {
     path
 }
 
-fn names(channels: &[foreframe::types::Channel]) -> Vec<String> {
+fn names(channels: &[foreframe_core::types::Channel]) -> Vec<String> {
     channels.iter().map(ToString::to_string).collect()
 }
 
@@ -230,7 +230,7 @@ fn a_stopped_import_of_a_bag_continues_to_the_same_bytes() {
             disk_mib: DEFAULT_DISK_MIB,
         };
         let cancelled = AtomicBool::new(false);
-        let stop = |now: foreframe::dataset::import::ImportProgress| {
+        let stop = |now: foreframe_data::dataset::import::ImportProgress| {
             cancelled.store(now.done >= stop_after, Ordering::Relaxed);
         };
         let stopped = import(&config, &stop, &cancelled);

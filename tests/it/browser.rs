@@ -259,7 +259,7 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
         .await;
     assert_eq!(page.value("document.getElementById('unlock').hidden").await, true);
     app.store()
-        .revoke_key(&key.id, 2.0, &foreframe::store::Author::CommandLine)
+        .revoke_key(&key.id, 2.0, &foreframe_jobs::store::Author::CommandLine)
         .await
         .unwrap();
     keys.refresh().await.unwrap();

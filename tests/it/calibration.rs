@@ -1,15 +1,16 @@
 //! Expected errors, novelty, warnings and other numbers of steps: from the calibration to the answers.
 
+use std::sync::Arc;
 use std::time::Instant;
 
-use foreframe::SessionState;
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::evaluation::{self, EvaluateConfig};
-use foreframe::nn::ModelSpec;
-use foreframe::registry::{self, LoadedModel};
 use foreframe::server::ServerConfig;
-use foreframe::serving::{self, PredictionInput};
-use foreframe::types::{Action, RobotState};
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::serving::Session;
+use foreframe_core::serving::{self, PredictionInput};
+use foreframe_core::types::{Action, RobotState};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe_train::evaluation::{self, EvaluateConfig};
 use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
@@ -109,10 +110,9 @@ fn a_session_expects_the_same_as_a_request() {
     let model = calibrated(dir.path(), &dataset);
     let known = input(&dataset, 1.0, None);
     let held = vec![known.actions[0].clone(); 2];
-    let conditioning = serving::ConditioningInput::for_model(&model, Some(&held), known.state.as_ref()).unwrap();
-    let (mut session, mut last) = (SessionState::default(), None);
+    let (mut session, mut last) = (Session::new(Arc::new(model.clone())), None);
     for frame in known.frames.clone() {
-        last = session.predict_next(&model, frame, &conditioning).unwrap();
+        last = session.step(frame, known.state.as_ref(), Some(&held)).unwrap();
     }
     let (stepped, whole) = (last.unwrap(), serving::predict(&model, &[&known]).unwrap().remove(0));
     assert_eq!(stepped.frames, whole.frames);

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use foreframe::files::sha256_hex;
-use foreframe::nn::Conditioning;
+use foreframe_core::files::sha256_hex;
+use foreframe_core::nn::Conditioning;
 use serde_json::{Value, json};
 
 use crate::process::{output, text};
@@ -203,7 +203,7 @@ fn predict_reports_invalid_frames_and_actions() {
     let dir = working_dir();
     let frames = dir.path().join("look");
     fs::create_dir(&frames).unwrap();
-    let png = foreframe::frame::codec::encode_png(&service::frame(9)).unwrap();
+    let png = foreframe_core::frame::codec::encode_png(&service::frame(9)).unwrap();
     for index in 0..service::CONTEXT {
         fs::write(frames.join(format!("frame-{index}.png")), &png).unwrap();
     }
@@ -335,7 +335,7 @@ fn a_failed_write_leaves_no_data_set() {
 fn write_png(path: &Path, value: u8) {
     fs::write(
         path,
-        foreframe::frame::codec::encode_png(&service::frame(value)).unwrap(),
+        foreframe_core::frame::codec::encode_png(&service::frame(value)).unwrap(),
     )
     .unwrap();
 }

@@ -1,8 +1,8 @@
 //! The configuration: precedence, sources of values, and refusals.
 
 use foreframe::config::{Config, LoadedConfig, environment_layers};
-use foreframe::settings::{SettingsError, SettingsLayer};
 use foreframe::telemetry::LogFormat;
+use foreframe_train::settings::{SettingsError, SettingsLayer};
 
 fn environment(variables: &[(&str, &str)]) -> Vec<SettingsLayer> {
     let owned = variables

@@ -115,7 +115,7 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
     }
     let schema = &contracts.openapi["components"]["schemas"]["JobSpec"];
     assert_eq!(schema["discriminator"]["propertyName"], "kind");
-    for kind in foreframe::jobs::JobSpec::KINDS {
+    for kind in foreframe_jobs::jobs::JobSpec::KINDS {
         let variant = schema["discriminator"]["mapping"][kind].as_str().unwrap();
         let items = schema["oneOf"].as_array().unwrap();
         assert!(items.iter().any(|item| item["$ref"] == variant), "{kind}");

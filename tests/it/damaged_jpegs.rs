@@ -5,10 +5,10 @@ use std::process::Command;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use foreframe::frame::{FrameError, codec};
-use foreframe::nn::Conditioning;
 use foreframe::server::protocol::{ClientMessage, Codec, ErrorCode, FrameMessage, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
+use foreframe_core::frame::{FrameError, codec};
+use foreframe_core::nn::Conditioning;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::json;

@@ -4,12 +4,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use foreframe::dataset::{
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{
     CollectConfig, CollectProgress, CollectionStatus, Dataset, DatasetError, DatasetInfo, collect,
 };
-use foreframe::frame::warp::CameraModel;
-use foreframe::sim::{Scenario, World, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_sim::{Scenario, World, WorldConfig};
 use proptest::prelude::*;
 use tempfile::TempDir;
 

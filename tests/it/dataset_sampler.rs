@@ -2,9 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use foreframe::dataset::{Dataset, DatasetError, DatasetInfo, EpisodeData, Split, Splits, Window, WindowShape};
-use foreframe::sim::{Scenario, TrialParameters};
-use foreframe::types::{Channel, Seed};
+use foreframe_core::types::{Channel, Seed};
+use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo, EpisodeData, Split, Splits, Window, WindowShape};
+use foreframe_sim::{Scenario, TrialParameters};
 use proptest::prelude::*;
 
 const PERIOD_S: f64 = 0.2;

@@ -1,8 +1,8 @@
 //! Versions whose deletion was interrupted.
 
-use foreframe::nn::Conditioning;
-use foreframe::store::{Author, unix_s};
-use foreframe::versions::Versions;
+use foreframe_core::nn::Conditioning;
+use foreframe_jobs::store::{Author, unix_s};
+use foreframe_jobs::versions::Versions;
 
 use crate::service::{model, spec, store};
 

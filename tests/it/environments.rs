@@ -4,10 +4,10 @@ use axum::body::Body;
 use axum::http::Request;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use foreframe::frame::codec;
 use foreframe::server::{App, ServerConfig};
-use foreframe::sim::{Environment, Scenario, TrialParameters, WorldConfig};
-use foreframe::types::{Action, Seed};
+use foreframe_core::frame::codec;
+use foreframe_core::types::{Action, Seed};
+use foreframe_sim::{Environment, Scenario, TrialParameters, WorldConfig};
 use serde_json::{Value, json};
 
 use crate::service::{Answer, app, post, send};

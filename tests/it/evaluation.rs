@@ -3,16 +3,16 @@
 use std::collections::BTreeSet;
 use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::{CollectConfig, Dataset, Split, Splits, collect};
-use foreframe::evaluation::actions::Variant;
-use foreframe::evaluation::method::Method;
-use foreframe::evaluation::plans::PlanOutcome;
-use foreframe::evaluation::report::{EvaluationReport, SetOutcome};
-use foreframe::evaluation::{self, EvaluateConfig, EvaluationError, ScoredSplit};
-use foreframe::nn::{ChannelScale, Conditioning, ModelSpec};
-use foreframe::registry::LoadedModel;
-use foreframe::sim::{Scenario, WorldConfig};
-use foreframe::types::{Channel, Seed};
+use foreframe_core::nn::{ChannelScale, Conditioning, ModelSpec};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::types::{Channel, Seed};
+use foreframe_data::dataset::{CollectConfig, Dataset, Split, Splits, collect};
+use foreframe_sim::{Scenario, WorldConfig};
+use foreframe_train::evaluation::actions::Variant;
+use foreframe_train::evaluation::method::Method;
+use foreframe_train::evaluation::plans::PlanOutcome;
+use foreframe_train::evaluation::report::{EvaluationReport, SetOutcome};
+use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError, ScoredSplit};
 
 use crate::fixtures::{self, moving_squares};
 

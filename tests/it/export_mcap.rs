@@ -4,11 +4,11 @@ use std::fs;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::export::{ACTION_TOPIC, STATE_TOPIC, to_mcap};
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
-use foreframe::dataset::{Dataset, DatasetInfo, Episode, EpisodeData};
-use foreframe::frame::warp::CameraModel;
-use foreframe::types::Channel;
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::types::Channel;
+use foreframe_data::dataset::export::{ACTION_TOPIC, STATE_TOPIC, to_mcap};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::{Dataset, DatasetInfo, Episode, EpisodeData};
 
 use crate::process::{output, text};
 use crate::recordings;

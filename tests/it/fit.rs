@@ -1,9 +1,9 @@
 //! Frames of another size: resized where the client asks for it, else refused.
 
-use foreframe::frame::fit::{Fit, fit};
-use foreframe::frame::{Frame, codec};
 use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, ErrorCode, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
+use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::{Frame, codec};
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle, numbered_frame};

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec, Parameters};
-use foreframe::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
-use foreframe::types::{Channel, Seed};
+use foreframe_core::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec, Parameters};
+use foreframe_core::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe_core::types::{Channel, Seed};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 
 /// Frames per episode.
 const FRAMES: u32 = 14;

@@ -4,13 +4,13 @@ use std::cell::Cell;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use foreframe::frame::Frame;
-use foreframe::nn::Conditioning;
-use foreframe::registry::LoadedModel;
 use foreframe::server::protocol::{Codec, ServerMessage};
 use foreframe::server::{App, ServerConfig};
-use foreframe::serving::{self, PredictionInput};
-use foreframe::types::{Action, RobotState};
+use foreframe_core::frame::Frame;
+use foreframe_core::nn::Conditioning;
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::{self, PredictionInput};
+use foreframe_core::types::{Action, RobotState};
 use serde_json::json;
 
 use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};

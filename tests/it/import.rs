@@ -4,9 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use foreframe::dataset::Dataset;
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
-use foreframe::frame::{Frame, codec};
+use foreframe_core::frame::{Frame, codec};
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
 use serde_json::json;
 
 use crate::recordings::{has_ffmpeg, numpy_array as npy, video};
@@ -285,7 +285,7 @@ fn damaged(change: impl Fn(&Path)) -> (String, usize) {
         ..small()
     };
     let imported = run(&source, &dir.path().join("skipping"), options).unwrap();
-    (foreframe::error_text::with_causes(&error), imported.skipped.len())
+    (foreframe_core::error_text::with_causes(&error), imported.skipped.len())
 }
 
 #[test]
@@ -359,7 +359,10 @@ fn a_used_directory_and_other_options_are_refused() {
     let error = run(&source, &source, small()).unwrap_err().to_string();
     assert!(error.contains("other files"), "{error}");
     let error = run(&dir.path().join("none"), &dir.path().join("c"), small()).unwrap_err();
-    assert!(foreframe::error_text::with_causes(&error).contains("none"), "{error}");
+    assert!(
+        foreframe_core::error_text::with_causes(&error).contains("none"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use foreframe::dataset::Dataset;
-use foreframe::dataset::import::{ImportOptions, Imported};
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::import::{ImportOptions, Imported};
 
 use crate::bag_files::{BagMessage, image};
 use crate::import::{folder, npz, run, small};

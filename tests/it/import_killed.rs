@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Stdio};
 use std::time::Instant;
 
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
 use rand::Rng as _;
 
 use crate::process::{foreframe, text};

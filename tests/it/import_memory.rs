@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Output;
 
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, import};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, import};
 use serde_json::Value;
 
 use crate::bag_files::endless_topics;

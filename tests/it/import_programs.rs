@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use foreframe::dataset::import::ImportOptions;
+use foreframe_data::dataset::import::ImportOptions;
 use serde_json::{Value, json};
 
 use crate::import::run;
@@ -195,7 +195,7 @@ fn a_portrait_video_keeps_its_sides() {
         };
         let out = dir.path().join(out);
         run(source, &out, options).unwrap();
-        foreframe::dataset::Dataset::open(&out)
+        foreframe_data::dataset::Dataset::open(&out)
             .unwrap()
             .pixels(0)
             .unwrap()

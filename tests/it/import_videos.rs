@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use foreframe::dataset::Dataset;
-use foreframe::dataset::import::ImportOptions;
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::import::ImportOptions;
 
 use crate::import::{run, small};
 use crate::recordings::{contents, has_ffmpeg, lerobot_videos, video};

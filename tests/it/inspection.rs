@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
-use foreframe::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, collect};
-use foreframe::inspection::{FramePlace, FrozenSpan, Inspection, MotionSignal, inspect, page};
-use foreframe::sim::{Scenario, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, collect};
+use foreframe_data::inspection::{FramePlace, FrozenSpan, Inspection, MotionSignal, inspect, page};
+use foreframe_sim::{Scenario, WorldConfig};
 
 /// Episodes of a driving camera, so that every action moves the image.
 fn driving() -> (DatasetInfo, Vec<EpisodeData>) {

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::http::Request;
-use foreframe::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
-use foreframe::nn::Conditioning;
 use foreframe::server::{App, AppParts, ServerConfig};
-use foreframe::serving::{Predictor, PredictorConfig};
-use foreframe::versions::Versions;
+use foreframe_core::nn::Conditioning;
+use foreframe_core::serving::{Predictor, PredictorConfig};
+use foreframe_jobs::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
+use foreframe_jobs::versions::Versions;
 use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
 

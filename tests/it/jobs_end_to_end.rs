@@ -243,12 +243,12 @@ async fn model_versions_are_activated_refused_and_deleted() {
     );
     // A version that another server activates is loaded. If it is invalid, the previous one is served, also after a restart.
     store(dir.path())
-        .set_active("plain", 1, 0.0, &foreframe::store::Author::CommandLine)
+        .set_active("plain", 1, 0.0, &foreframe_jobs::store::Author::CommandLine)
         .await
         .unwrap();
     wait_for_version(&next, "plain", 1).await;
     store(dir.path())
-        .set_active("plain", 3, 0.0, &foreframe::store::Author::CommandLine)
+        .set_active("plain", 3, 0.0, &foreframe_jobs::store::Author::CommandLine)
         .await
         .unwrap();
     let third = App::open(config).await.unwrap();

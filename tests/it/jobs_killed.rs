@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
 use rand::Rng as _;
 use serde_json::{Value, json};
 

@@ -4,7 +4,7 @@ use axum::body::Body;
 use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
 use foreframe::server::{App, ServerConfig};
-use foreframe::store::{Author, KeyRow, KeyScope, Store, StoreConfig, unix_s};
+use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreConfig, unix_s};
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;

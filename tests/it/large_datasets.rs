@@ -7,13 +7,13 @@ use std::process::{Command, Output, Stdio};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use foreframe::dataset::export::to_lerobot_images;
-use foreframe::dataset::{Dataset, DatasetError};
-use foreframe::error_text::with_causes;
-use foreframe::evaluation::{self, EvaluateConfig};
-use foreframe::inspection::{inspect, page};
-use foreframe::registry;
-use foreframe::training::{TrainConfig, Training, run};
+use foreframe_core::error_text::with_causes;
+use foreframe_core::registry;
+use foreframe_data::dataset::export::to_lerobot_images;
+use foreframe_data::dataset::{Dataset, DatasetError};
+use foreframe_data::inspection::{inspect, page};
+use foreframe_train::evaluation::{self, EvaluateConfig};
+use foreframe_train::training::{TrainConfig, Training, run};
 use serde_json::Value;
 use tempfile::TempDir;
 

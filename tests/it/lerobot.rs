@@ -4,11 +4,11 @@ use std::fs;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use foreframe::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
-use foreframe::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
-use foreframe::dataset::{CollectConfig, Dataset, DatasetError, collect};
-use foreframe::sim::{Scenario, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::{CollectConfig, Dataset, DatasetError, collect};
+use foreframe_sim::{Scenario, WorldConfig};
 use serde_json::{Value, json};
 
 use crate::recordings::has_ffmpeg;
@@ -145,7 +145,7 @@ fn damaged_descriptions_are_refused() {
     });
     let refused = |name: &str| {
         let error = run(&set, &dir.path().join(name), image()).unwrap_err();
-        foreframe::error_text::with_causes(&error)
+        foreframe_core::error_text::with_causes(&error)
     };
     change_info(&set, |info| info["data_path"] = json!("../../{file_index:03d}.parquet"));
     assert!(refused("a").contains("it must be a file below"), "{}", refused("a"));

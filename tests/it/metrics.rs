@@ -5,10 +5,10 @@ use std::net::TcpStream;
 use std::path::Path;
 use std::time::Instant;
 
-use foreframe::metric_names;
-use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, OnLate, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
+use foreframe_core::metric_names;
+use foreframe_core::nn::{Conditioning, ModelSpec};
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};

@@ -7,16 +7,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use foreframe::dataset::moving_mnist::{MovingMnistConfig, collect_digits};
-use foreframe::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
-use foreframe::evaluation::method::Method;
-use foreframe::evaluation::{self, EvaluateConfig, ScoredSplit};
-use foreframe::frame::quality::ssim_even;
-use foreframe::frame::{Frame, codec};
-use foreframe::registry;
-use foreframe::sim::moving_digits::moving_digits;
-use foreframe::training::{TrainConfig, Training, run};
-use foreframe::types::Seed;
+use foreframe_core::frame::quality::ssim_even;
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::registry;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::moving_mnist::{MovingMnistConfig, collect_digits};
+use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo, Split, Splits};
+use foreframe_sim::moving_digits::moving_digits;
+use foreframe_train::evaluation::method::Method;
+use foreframe_train::evaluation::{self, EvaluateConfig, ScoredSplit};
+use foreframe_train::training::{TrainConfig, Training, run};
 
 use crate::process::{output, text};
 
@@ -278,7 +278,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     };
     run(
         &training,
-        &mut |_: foreframe::training::TrainingEvent| {},
+        &mut |_: foreframe_train::training::TrainingEvent| {},
         &AtomicBool::new(false),
     )
     .unwrap();

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use foreframe::nn::dense::{LstmState, PeepholeCell, unroll};
+use foreframe_core::nn::dense::{LstmState, PeepholeCell, unroll};
 
 use crate::nn_fixtures::largest_difference;
 use crate::nn_reference::{CellState, step};

@@ -1,7 +1,7 @@
 //! Small models and inputs for the tests of the network.
 
 use candle_core::{Device, Tensor};
-use foreframe::nn::{
+use foreframe_core::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, ModelSpec, PredictorOutput,
     Reconstruction,
 };

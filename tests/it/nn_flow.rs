@@ -1,12 +1,12 @@
 //! The flow network: shapes, costs, independence of the batch, and what it refuses.
 
 use candle_core::{Device, Tensor};
-use foreframe::frame::warp::CameraModel;
-use foreframe::nn::{
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, FlowLayers, FlowSpec, Model, ModelSpec,
     NnError, Parameters,
 };
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
 
 use crate::nn_fixtures::{condition, largest_difference, values};
 

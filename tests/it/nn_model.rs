@@ -1,8 +1,10 @@
 //! The whole model: gradients, determinism, conditioning, and errors.
 
 use candle_core::{DType, Device, Tensor};
-use foreframe::nn::{Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction};
-use foreframe::types::Seed;
+use foreframe_core::nn::{
+    Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction,
+};
+use foreframe_core::types::Seed;
 
 use crate::nn_fixtures::{all_kinds, bits, condition, largest_difference, tiny, values};
 use crate::nn_reference::{Reference, in_f64};

@@ -1,9 +1,9 @@
 //! Adam: the closed form, resuming, clipping, and errors.
 
 use candle_core::{Device, Tensor};
-use foreframe::nn::{Architecture, ConditioningTensors, DenseSpec, Feedback, Loss, Model, ModelSpec, Parameters};
-use foreframe::training::optimizer::{Gradients, Optimizer, OptimizerConfig, OptimizerError};
-use foreframe::types::Seed;
+use foreframe_core::nn::{Architecture, ConditioningTensors, DenseSpec, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe_core::types::Seed;
+use foreframe_train::training::optimizer::{Gradients, Optimizer, OptimizerConfig, OptimizerError};
 
 const RATE: f64 = 1e-2;
 

@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use foreframe::nn::spec::MIN_CHANNEL_STD;
-use foreframe::nn::{
+use foreframe_core::nn::spec::MIN_CHANNEL_STD;
+use foreframe_core::nn::{
     ChannelScale, ConditioningTensors, DenseSpec, ModelSpec, Parameters, PredictorOutput, Reconstruction,
 };
 

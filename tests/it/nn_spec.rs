@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Tensor};
-use foreframe::nn::{Architecture, Conditioning, DenseSpec, Loss, ModelSpec, NnError, Parameters, Reconstruction};
-use foreframe::types::Seed;
+use foreframe_core::nn::{Architecture, Conditioning, DenseSpec, Loss, ModelSpec, NnError, Parameters, Reconstruction};
+use foreframe_core::types::Seed;
 
 use crate::nn_fixtures::{all_kinds, bits, channel, tiny, values};
 

@@ -6,11 +6,11 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use foreframe::dataset::{CollectConfig, collect};
 use foreframe::server::protocol::{ClosingReason, Codec, ErrorCode, ServerMessage};
 use foreframe::server::{self, App, ServerConfig, ServerListeners};
-use foreframe::sim::{Scenario, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_core::types::Seed;
+use foreframe_data::dataset::{CollectConfig, collect};
+use foreframe_sim::{Scenario, WorldConfig};
 use serde_json::json;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};

@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use foreframe::nn::Conditioning;
+use foreframe_core::nn::Conditioning;
 use serde_json::{Value, json};
 
 use crate::process::{Program, RunningServer, foreframe, output, text};

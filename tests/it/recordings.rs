@@ -4,10 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use foreframe::dataset::export::{to_lerobot_images, to_lerobot_videos};
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::frame::{Frame, codec};
-use foreframe::types::Channel;
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::types::Channel;
+use foreframe_data::dataset::export::{to_lerobot_images, to_lerobot_videos};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 use serde_json::json;
 
 use crate::bag_files::{BagMessage, Chunks, image, mcap, odometry, twist};

@@ -6,10 +6,10 @@ use axum::body::Body;
 use axum::http::{Request, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use foreframe::frame::codec;
-use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::Codec;
 use foreframe::server::{App, ServerConfig};
+use foreframe_core::frame::codec;
+use foreframe_core::nn::{Conditioning, ModelSpec};
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};

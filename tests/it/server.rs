@@ -3,10 +3,10 @@
 use axum::http::header;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use foreframe::frame::{Frame, codec};
-use foreframe::nn::Conditioning;
 use foreframe::server::ServerConfig;
-use foreframe::serving::{self, PredictionInput};
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::nn::Conditioning;
+use foreframe_core::serving::{self, PredictionInput};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;

@@ -5,9 +5,9 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use foreframe::frame::codec;
 use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
+use foreframe_core::frame::codec;
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle};

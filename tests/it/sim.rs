@@ -1,12 +1,12 @@
 //! The simulated world: closed forms, seeds, bounds, collisions, camera.
 
-use foreframe::sim::camera::Camera;
-use foreframe::sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
-use foreframe::sim::{
+use foreframe_core::types::{Action, Seed};
+use foreframe_sim::camera::Camera;
+use foreframe_sim::scenario::{HELD_OUT_HEADING_GAIN, HELD_OUT_PAIRS};
+use foreframe_sim::{
     Look, Observation, PlanarPose, Scenario, TrialParameters, World, WorldConfig, action_channels, arena, robot,
     state_channels,
 };
-use foreframe::types::{Action, Seed};
 
 pub(crate) fn action(linear: f32, angular: f32) -> Action {
     Action::try_from(vec![linear, angular]).unwrap()

@@ -1,7 +1,7 @@
 //! Errors of the simulator, and the episodes of an environment.
 
-use foreframe::sim::{Environment, Scenario, SimError, TrialParameters, World, WorldConfig};
-use foreframe::types::{Action, Seed};
+use foreframe_core::types::{Action, Seed};
+use foreframe_sim::{Environment, Scenario, SimError, TrialParameters, World, WorldConfig};
 
 use crate::sim::{action, small};
 

@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
-use foreframe::dataset::{Dataset, DatasetInfo, EpisodeData};
-use foreframe::nn::ConditioningTensors;
-use foreframe::registry;
-use foreframe::training::{TrainConfig, TrainingOutcome};
+use foreframe_core::nn::ConditioningTensors;
+use foreframe_core::registry;
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe_train::training::{TrainConfig, TrainingOutcome};
 
 use crate::training::train;
 

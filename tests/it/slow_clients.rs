@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use foreframe::nn::{Conditioning, ModelSpec};
 use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, FrameMessage, ServerMessage, WarningCode};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
+use foreframe_core::nn::{Conditioning, ModelSpec};
 
 use crate::client::Client;
 use crate::service::{self, InProcessServer, model, run, spec, with_data};

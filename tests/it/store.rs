@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use crate::skip::skip_without;
-use foreframe::store::{
+use foreframe_jobs::store::{
     Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob,
     PublishedVersion, Store, StoreConfig,
 };

@@ -1,6 +1,6 @@
 //! How the store counts attempts without progress.
 
-use foreframe::store::{JobOutcome, JobReport, NewJob, Store, StoreConfig};
+use foreframe_jobs::store::{JobOutcome, JobReport, NewJob, Store, StoreConfig};
 
 async fn store(dir: &std::path::Path) -> Store {
     let config = StoreConfig {

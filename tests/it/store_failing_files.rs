@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use foreframe::nn::Conditioning;
+use foreframe_core::nn::Conditioning;
 use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};

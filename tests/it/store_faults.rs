@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use foreframe::store::{EnqueueResult, JobPage, NewJob, Store, StoreConfig, StoreError};
+use foreframe_jobs::store::{EnqueueResult, JobPage, NewJob, Store, StoreConfig, StoreError};
 
 async fn open(dir: &Path) -> Result<Store, StoreError> {
     let config = StoreConfig {

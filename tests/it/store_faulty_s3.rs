@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
-use foreframe::files::sha256_hex;
-use foreframe::store::{Store, StoreConfig};
+use foreframe_core::files::sha256_hex;
+use foreframe_jobs::store::{Store, StoreConfig};
 use serde_json::Value;
 
 use crate::jobs_killed::{collect, weights};

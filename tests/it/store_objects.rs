@@ -1,6 +1,6 @@
 //! The object store that several machines share: in a directory, and in S3 if available.
 
-use foreframe::store::{Store, StoreConfig};
+use foreframe_jobs::store::{Store, StoreConfig};
 use tempfile::TempDir;
 
 /// Two data directories with one object store: a directory, and an S3 bucket if `FOREFRAME_TEST_S3` is set.

@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use foreframe::nn::Conditioning;
 use foreframe::server::ServerConfig;
+use foreframe_core::nn::Conditioning;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
@@ -188,7 +188,7 @@ async fn refused_messages_do_not_change_the_stream() {
         fields.extend(more.as_object().unwrap().clone());
         message
     };
-    let small = png(&foreframe::frame::Frame::new(8, 8, vec![0; 64]).unwrap());
+    let small = png(&foreframe_core::frame::Frame::new(8, 8, vec![0; 64]).unwrap());
     for (message, code, detail) in [
         (json!({"type": "dance"}), "malformed", "unknown variant `dance`"),
         (with(json!({"colour": 1})), "malformed", "unknown field `colour`"),
@@ -283,7 +283,7 @@ async fn a_client_that_never_reads_loses_its_stream() {
         stream_send_ms: 50,
         ..with_data(dir.path(), ServerConfig::default())
     };
-    let large = foreframe::nn::ModelSpec {
+    let large = foreframe_core::nn::ModelSpec {
         frame_width_px: 128,
         frame_height_px: 128,
         context: 1,

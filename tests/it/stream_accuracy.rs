@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
-use foreframe::frame::{Frame, codec};
-use foreframe::registry::{self, LoadedModel};
 use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMessage};
 use foreframe::server::{App, ImageBytes, ImageFormat, ServerConfig};
-use foreframe::serving::{self, PredictionInput};
-use foreframe::types::{Action, RobotState, Seed};
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::serving::{self, PredictionInput};
+use foreframe_core::types::{Action, RobotState, Seed};
 use rand::Rng as _;
 use serde_json::{Value, json};
 
@@ -159,21 +159,21 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
         };
         let features = tensor(&[24, spec.context, spec.code_len()]);
         let windows: Vec<u32> = (0..64).map(|future| future * 7 % 24).collect();
-        let condition = foreframe::nn::ConditioningTensors {
+        let condition = foreframe_core::nn::ConditioningTensors {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
         };
         let together = model.model.predict_futures(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
             let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
-            let condition = foreframe::nn::ConditioningTensors {
+            let condition = foreframe_core::nn::ConditioningTensors {
                 actions: row(&condition.actions),
                 state: row(&condition.state),
             };
             let window = features.narrow(0, window as usize, 1).unwrap();
             let alone = model
                 .model
-                .predict(&window, &condition, foreframe::nn::Feedback::Prediction)
+                .predict(&window, &condition, foreframe_core::nn::Feedback::Prediction)
                 .unwrap();
             let apart = (alone - together.narrow(0, future, 1).unwrap()).unwrap().abs().unwrap();
             let apart = apart.flatten_all().unwrap().max(0).unwrap().to_scalar::<f32>().unwrap();

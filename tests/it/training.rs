@@ -4,13 +4,13 @@ use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use foreframe::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, Split, Splits, collect};
-use foreframe::frame::warp::CameraModel;
-use foreframe::registry::{self, StoredWeights};
-use foreframe::settings::SettingsLayer;
-use foreframe::sim::{Scenario, TrialParameters, WorldConfig};
-use foreframe::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
-use foreframe::types::{Channel, Seed};
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::registry::{self, StoredWeights};
+use foreframe_core::types::{Channel, Seed};
+use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, Split, Splits, collect};
+use foreframe_sim::{Scenario, TrialParameters, WorldConfig};
+use foreframe_train::settings::SettingsLayer;
+use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, run};
 
 use crate::fixtures::moving_squares;
 

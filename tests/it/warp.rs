@@ -1,10 +1,10 @@
 //! Warping by a rotation against the simulator's own pictures.
 
-use foreframe::frame::preprocess::scale;
-use foreframe::frame::quality::mse;
-use foreframe::frame::warp::{CameraModel, rotation_grid, sample};
-use foreframe::sim::{CameraConfig, PlanarPose, Scenario, TrialParameters, World, WorldConfig};
-use foreframe::types::Seed;
+use foreframe_core::frame::preprocess::scale;
+use foreframe_core::frame::quality::mse;
+use foreframe_core::frame::warp::{CameraModel, rotation_grid, sample};
+use foreframe_core::types::Seed;
+use foreframe_sim::{CameraConfig, PlanarPose, Scenario, TrialParameters, World, WorldConfig};
 
 fn config(tilt_down_rad: f64) -> WorldConfig {
     WorldConfig {

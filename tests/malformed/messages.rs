@@ -1,8 +1,8 @@
 //! Stream messages in both sub-protocols.
 
 use axum::extract::ws::Message;
-use foreframe::error_text::without_middle;
 use foreframe::server::protocol::{ClientMessage, Codec};
+use foreframe_core::error_text::without_middle;
 use proptest::prelude::*;
 use proptest::sample::Index;
 

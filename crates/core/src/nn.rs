@@ -34,7 +34,7 @@ pub mod tensors;
 
 pub use conditioning::ConditioningTensors;
 pub use dense::Feedback;
-pub use error::NnError;
+pub use error::{NnError, TensorError};
 pub use flow::FlowPrediction;
 pub use loss::Loss;
 pub use model::Model;

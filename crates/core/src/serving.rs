@@ -22,7 +22,7 @@ pub mod session;
 pub use conditioning::{ConditioningInput, RawConditioning, STEP_FIELDS};
 pub use error::{InputError, ServingError};
 pub use input::PredictionInput;
-pub use local::predict;
+pub use local::{Session, predict};
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
 pub use session::{SessionMemory, SessionState};

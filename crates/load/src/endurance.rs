@@ -16,7 +16,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use foreframe::{LoadedModel, registry};
+use foreframe_core::registry::{self, LoadedModel};
 use futures_util::future::join_all;
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, sleep_until, timeout};

@@ -2,11 +2,11 @@
 
 use std::fs;
 
-use foreframe::frame::codec;
-use foreframe::nn::ModelSpec;
-use foreframe::registry::manifest;
 use foreframe::server::protocol::{ClientMessage, FrameMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
+use foreframe_core::frame::codec;
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::manifest;
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
 

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use crate::cli::error::CliError;
 use crate::cli::process::print_line;
-use crate::dataset::{Dataset, DatasetInfo};
-use crate::error_text::comma_separated;
-use crate::files::write_atomically;
-use crate::inspection::{ActionDelay, ChannelSummary, Inspection, inspect, page};
+use foreframe_core::error_text::comma_separated;
+use foreframe_core::files::write_atomically;
+use foreframe_data::dataset::{Dataset, DatasetInfo};
+use foreframe_data::inspection::{ActionDelay, ChannelSummary, Inspection, inspect, page};
 
 /// Looks through a data set and prints what was found, also as a page into the file `html`.
 pub(super) fn describe(dir: &Path, dataset: &Dataset, html: Option<&Path>, is_json: bool) -> Result<(), CliError> {

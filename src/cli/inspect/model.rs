@@ -4,9 +4,9 @@ use std::path::Path;
 
 use crate::cli::error::CliError;
 use crate::cli::process::print_line;
-use crate::error_text::comma_separated;
-use crate::nn::{Architecture, ChannelScale, ModelSpec, costs};
-use crate::registry::Manifest;
+use foreframe_core::error_text::comma_separated;
+use foreframe_core::nn::{Architecture, ChannelScale, ModelSpec, costs};
+use foreframe_core::registry::Manifest;
 
 /// Prints what a model takes, predicts, costs and comes from.
 pub(super) fn describe(dir: &Path, manifest: &Manifest, as_json: bool) -> Result<(), CliError> {

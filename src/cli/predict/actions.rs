@@ -5,8 +5,8 @@ use std::path::Path;
 use serde::Deserialize;
 
 use crate::cli::error::CliError;
-use crate::nn::ModelSpec;
-use crate::types::{Action, RobotState};
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::types::{Action, RobotState};
 
 /// One entry for each image of the directory.
 #[derive(Deserialize)]

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use tracing::info;
 
 use crate::cli::error::CliError;
-use crate::error_text;
-use crate::files::natural_order;
-use crate::frame::fit::{Fit, fit};
-use crate::frame::{Frame, codec};
-use crate::nn::ModelSpec;
+use foreframe_core::error_text;
+use foreframe_core::files::natural_order;
+use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::nn::ModelSpec;
 
 /// The endings of the files that are read.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];

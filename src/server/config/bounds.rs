@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 
 use super::ServerConfig;
-use crate::nn::spec::MAX_STEPS;
+use foreframe_core::nn::spec::MAX_STEPS;
 
 /// A setting out of range.
 #[derive(Debug, thiserror::Error)]

@@ -2,7 +2,7 @@
 
 use axum::http::Method;
 
-use crate::store::KeyScope;
+use foreframe_jobs::store::KeyScope;
 
 /// The scope that a request needs, by its method and its route's template. A route without a rule needs `admin`.
 pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScope {

@@ -11,8 +11,8 @@ use metrics::counter;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::problem::ApiError;
-use crate::metric_names;
 use crate::server::config::ServerConfig;
+use foreframe_core::metric_names;
 
 /// The places of requests for predictions; clones share them.
 #[derive(Clone)]

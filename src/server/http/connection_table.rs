@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use metrics::counter;
 use tokio::sync::Notify;
 
-use crate::metric_names;
+use foreframe_core::metric_names;
 
 /// The limits of a [`ConnectionTable`].
 pub(super) struct ConnectionLimits {

@@ -19,8 +19,8 @@ use tracing::warn;
 use super::access::required_scope;
 use super::problem::ApiError;
 use super::rate::RateLimit;
-use crate::metric_names;
-use crate::store::{Author, KeyRow, KeyScope, Store, StoreError};
+use foreframe_core::metric_names;
+use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreError};
 
 /// The beginning of every key, so that leaked keys are easy to find.
 const PREFIX: &str = "ffk";

@@ -18,8 +18,8 @@ use tracing::warn;
 
 use super::connection_table::{ConnectionLimits, ConnectionPlace, ConnectionTable};
 use super::problem::CONNECTIONS_FULL_RESPONSE;
-use crate::metric_names;
 use crate::server::config::ServerConfig;
+use foreframe_core::metric_names;
 
 /// How many connections can be refused with a response at the same time; more are closed without one.
 const MAX_REFUSING: usize = 64;

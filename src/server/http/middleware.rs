@@ -12,8 +12,8 @@ use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
 use super::problem::{self, ApiError};
-use crate::metric_names;
 use crate::server::config::ServerConfig;
+use foreframe_core::metric_names;
 
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// The maximum length of a client's own id; a longer one is replaced.

@@ -8,9 +8,9 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::{error, warn};
 
-use crate::error_kind::{ErrorKind, HasErrorKind};
-use crate::error_text::{with_causes, without_middle};
-use crate::files::is_transient;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::error_text::{with_causes, without_middle};
+use foreframe_core::files::is_transient;
 
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
@@ -242,7 +242,7 @@ pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::StoreError;
+    use foreframe_jobs::store::StoreError;
 
     #[derive(Debug, thiserror::Error)]
     #[error("of a test")]

@@ -9,7 +9,7 @@ use crate::server::http::extract::Query;
 use crate::server::http::page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::audit::AuditRow;
+use foreframe_jobs::store::audit::AuditRow;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(list))

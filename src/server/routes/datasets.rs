@@ -10,17 +10,17 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture::PictureError;
-use crate::dataset::{Dataset, DatasetError, DatasetInfo};
-use crate::evaluation::figures::animation::enlarged_gif;
-use crate::evaluation::figures::montage::{MontageRow, Style, montage};
-use crate::frame::{Frame, FrameError, codec};
-use crate::jobs::{JobError, datasets};
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::Author;
-use crate::types::Channel;
+use foreframe_core::frame::{Frame, FrameError, codec};
+use foreframe_core::types::Channel;
+use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo};
+use foreframe_jobs::jobs::{JobError, datasets};
+use foreframe_jobs::store::Author;
+use foreframe_train::evaluation::figures::animation::enlarged_gif;
+use foreframe_train::evaluation::figures::montage::{MontageRow, Style, montage};
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

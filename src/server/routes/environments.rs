@@ -11,15 +11,18 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::nn::spec::MAX_MODEL_SIDE_PX;
 use crate::server::environments::SharedEnvironment;
 use crate::server::http::extract::{Json, Path};
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat};
 use crate::server::state::App;
-use crate::sim::{self, Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig};
-use crate::types::{Action, Channel, Seed, ValueError};
+use foreframe_core::nn::spec::MAX_MODEL_SIDE_PX;
+use foreframe_core::types::{Action, Channel, Seed, ValueError};
+use foreframe_sim::{
+    Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig, action_channels,
+    state_channels,
+};
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -237,8 +240,8 @@ fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), Env
     let body = EnvironmentBody {
         id: String::new(),
         scenario: request.scenario,
-        action: sim::action_channels(),
-        state: sim::state_channels(),
+        action: action_channels(),
+        state: state_channels(),
         world: request.world.clone(),
         observation,
         info,

@@ -7,7 +7,7 @@ use utoipa_axum::routes;
 
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::Store;
+use foreframe_jobs::store::Store;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(livez)).routes(routes!(readyz))

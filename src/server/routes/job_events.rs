@@ -14,12 +14,12 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::jobs::LogLine;
-use crate::jobs::{Job, JobError};
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::http::task_limit::stop_requested;
 use crate::server::state::App;
+use foreframe_jobs::jobs::{Job, JobError};
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(events))

@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
 use utoipa_axum::routes;
 
-use crate::jobs::pipeline::report_key;
-use crate::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::{Author, LogRow, LossRow};
+use foreframe_jobs::jobs::pipeline::report_key;
+use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
+use foreframe_jobs::store::{Author, LogRow, LossRow};
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {

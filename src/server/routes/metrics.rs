@@ -11,10 +11,12 @@ use tracing::warn;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::jobs::{JobSpec, JobState};
 use crate::server::state::App;
-use crate::store::Store;
-use crate::{metric_names, telemetry};
+use foreframe_core::metric_names;
+use foreframe_jobs::jobs::{JobSpec, JobState};
+use foreframe_jobs::store::Store;
+
+use crate::telemetry;
 
 pub(in crate::server) const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 /// How often the samples of histograms are sorted into their buckets.

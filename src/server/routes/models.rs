@@ -7,14 +7,14 @@ use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::nn::ModelSpec;
-use crate::registry::Manifest;
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::store::Author;
-use crate::versions::VersionError;
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::Manifest;
+use foreframe_jobs::store::Author;
+use foreframe_jobs::versions::VersionError;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

@@ -3,13 +3,13 @@
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 
-use crate::error_text::with_causes;
-use crate::evaluation::figures::montage::{MontageRow, Style, montage};
-use crate::frame::{Frame, FrameError, codec};
 use crate::server::blocking::BlockingWork;
 use crate::server::http::extract::ResponseFormat;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
+use foreframe_core::error_text::with_causes;
+use foreframe_core::frame::{Frame, FrameError, codec};
+use foreframe_train::evaluation::figures::montage::{MontageRow, Style, montage};
 
 /// How long an animation stays on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;

@@ -9,18 +9,18 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use crate::evaluation::figures::montage::prediction_sheet;
-use crate::frame::Frame;
-use crate::frame::fit::Fit;
-use crate::registry::Manifest;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
 use crate::server::http::multipart::{JsonOrForm, TooManyError, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
-use crate::types::{Action, RobotState, ValueError};
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::registry::Manifest;
+use foreframe_core::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
+use foreframe_core::types::{Action, RobotState, ValueError};
+use foreframe_train::evaluation::figures::montage::prediction_sheet;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(predict))

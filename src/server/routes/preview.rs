@@ -10,16 +10,16 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use crate::evaluation::figures::montage::prediction_sheet;
-use crate::frame::Frame;
-use crate::nn::{Conditioning, ModelSpec};
-use crate::registry::{LoadedModel, Manifest};
 use crate::server::http::extract::Path;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
-use crate::serving::{PredictionInput, ServingError};
-use crate::sim::{Scenario, SimError, World, WorldConfig};
-use crate::types::{Action, RobotState, Seed};
+use foreframe_core::frame::Frame;
+use foreframe_core::nn::{Conditioning, ModelSpec};
+use foreframe_core::registry::{LoadedModel, Manifest};
+use foreframe_core::serving::{PredictionInput, ServingError};
+use foreframe_core::types::{Action, RobotState, Seed};
+use foreframe_sim::{Scenario, SimError, World, WorldConfig};
+use foreframe_train::evaluation::figures::montage::prediction_sheet;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(preview))

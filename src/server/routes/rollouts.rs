@@ -11,17 +11,17 @@ use utoipa_axum::routes;
 use super::picture;
 use super::predict::{self, PredictError};
 use super::sessions::AuthorizedSession;
-use crate::frame::Frame;
-use crate::frame::fit::Fit;
-use crate::registry::Manifest;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Json, Path, ResponseFormat};
 use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
-use crate::serving::{ConditioningInput, Prediction, Rollout, Task, Timing};
-use crate::types::RobotState;
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::registry::Manifest;
+use foreframe_core::serving::{ConditioningInput, Prediction, Rollout, Task, Timing};
+use foreframe_core::types::RobotState;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

@@ -21,7 +21,7 @@ use crate::server::state::App;
 use crate::server::stream::connection::{StreamConnection, StreamServices};
 use crate::server::stream::protocol::{Codec, SessionSettings};
 use crate::server::stream::session::Session;
-use crate::serving::SessionState;
+use foreframe_core::serving::SessionState;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()

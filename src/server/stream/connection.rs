@@ -21,9 +21,6 @@ use super::protocol::{
 };
 use super::session::{Owner, Ownership, Session};
 use super::step::{FrameStep, StepError};
-use crate::error_text::without_middle;
-use crate::frame::fit::Fit;
-use crate::metric_names;
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
 use crate::server::http::body_budget;
@@ -31,7 +28,10 @@ use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::message_bytes::MessageBytes;
 use crate::server::http::task_limit::{TaskLimit, stop_requested};
 use crate::server::images::ImageFormat;
-use crate::serving::Predictor;
+use foreframe_core::error_text::without_middle;
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::metric_names;
+use foreframe_core::serving::Predictor;
 
 /// How long a client may take to close the socket after the last message, so that it can read it.
 const LINGER: Duration = Duration::from_secs(1);

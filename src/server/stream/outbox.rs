@@ -8,7 +8,7 @@ use metrics::counter;
 use tokio::sync::Notify;
 
 use super::protocol::{ClosingReason, ServerMessage, WarningCode};
-use crate::metric_names;
+use foreframe_core::metric_names;
 
 /// The assumed size of a message without its images and its detail, in bytes: more than any but `ready` takes.
 const MESSAGE_BYTES: usize = 512;

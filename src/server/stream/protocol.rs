@@ -7,13 +7,13 @@ pub mod codec;
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::fit::Fit;
-use crate::nn::ModelSpec;
 use crate::server::config::ServerConfig;
 use crate::server::images::{ImageBytes, ImageFormat};
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::nn::ModelSpec;
 
-pub use crate::serving::Timing;
 pub use codec::Codec;
+pub use foreframe_core::serving::Timing;
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]

@@ -8,12 +8,12 @@ use tokio::sync::watch;
 
 use super::protocol::{ConfigureMessage, ServerMessage, SessionSettings};
 use super::step::{FrameStep, SessionCore, StepError};
-use crate::registry::LoadedModel;
 use crate::server::blocking::BlockingWork;
 use crate::server::http::keys::Caller;
 use crate::server::images::ImageFormat;
 use crate::server::token::{Token, TokenHash};
-use crate::serving::{Predictor, SessionState};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::{Predictor, SessionState};
 
 /// Who may step a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -8,10 +8,10 @@ use metrics::counter;
 use tracing::info;
 
 use super::session::Session;
-use crate::metric_names;
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::ApiError;
 use crate::server::token::TokenHash;
+use foreframe_core::metric_names;
 
 /// Why a session is not available.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]

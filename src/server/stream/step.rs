@@ -3,17 +3,17 @@
 use std::sync::Arc;
 
 use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings};
-use crate::error_kind::{ErrorKind, HasErrorKind};
-use crate::frame::Frame;
-use crate::frame::fit::Fit;
-use crate::nn::ModelSpec;
-use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
-use crate::serving::{
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::Manifest;
+use foreframe_core::serving::{
     ConditioningInput, InputError, Prediction, RawConditioning, STEP_FIELDS, ServingError, SessionState, Task,
 };
-use crate::types::{Action, RobotState, ValueError};
+use foreframe_core::types::{Action, RobotState, ValueError};
 
 /// A frame that fits the model.
 #[derive(Clone, Debug)]

@@ -127,7 +127,26 @@ pub enum NnError {
     },
     /// The tensor library failed.
     #[error("tensor computation failed")]
-    Tensor(#[from] candle_core::Error),
+    Tensor(#[source] TensorError),
+}
+
+/// What the tensor library said.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub struct TensorError(Box<dyn std::error::Error + Send + Sync>);
+
+#[doc(hidden)]
+impl From<candle_core::Error> for TensorError {
+    fn from(error: candle_core::Error) -> Self {
+        Self(Box::new(error))
+    }
+}
+
+#[doc(hidden)]
+impl From<candle_core::Error> for NnError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Tensor(error.into())
+    }
 }
 
 impl HasErrorKind for NnError {

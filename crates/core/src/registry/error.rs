@@ -80,7 +80,7 @@ pub enum RegistryError {
         /// The weights file.
         path: PathBuf,
         /// The reader's error.
-        source: candle_core::Error,
+        source: crate::nn::TensorError,
     },
 }
 

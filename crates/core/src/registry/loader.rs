@@ -77,7 +77,7 @@ pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let tensors =
         candle_core::safetensors::load_buffer(&bytes, &Device::Cpu).map_err(|source| RegistryError::Safetensors {
             path: path.clone(),
-            source,
+            source: source.into(),
         })?;
     let parameters = Parameters::from_tensors(&manifest.spec, tensors.into_iter().collect())
         .map_err(|source| RegistryError::Weights { path, source })?;

@@ -266,5 +266,5 @@ fn model_error(loaded: &LoadedModel, source: crate::nn::NnError) -> ServingError
 }
 
 fn tensor_error(source: candle_core::Error) -> ServingError {
-    ServingError::Tensor(Arc::new(source))
+    ServingError::Tensor(Arc::new(source.into()))
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::frame::FrameError;
-use crate::nn::NnError;
+use crate::nn::{NnError, TensorError};
 
 /// Why a prediction failed.
 #[derive(Debug, thiserror::Error)]
@@ -60,7 +60,7 @@ pub enum ServingError {
     },
     /// The prediction's tensors could not be built.
     #[error("the input's tensors could not be built")]
-    Tensor(#[source] Arc<candle_core::Error>),
+    Tensor(#[source] Arc<TensorError>),
     /// The thread that owns the models could not be started.
     #[error("could not start the predictor's thread")]
     Thread(#[source] std::io::Error),

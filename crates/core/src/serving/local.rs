@@ -1,12 +1,14 @@
 //! Predictions on the caller's own thread, for a program that has one camera and one model and needs no [`super::Predictor`].
 
+use std::sync::Arc;
+
 use super::compute;
 use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning};
 use super::error::{InputError, ServingError};
 use super::input::PredictionInput;
 use super::prediction::Rollout;
 use super::ranges::range_warnings;
-use super::session::SessionState;
+use super::session::{MemoryError, SessionMemory, SessionState};
 use super::task::{Task, check_size};
 use crate::frame::Frame;
 use crate::registry::{LoadedModel, Manifest};
@@ -51,26 +53,92 @@ impl ConditioningInput {
     }
 }
 
-impl SessionState {
-    /// Encodes the next frame, keeps its features, and predicts the frames that follow; `None` until the context is full.
-    /// Always give a session the same model. Errors: `Input` if the frame has another size than the model's, and what the
-    /// computation fails with; the state is then as before.
-    pub fn predict_next(
+/// A stream of frames with one model, on the caller's own thread. Each frame is encoded once: the session keeps the features
+/// of the last frames.
+#[derive(Clone)]
+pub struct Session {
+    model: Arc<LoadedModel>,
+    state: SessionState,
+}
+
+impl Session {
+    /// A session before its first frame.
+    #[must_use]
+    pub fn new(model: Arc<LoadedModel>) -> Self {
+        Self {
+            model,
+            state: SessionState::default(),
+        }
+    }
+
+    /// Continues an exported session. Errors: what of the memory does not fit the model.
+    pub fn restore(model: Arc<LoadedModel>, memory: SessionMemory) -> Result<Self, MemoryError> {
+        let state = SessionState::restore(memory, &model.manifest.name, model.model.spec())?;
+        Ok(Self { model, state })
+    }
+
+    /// Takes the next frame and predicts the frames that follow; `None` until the context is full. `state` is the robot's
+    /// state at this frame. `future_actions` holds one action for each predicted frame; the first acts from this frame to
+    /// the first predicted one. A model ignores what it does not take. Errors: `Input` if something does not fit the model,
+    /// and what the computation fails with; the session is then as before.
+    pub fn step(
         &mut self,
-        loaded: &LoadedModel,
         frame: Frame,
-        conditioning: &ConditioningInput,
+        state: Option<&RobotState>,
+        future_actions: Option<&[Action]>,
     ) -> Result<Option<Rollout>, ServingError> {
-        let spec = loaded.model.spec();
-        check_size("frame", &loaded.manifest.name, spec, (frame.width(), frame.height()))?;
-        let task = self.step(frame, Some(conditioning.clone()), spec);
-        let mut predictions = compute::run(loaded, &[&task])?;
+        let conditioning = ConditioningInput::for_model(&self.model, future_actions, state)?;
+        let spec = self.model.model.spec();
+        check_size(
+            "frame",
+            &self.model.manifest.name,
+            spec,
+            (frame.width(), frame.height()),
+        )?;
+        let task = self.state.step(frame, Some(conditioning.clone()), spec);
+        let mut predictions = compute::run(&self.model, &[&task])?;
         let prediction = predictions.pop().expect("a task without a prediction is a bug");
-        let seq = self.next_seq();
+        let seq = self.state.next_seq();
         for features in prediction.features {
-            self.advance(seq, features, conditioning.clone(), spec);
+            self.state.advance(seq, features, conditioning.clone(), spec);
         }
         Ok(prediction.rollouts.into_iter().next())
+    }
+
+    /// Predicts one rollout for each plan from the last frame and state: one action for each frame to predict, the same
+    /// number in all plans. Empty until the context is full. Errors: `Input` if a plan does not fit the model.
+    pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
+        let spec = self.model.model.spec();
+        let steps = plans.first().map(Vec::len);
+        let from = (self.state.robot_state().cloned(), steps);
+        let inputs = ConditioningInput::candidates(plans, from, &self.model.manifest.name, spec)?;
+        if inputs.is_empty() || self.state.frame_count() < spec.context {
+            return Ok(Vec::new());
+        }
+        let mut predictions = compute::run(&self.model, &[&self.state.rollout_task(inputs)])?;
+        Ok(predictions
+            .pop()
+            .map(|prediction| prediction.rollouts)
+            .unwrap_or_default())
+    }
+
+    /// What of the last state and actions was out of the range that the model saw in training; nothing if its manifest has
+    /// no ranges.
+    #[must_use]
+    pub fn warnings(&self) -> Vec<String> {
+        self.state.conditioning().warnings(&self.model.manifest)
+    }
+
+    /// What another program or server needs to continue the session.
+    #[must_use]
+    pub fn memory(&self) -> SessionMemory {
+        self.state.memory()
+    }
+
+    /// Its model.
+    #[must_use]
+    pub fn model(&self) -> &LoadedModel {
+        &self.model
     }
 }
 
@@ -86,14 +154,21 @@ mod tests {
             vec![Action::try_from(vec![0.5]).unwrap(); 2],
             RobotState::try_from(vec![-0.5]).unwrap(),
         );
-        let conditioning = ConditioningInput::for_model(&model, Some(&actions), Some(&state)).unwrap();
         let frames: Vec<Frame> = (0..3).map(|i| Frame::new(6, 4, vec![i * 40; 24]).unwrap()).collect();
-        let mut session = SessionState::default();
+        let mut session = Session::new(Arc::new(model.clone()));
         let mut predicted = None;
         for frame in frames.clone() {
             assert_eq!(predicted, None);
-            predicted = session.predict_next(&model, frame, &conditioning).unwrap();
+            assert!(session.rollouts(vec![actions.clone()]).unwrap().is_empty());
+            predicted = session.step(frame, Some(&state), Some(&actions)).unwrap();
         }
+        let again = Session::restore(Arc::new(model.clone()), session.memory()).unwrap();
+        let shorter = again.rollouts(vec![actions[..1].to_vec(); 2]).unwrap();
+        assert_eq!(
+            again.rollouts(vec![actions.clone()]).unwrap(),
+            predicted.clone().into_iter().collect::<Vec<_>>()
+        );
+        assert_eq!((shorter.len(), shorter[0].frames.len()), (2, 1));
         let input = PredictionInput {
             frames,
             state: Some(state),
@@ -163,12 +238,11 @@ mod tests {
 
     #[test]
     fn a_frame_of_another_size_leaves_the_session_unchanged() {
-        let (model, mut session) = (test_model(), SessionState::default());
+        let mut session = Session::new(Arc::new(test_model()));
+        let (state, actions) = (RobotState::try_from(vec![0.0]).unwrap(), vec![action(0.0); 2]);
         let frame = Frame::new(5, 4, vec![0; 20]).unwrap();
-        let error = session
-            .predict_next(&model, frame, &ConditioningInput::default())
-            .unwrap_err();
+        let error = session.step(frame, Some(&state), Some(&actions)).unwrap_err();
         assert_eq!(error.to_string(), "frame is 5×4 px; model \"test\" takes 6×4");
-        assert_eq!(session, SessionState::default());
+        assert_eq!(session.memory(), SessionState::default().memory());
     }
 }

@@ -149,6 +149,11 @@ impl SessionState {
         self.features.len()
     }
 
+    /// The last conditioning input.
+    pub(super) fn conditioning(&self) -> &ConditioningInput {
+        &self.conditioning
+    }
+
     /// The robot's state at the last frame, if the model takes it.
     #[must_use]
     pub fn robot_state(&self) -> Option<&RobotState> {

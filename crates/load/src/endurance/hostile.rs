@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use foreframe::LoadedModel;
 use foreframe::server::protocol::Codec;
+use foreframe_core::registry::LoadedModel;
 use futures_util::{SinkExt as _, StreamExt as _};
 use proptest::strategy::{Strategy as _, ValueTree as _};
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};

@@ -1,10 +1,13 @@
 //! The frames of a robot, and the predictions that the library makes of them one after another.
 
-use foreframe::frame::{Frame, codec};
+use std::sync::Arc;
+
 use foreframe::server::protocol::{ClientMessage, FrameMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
-use foreframe::types::{Action, RobotState};
-use foreframe::{ConditioningInput, LoadedModel, SessionState};
+use foreframe_core::frame::{Frame, codec};
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::Session;
+use foreframe_core::types::{Action, RobotState};
 use tokio_tungstenite::tungstenite::Message;
 
 use crate::workload::{self, Workload};
@@ -26,10 +29,10 @@ impl RobotRecording {
     pub(super) fn new(robot: u64, workload: &Workload, model: &LoadedModel) -> Self {
         let messages: Vec<FrameMessage> = (0..PERIOD).map(|index| message(robot, index, workload)).collect();
         let context = workload.context();
-        let (mut session, mut expected) = (SessionState::default(), Vec::new());
+        let (mut session, mut expected) = (Session::new(Arc::new(model.clone())), Vec::new());
         for seq in 0..PERIOD + context - 1 {
             let message = &messages[(seq % PERIOD) as usize];
-            expected.extend(predict(&mut session, message, model));
+            expected.extend(predict(&mut session, message));
         }
         Self {
             messages,
@@ -71,14 +74,13 @@ fn message(robot: u64, index: u64, workload: &Workload) -> FrameMessage {
     }
 }
 
-fn predict(session: &mut SessionState, message: &FrameMessage, model: &LoadedModel) -> Option<Vec<Frame>> {
-    let spec = model.model.spec();
+fn predict(session: &mut Session, message: &FrameMessage) -> Option<Vec<Frame>> {
+    let spec = session.model().model.spec();
     let frame = Frame::new(spec.frame_width_px, spec.frame_height_px, message.image.0.clone()).unwrap();
     let action = message.action.clone().map(|action| Action::try_from(action).unwrap());
     let state = message.state.clone().map(|state| RobotState::try_from(state).unwrap());
     let future = action.map(|action| vec![action; spec.horizon]);
-    let conditioning = ConditioningInput::for_model(model, future.as_deref(), state.as_ref()).unwrap();
-    let predicted = session.predict_next(model, frame, &conditioning).unwrap();
+    let predicted = session.step(frame, state.as_ref(), future.as_deref()).unwrap();
     predicted.map(|rollout| rollout.frames)
 }
 

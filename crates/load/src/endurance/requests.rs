@@ -3,10 +3,11 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use foreframe::frame::Frame;
 use foreframe::server::ImageBytes;
-use foreframe::types::{Action, RobotState};
-use foreframe::{LoadedModel, PredictionInput, predict};
+use foreframe_core::frame::Frame;
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::{PredictionInput, predict};
+use foreframe_core::types::{Action, RobotState};
 use serde_json::{Value, json};
 use tokio::time::sleep;
 

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use foreframe::dataset::Dataset;
-use foreframe::registry;
+use foreframe_core::registry;
+use foreframe_data::dataset::Dataset;
 use serde_json::{Value, json};
 
 use super::changes::{COLLECTED, MODEL, numbers};

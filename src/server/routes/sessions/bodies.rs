@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::fit::Fit;
-use crate::registry::LoadedModel;
 use crate::server::http::problem::ApiError;
 use crate::server::images::ImageFormat;
 use crate::server::state::App;
 use crate::server::stream::protocol::{OnGap, OnLate, SessionSettings, StreamLimits};
 use crate::server::stream::session::Session;
-use crate::serving::{SessionMemory, SessionState};
+use foreframe_core::frame::fit::Fit;
+use foreframe_core::registry::LoadedModel;
+use foreframe_core::serving::{SessionMemory, SessionState};
 
 /// The session to open.
 #[derive(Debug, Deserialize, utoipa::ToSchema)]

@@ -5,8 +5,8 @@ use serde::de::{Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
-use crate::frame::fit::Fit;
 use crate::server::images::{ImageBytes, ImageFormat};
+use foreframe_core::frame::fit::Fit;
 
 /// The maximum number of items of a list in a message: more than any model takes.
 const MAX_ITEMS: usize = 4096;
