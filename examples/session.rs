@@ -22,7 +22,7 @@ struct Recording {
 fn main() -> Result<(), Box<dyn Error>> {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let model = load(&root.join("models/moving"))?;
-    let horizon = model.model.spec().horizon;
+    let horizon = model.network.spec().horizon;
     let recording: Recording = serde_json::from_slice(&std::fs::read(root.join("examples/frames/actions.json"))?)?;
 
     let mut session = SessionState::default();

@@ -106,7 +106,7 @@ impl Recording {
         let last = &self.frames[self.frames.len() - spec.context..];
         for (frame, found) in last.iter().zip(&features) {
             let pixels = Tensor::from_vec(spec.preprocess.forward(frame), (1, spec.pixels()), &Device::Cpu).unwrap();
-            let expected = model.model.encode_frames(&pixels).unwrap().flatten_all().unwrap();
+            let expected = model.network.encode_frames(&pixels).unwrap().flatten_all().unwrap();
             for (found, expected) in found.iter().zip(expected.to_vec1::<f32>().unwrap()) {
                 assert!((found - expected).abs() <= 1e-5, "{found} {expected}");
             }
@@ -163,7 +163,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
         };
-        let together = model.model.predict_futures(&features, &windows, &condition).unwrap();
+        let together = model.network.predict_futures(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
             let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
             let condition = foreframe::nn::ConditioningTensors {
@@ -172,7 +172,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             };
             let window = features.narrow(0, window as usize, 1).unwrap();
             let alone = model
-                .model
+                .network
                 .predict(&window, &condition, foreframe::nn::Feedback::Prediction)
                 .unwrap();
             let apart = (alone - together.narrow(0, future, 1).unwrap()).unwrap().abs().unwrap();

@@ -17,7 +17,7 @@ use crate::types::{Action, RobotState};
 pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
-        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
+        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.network.spec())?))
         .collect::<Result<Vec<Task>, ServingError>>()?;
     let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
     Ok(predictions
@@ -41,7 +41,7 @@ impl ConditioningInput {
             state,
             steps: None,
         };
-        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.model.spec())
+        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.network.spec())
     }
 
     /// What is out of the range that the model saw in training; nothing if its manifest has no ranges.
@@ -61,7 +61,7 @@ impl SessionState {
         frame: Frame,
         conditioning: &ConditioningInput,
     ) -> Result<Option<Rollout>, ServingError> {
-        let spec = loaded.model.spec();
+        let spec = loaded.network.spec();
         check_size("frame", &loaded.manifest.name, spec, (frame.width(), frame.height()))?;
         let task = self.step(frame, Some(conditioning.clone()), spec);
         let mut predictions = compute::run(loaded, &[&task])?;
@@ -127,8 +127,8 @@ mod tests {
     }
 
     fn check_steps(model: &LoadedModel) {
-        let width = model.model.spec().frame_width_px;
-        let spec = model.model.spec();
+        let width = model.network.spec().frame_width_px;
+        let spec = model.network.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
             let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);

@@ -239,7 +239,7 @@ mod tests {
             actions in proptest::collection::vec(-2.0f32..2.0, 0..4),
             state in proptest::option::of(-2.0f32..2.0),
         ) {
-            let spec = test_model().model.spec().clone();
+            let spec = test_model().network.spec().clone();
             let memory = SessionMemory {
                 next_seq,
                 features,
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn a_feature_out_of_range_is_refused_with_its_position() {
-        let spec = test_model().model.spec().clone();
+        let spec = test_model().network.spec().clone();
         let mut memory = SessionMemory {
             next_seq: 1,
             features: vec![vec![0.0; 5]],
