@@ -39,10 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let prediction = session.predict_next(&model, frame, &conditioning)?;
         predicted = prediction.and_then(|rollout| rollout.frames.into_iter().next());
     }
-    println!(
-        "the session holds {} frames of context",
-        session.memory().features.len()
-    );
+    println!("the session holds {} frames of context", session.frame_count());
     Ok(())
 }
 

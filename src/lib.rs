@@ -67,7 +67,7 @@ pub mod cli;
 pub use frame::{Frame, FrameError};
 pub use nn::{Model, ModelSpec, NnError};
 pub use registry::{LoadedModel, Manifest, RegistryError, load};
-pub use serving::session::{MemoryError, SessionMemory, SessionState};
+pub use serving::session::{SessionSnapshot, SessionState, SnapshotError};
 pub use serving::{
     ConditioningInput, InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError,
     predict,

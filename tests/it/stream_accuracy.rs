@@ -101,8 +101,8 @@ impl Recording {
     /// Checks that an exported state has the features of the last frames, within 1e-5.
     fn check_state(&self, model: &LoadedModel, state: &Value) {
         let spec = &model.manifest.spec;
-        let features: Vec<Vec<f32>> = serde_json::from_value(state["memory"]["features"].clone()).unwrap();
-        assert_eq!(state["memory"]["next_seq"], self.frames.len());
+        let features: Vec<Vec<f32>> = serde_json::from_value(state["snapshot"]["features"].clone()).unwrap();
+        assert_eq!(state["snapshot"]["next_seq"], self.frames.len());
         let last = &self.frames[self.frames.len() - spec.context..];
         for (frame, found) in last.iter().zip(&features) {
             let pixels = Tensor::from_vec(spec.preprocess.forward(frame), (1, spec.pixels()), &Device::Cpu).unwrap();

@@ -25,7 +25,7 @@ pub use input::PredictionInput;
 pub use local::predict;
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
-pub use session::{SessionMemory, SessionState};
+pub use session::{SessionSnapshot, SessionState};
 pub use task::{Features, Task, check_size};
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use super::picture;
 use super::predict::{self, PredictError};
 use super::sessions::AuthorizedSession;
 use crate::frame::Frame;
-use crate::frame::fit::Fit;
+use crate::frame::resize::Resize;
 use crate::registry::Manifest;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Json, Path, ResponseFormat};
@@ -41,7 +41,7 @@ struct RolloutRequest {
     format: ImageFormat,
     /// How an image of another size is resized; without it, another size is an error.
     #[serde(default)]
-    fit: Option<Fit>,
+    resize: Option<Resize>,
     /// The robot's state at the last frame.
     #[serde(default)]
     state: Option<Vec<f32>>,
@@ -190,8 +190,8 @@ impl RolloutRequest {
         manifest: &Manifest,
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, Task), PredictError> {
-        let (format, fit) = (self.format, self.fit);
-        let frames = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
+        let (format, resize) = (self.format, self.resize);
+        let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, frames.len())?;
         let conditioning = conditioning((self.candidates, self.steps), state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);

@@ -7,7 +7,7 @@ pub mod codec;
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::fit::Fit;
+use crate::frame::resize::Resize;
 use crate::nn::ModelSpec;
 use crate::server::config::ServerConfig;
 use crate::server::images::{ImageBytes, ImageFormat};
@@ -72,7 +72,7 @@ pub struct ConfigureMessage {
     pub format: Option<ImageFormat>,
     /// How a frame of another size is resized.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fit: Option<Fit>,
+    pub resize: Option<Resize>,
 }
 
 /// Settings of a session.
@@ -88,7 +88,7 @@ pub struct SessionSettings {
     pub format: Option<ImageFormat>,
     /// How a frame of another size is resized; absent: it is refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fit: Option<Fit>,
+    pub resize: Option<Resize>,
 }
 
 /// What happens if frames are missing.

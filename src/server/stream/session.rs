@@ -118,7 +118,7 @@ impl Session {
         settings.on_gap = message.on_gap.unwrap_or(settings.on_gap);
         settings.on_late = message.on_late.unwrap_or(settings.on_late);
         settings.format = message.format.map(ImageFormat::answer).or(settings.format);
-        settings.fit = message.fit.or(settings.fit);
+        settings.resize = message.resize.or(settings.resize);
         ServerMessage::Configured(*settings)
     }
 
@@ -217,7 +217,9 @@ impl Ownership {
         };
         if answer.must_compress(format) {
             let model = Arc::clone(model);
-            return blocking.run(move || answer.message(format, model.network.spec())).await?;
+            return blocking
+                .run(move || answer.message(format, model.network.spec()))
+                .await?;
         }
         answer.message(format, spec)
     }

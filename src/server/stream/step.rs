@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings};
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::frame::Frame;
-use crate::frame::fit::Fit;
+use crate::frame::resize::Resize;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::server::blocking::TaskError;
@@ -31,7 +31,7 @@ impl FrameStep {
     /// Checks the message and decodes its image, which takes long unless the image is raw. Errors name the field.
     pub(in crate::server) fn new(
         message: FrameMessage,
-        fit: Option<Fit>,
+        resize: Option<Resize>,
         manifest: &Manifest,
         max_steps: usize,
     ) -> Result<Self, StepError> {
@@ -60,7 +60,7 @@ impl FrameStep {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
             conditioning: ConditioningInput::new(given, &STEP_FIELDS, &manifest.name, &manifest.spec)?,
-            frame: images::decode("image", message.image, ImageInput { format, fit }, manifest)?,
+            frame: images::decode("image", message.image, ImageInput { format, resize }, manifest)?,
             format,
             is_overtaken: false,
         })

@@ -17,7 +17,11 @@ use crate::types::{Action, RobotState};
 pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
-        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.network.spec())?))
+        .map(|input| {
+            Ok((*input)
+                .clone()
+                .into_task(&loaded.manifest.name, loaded.network.spec())?)
+        })
         .collect::<Result<Vec<Task>, ServingError>>()?;
     let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
     Ok(predictions

@@ -53,7 +53,7 @@ pub(super) fn contexts(
             .iter()
             .flat_map(|window| ends(window.first_frame, spec.context))
             .collect();
-        let frames = inference::fitted_frames(dataset, spec, &ends)?;
+        let frames = inference::resized_frames(dataset, spec, &ends)?;
         let codes = inference::encode(loaded, &frames)?;
         found.extend(ContextStatistics::of_codes(&loaded.network, &codes, 2)?);
         watched.report(EvaluationStage::Calibration, found.len(), windows.len())?;

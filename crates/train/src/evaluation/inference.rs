@@ -4,8 +4,8 @@ use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::EvaluationError;
-use foreframe_core::frame::fit::{Fit, fit};
 use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::nn::{ConditioningTensors, Feedback, ModelSpec};
 use foreframe_core::registry::LoadedModel;
 use foreframe_data::dataset::{Dataset, Window};
@@ -145,18 +145,18 @@ pub(super) fn encode(loaded: &LoadedModel, frames: &[f32]) -> Result<Vec<f32>, E
 }
 
 /// Frames of a data set of any size in the model's space, one after another. Another size is cropped and resized.
-pub(super) fn fitted_frames(
+pub(super) fn resized_frames(
     dataset: &Dataset,
     spec: &ModelSpec,
     frames: &[usize],
 ) -> Result<Vec<f32>, EvaluationError> {
     let mut all = Vec::with_capacity(frames.len() * spec.pixels());
     for &frame in frames {
-        let frame = fit(
+        let frame = resize(
             &dataset.frame(frame)?,
             spec.frame_width_px,
             spec.frame_height_px,
-            Fit::Crop,
+            Resize::Crop,
         )?;
         all.extend(spec.preprocess.forward(&frame));
     }
