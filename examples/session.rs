@@ -23,7 +23,7 @@ struct Recording {
 fn main() -> Result<(), Box<dyn Error>> {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let model = load(&root.join("models/moving"))?;
-    let horizon = model.model.spec().horizon;
+    let horizon = model.network.spec().horizon;
     let recording: Recording = serde_json::from_slice(&std::fs::read(root.join("examples/frames/actions.json"))?)?;
 
     let mut session = Session::new(Arc::new(model));
@@ -39,10 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let prediction = session.step(frame, Some(&recording.states[i]), Some(&plan))?;
         predicted = prediction.and_then(|rollout| rollout.frames.into_iter().next());
     }
-    println!(
-        "the session holds {} frames of context",
-        session.memory().features.len()
-    );
+    println!("the session holds {} frames of context", session.snapshot().features.len());
     Ok(())
 }
 

@@ -14,7 +14,7 @@ use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::codec;
 use foreframe_core::nn::ModelSpec;
 use foreframe::server::protocol::{ClientMessage, Codec};
-use foreframe_core::serving::{SessionMemory, SessionState};
+use foreframe_core::serving::{SessionSnapshot, SessionState};
 use foreframe_sim::{Scenario, WorldConfig};
 use foreframe_train::training::{self, CHECKPOINT_FILE, CheckpointPosition, TrainConfig, Training};
 use foreframe_core::types::Seed;
@@ -105,11 +105,11 @@ fn states(bytes: &[u8]) {
             .spec
             .clone()
     });
-    let Ok(memory) = serde_json::from_slice::<SessionMemory>(bytes) else {
+    let Ok(snapshot) = serde_json::from_slice::<SessionSnapshot>(bytes) else {
         return;
     };
-    if let Ok(state) = SessionState::restore(memory, "moving", spec) {
-        let again = SessionState::restore(state.memory(), "moving", spec).unwrap();
+    if let Ok(state) = SessionState::restore(snapshot, "moving", spec) {
+        let again = SessionState::restore(state.snapshot(), "moving", spec).unwrap();
         assert!(state.next_seq() == again.next_seq() && state.frame_count() == again.frame_count());
     }
 }

@@ -13,7 +13,7 @@ use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use foreframe_core::error_text;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::serving::{self, PredictionInput, Rollout};
@@ -34,7 +34,7 @@ planned actions at the end. The model takes the state at frame N.
 
 Examples:
   foreframe predict --model paper --frames images --out predicted
-  foreframe predict --model static --frames photos --fit crop --out predicted
+  foreframe predict --model static --frames photos --resize crop --out predicted
 
   foreframe export --dataset moving-observer --episode 3 --out look
   foreframe predict --model moving --frames look --actions look/actions.json --at 9 --out seen"
@@ -57,7 +57,7 @@ pub(super) struct PredictArgs {
     steps: Option<usize>,
     /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
     #[arg(long, value_name = "FIT")]
-    fit: Option<Fit>,
+    resize: Option<Resize>,
     /// A new directory for the files
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -76,7 +76,7 @@ struct Selected {
 pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (_, loaded) = workspace.load_model(&args.model)?;
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let most = workspace.config().server.max_steps.max(spec.horizon);
     let steps = args.steps.unwrap_or(spec.horizon);
     if !(1..=most).contains(&steps) {
@@ -132,7 +132,7 @@ fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
 /// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its
 /// horizon.
 fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, CliError> {
-    let mut images = ImagePaths::list(&args.frames, args.fit)?;
+    let mut images = ImagePaths::list(&args.frames, args.resize)?;
     let count = images.count();
     if count < spec.context {
         return Err(CliError::Usage(format!(

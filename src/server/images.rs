@@ -6,7 +6,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
 use super::http::problem::ApiError;
 use foreframe_core::error_text::with_causes;
-use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
@@ -107,7 +107,7 @@ pub(in crate::server) enum ImageError {
         width: u32,
         height: u32,
     },
-    #[error("{0}; set fit to crop, letterbox or stretch to resize it")]
+    #[error("{0}; set resize to crop, letterbox or stretch")]
     Size(InputError),
     #[error("{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels")]
     TooManyPixels { field: String, width: u32, height: u32 },
@@ -129,7 +129,7 @@ impl From<ImageError> for ApiError {
 pub(in crate::server) struct ImageInput {
     pub(in crate::server) format: ImageFormat,
     /// How an image of another size becomes a frame; `None` refuses it.
-    pub(in crate::server) fit: Option<Fit>,
+    pub(in crate::server) resize: Option<Resize>,
 }
 
 /// The image in `field` as a frame of the model's size. The size is checked before pixels are decoded.
@@ -148,7 +148,7 @@ pub(in crate::server) fn decode(
         return raw(field, bytes, model, spec);
     }
     let (width, height) = codec::dimensions(&bytes).map_err(decode_error)?;
-    let Some(way) = input.fit else {
+    let Some(way) = input.resize else {
         check_size(field, model, spec, (width, height)).map_err(ImageError::Size)?;
         return codec::decode(&bytes).map_err(decode_error);
     };
@@ -157,7 +157,7 @@ pub(in crate::server) fn decode(
         return Err(ImageError::TooManyPixels { field, width, height });
     }
     let frame = codec::decode(&bytes).map_err(decode_error)?;
-    fit(&frame, spec.frame_width_px, spec.frame_height_px, way).map_err(decode_error)
+    resize(&frame, spec.frame_width_px, spec.frame_height_px, way).map_err(decode_error)
 }
 
 fn raw(field: &str, bytes: Vec<u8>, model: &str, spec: &ModelSpec) -> Result<Frame, ImageError> {

@@ -213,25 +213,25 @@ def bodies():
 
 
 def states():
-    memory = {"next_seq": 5, "features": [[0.25] * 8] * 3, "actions": [[0.5, -0.5]] * 2, "state": [1.0]}
+    snapshot = {"next_seq": 5, "features": [[0.25] * 8] * 3, "actions": [[0.5, -0.5]] * 2, "state": [1.0]}
     # tests/malformed replaces WEIGHTS with the model's hash.
-    state = {"model": "moving", "version": 1, "weights_sha256": "WEIGHTS", "on_gap": "error", "memory": memory}
-    with_memory = lambda **more: state | {"memory": memory | more}
+    state = {"model": "moving", "version": 1, "weights_sha256": "WEIGHTS", "on_gap": "error", "snapshot": snapshot}
+    with_snapshot = lambda **more: state | {"snapshot": snapshot | more}
     for name, content in {
         "201-sound": state,
-        "201-of-a-fresh-session": with_memory(next_seq=0, features=[], actions=[], state=None),
-        "201-greatest-seq": with_memory(next_seq=2**64 - 1),
+        "201-of-a-fresh-session": with_snapshot(next_seq=0, features=[], actions=[], state=None),
+        "201-greatest-seq": with_snapshot(next_seq=2**64 - 1),
         "404-other-model": state | {"model": "../moving"},
         "409-other-weights": state | {"weights_sha256": "00"},
         "422-unknown-field": state | {"colour": 1},
-        "422-seq-too-great": with_memory(next_seq=2**64),
-        "422-fewer-seen-than-kept": with_memory(next_seq=1),
-        "422-too-many-frames": with_memory(features=[[0.25] * 8] * 4),
-        "422-frame-of-one-feature": with_memory(features=[[0.25]] * 3),
-        "422-feature-of-two": with_memory(features=[[2.0] * 8] * 3),
-        "422-no-actions": with_memory(actions=[]),
-        "422-action-too-great": with_memory(actions=[[3e38, 0]] * 2),
-        "422-state-of-three": with_memory(state=[1, 2, 3]),
+        "422-seq-too-great": with_snapshot(next_seq=2**64),
+        "422-fewer-seen-than-kept": with_snapshot(next_seq=1),
+        "422-too-many-frames": with_snapshot(features=[[0.25] * 8] * 4),
+        "422-frame-of-one-feature": with_snapshot(features=[[0.25]] * 3),
+        "422-feature-of-two": with_snapshot(features=[[2.0] * 8] * 3),
+        "422-no-actions": with_snapshot(actions=[]),
+        "422-action-too-great": with_snapshot(actions=[[3e38, 0]] * 2),
+        "422-state-of-three": with_snapshot(state=[1, 2, 3]),
         "422-version-below-zero": state | {"version": -1},
     }.items():
         write("states", f"{name}.json", json.dumps(content))

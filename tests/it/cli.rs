@@ -120,7 +120,7 @@ fn usage_errors_exit_with_2_and_advice() {
             "\"plain@new\" is not NAME or NAME@VERSION",
         ),
         (
-            "predict --model plain --frames thesis --out p --fit squeeze",
+            "predict --model plain --frames thesis --out p --resize squeeze",
             "it must be crop, letterbox or stretch",
         ),
         (
@@ -376,7 +376,7 @@ fn a_prediction_follows_the_last_frames_in_natural_order() {
 }
 
 #[test]
-fn images_of_another_size_are_fitted_and_color_is_reported_once() {
+fn images_of_another_size_are_resized_and_color_is_reported_once() {
     let dir = working_dir();
     let images = dir.path().join("photos");
     fs::create_dir(&images).unwrap();
@@ -386,11 +386,11 @@ fn images_of_another_size_are_fitted_and_color_is_reported_once() {
     }
     let (code, text) = run(dir.path(), "predict --model plain --frames photos --out seen");
     assert!(
-        code == 2 && text.contains("photos/0.png is 40×20 px; model \"plain\" takes 16×12; add --fit crop"),
+        code == 2 && text.contains("photos/0.png is 40×20 px; model \"plain\" takes 16×12; add --resize crop"),
         "{text}"
     );
     for way in ["crop", "letterbox", "stretch"] {
-        let line = format!("predict --model plain --frames photos --fit {way} --out {way}");
+        let line = format!("predict --model plain --frames photos --resize {way} --out {way}");
         let (code, text) = run(dir.path(), &line);
         assert_eq!((code, text.matches("converted to gray").count()), (0, 1), "{text}");
     }

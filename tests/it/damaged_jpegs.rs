@@ -118,8 +118,8 @@ async fn a_request_with_a_damaged_jpeg_is_answered_422() {
     let accepted = post(&app, path, &json!({"frames": [whole, whole, whole], "format": "jpeg"})).await;
     assert_eq!(accepted.status, 200);
     for damaged in [&cut, &unended] {
-        for fit in [json!(null), json!("crop")] {
-            let body = json!({"frames": [whole, damaged, whole], "format": "jpeg", "fit": fit});
+        for resize in [json!(null), json!("crop")] {
+            let body = json!({"frames": [whole, damaged, whole], "format": "jpeg", "resize": resize});
             let detail = post(&app, path, &body).await.detail(422);
             assert!(detail.starts_with("frames[1] is a damaged JPEG image: "), "{detail}");
         }

@@ -31,7 +31,7 @@ async fn a_recording_on_the_server_becomes_a_data_set() {
         ..ServerConfig::default()
     };
     let app = app(&dir.path().join("data"), config);
-    let fields = json!({"size": "16x12", "fit": "letterbox", "skip_bad": true, "unit": ["state.heading=deg"]});
+    let fields = json!({"size": "16x12", "resize": "letterbox", "skip_bad": true, "unit": ["state.heading=deg"]});
     let created = post(&app, JOBS, &job("walk", fields.clone())).await;
     assert_eq!(created.status, 202, "{}", created.json());
     let path = format!("{JOBS}/{}", created.json()["id"].as_str().unwrap());

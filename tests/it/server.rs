@@ -117,7 +117,7 @@ async fn mismatched_inputs_are_refused_with_the_field() {
         (
             PLAIN,
             json!({"frames": with_large}),
-            "frames[2] is 80×60 px; model \"plain\" takes 16×12; set fit to crop, letterbox or stretch to resize it",
+            "frames[2] is 80×60 px; model \"plain\" takes 16×12; set resize to crop, letterbox or stretch",
         ),
         (
             PLAIN,

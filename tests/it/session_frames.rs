@@ -26,13 +26,13 @@ async fn on_gap_skip_accepts_a_gap_and_reports_it() {
         on_gap: Some(OnGap::Skip),
         on_late: None,
         format: Some(ImageFormat::Png),
-        fit: None,
+        resize: None,
     });
     let configured = ServerMessage::Configured(SessionSettings {
         on_gap: OnGap::Skip,
         on_late: OnLate::Predict,
         format: Some(ImageFormat::Png),
-        fit: None,
+        resize: None,
     });
     assert_eq!(client.ask(&configure).await, configured);
     for (seq, expected) in [(2, 2), (3, 0), (5, 1)] {
@@ -239,8 +239,8 @@ proptest! {
     #[test]
     fn random_session_bodies_never_cause_a_server_error(
         pointer in prop_oneof![
-            Just(""), Just("/state"), Just("/state/memory"), Just("/state/memory/features"), Just("/state/memory/features/0"),
-            Just("/state/memory/next_seq"), Just("/state/memory/actions"), Just("/state/version"), Just("/model"),
+            Just(""), Just("/state"), Just("/state/snapshot"), Just("/state/snapshot/features"), Just("/state/snapshot/features/0"),
+            Just("/state/snapshot/next_seq"), Just("/state/snapshot/actions"), Just("/state/version"), Just("/model"),
         ],
         garbage in prop_oneof![
             Just(json!(null)), Just(json!([])), Just(json!({})), Just(json!("")), any::<i64>().prop_map(|n| json!(n)),
@@ -252,7 +252,7 @@ proptest! {
             let app = app(dir.path(), ServerConfig::default());
             let session = SessionHandle::open(&app, &moving()).await;
             let mut body = json!({"model": "moving", "state": get(&app, &session.path("/state")).await.json()});
-            body["state"]["memory"]["features"] = json!([vec![0.0; 8]]);
+            body["state"]["snapshot"]["features"] = json!([vec![0.0; 8]]);
             if let Some(place) = body.pointer_mut(pointer) {
                 *place = garbage;
             }

@@ -241,27 +241,27 @@ async fn an_invalid_state_is_refused_with_the_field() {
     for (pointer, value, status, detail) in [
         ("/weights_sha256", json!("00"), 409, "here version 1"),
         ("/model", json!("none"), 404, "there is no model"),
-        ("/memory/next_seq", json!(0), 422, "state.memory.next_seq is 0"),
+        ("/snapshot/next_seq", json!(0), 422, "state.snapshot.next_seq is 0"),
         (
-            "/memory/features",
+            "/snapshot/features",
             json!(vec![vec![0.0; 8]; 4]),
             422,
-            "state.memory.features holds 4 frames",
+            "state.snapshot.features holds 4 frames",
         ),
         (
-            "/memory/features/0",
+            "/snapshot/features/0",
             json!([0.5]),
             422,
-            "state.memory.features[0] holds 1 numbers",
+            "state.snapshot.features[0] holds 1 numbers",
         ),
         (
-            "/memory/features/0/2",
+            "/snapshot/features/0/2",
             json!(1.5),
             422,
-            "state.memory.features[0][2] is 1.5",
+            "state.snapshot.features[0][2] is 1.5",
         ),
-        ("/memory/actions", json!([]), 422, "actions holds 0 actions"),
-        ("/memory/state", json!([1, 2, 3]), 422, "state holds 3 numbers"),
+        ("/snapshot/actions", json!([]), 422, "actions holds 0 actions"),
+        ("/snapshot/state", json!([1, 2, 3]), 422, "state holds 3 numbers"),
         ("/on_gap", json!("dance"), 422, "state.on_gap: unknown variant `dance`"),
     ] {
         let mut changed = state.clone();

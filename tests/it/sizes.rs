@@ -74,7 +74,7 @@ fn trains_and_predicts(preset: &str, [width, height, context, horizon]: [usize; 
     let TrainingOutcome::Finished { model_dir, .. } = outcome else {
         panic!("{outcome:?}")
     };
-    let model = registry::load(&model_dir).unwrap().model;
+    let model = registry::load(&model_dir).unwrap().network;
     let frames = Tensor::full(0.5f32, (1, context, width * height), &Device::Cpu).unwrap();
     let predicted = model.predict_frames(&frames, &ConditioningTensors::none()).unwrap();
     assert_eq!(predicted.dims(), [1, horizon, width * height]);
@@ -103,7 +103,7 @@ fn the_flow_network_takes_any_size_and_window() {
 fn no_accepted_value_makes_a_prediction_nan() {
     for name in ["moving-flow", "donkeycar", "moving"] {
         let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name);
-        let model = registry::load(&directory).unwrap().model;
+        let model = registry::load(&directory).unwrap().network;
         let spec = model.spec();
         let filled = |value: f32, shape: &[usize]| Tensor::full(value, shape, &Device::Cpu).unwrap();
         let frames = filled(0.5, &[1, spec.context, spec.pixels()]);

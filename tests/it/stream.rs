@@ -195,7 +195,7 @@ async fn refused_messages_do_not_change_the_stream() {
         (
             with(json!({"image": small})),
             "invalid",
-            "image is 8×8 px; model \"moving\" takes 16×12; set fit to crop, letterbox or stretch to resize it",
+            "image is 8×8 px; model \"moving\" takes 16×12; set resize to crop, letterbox or stretch",
         ),
         (with(json!({"action": [0.0]})), "invalid", "action holds 1 numbers"),
         (with(json!({"state": null})), "invalid", "state is missing"),

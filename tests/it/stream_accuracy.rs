@@ -101,12 +101,12 @@ impl Recording {
     /// Checks that an exported state has the features of the last frames, within 1e-5.
     fn check_state(&self, model: &LoadedModel, state: &Value) {
         let spec = &model.manifest.spec;
-        let features: Vec<Vec<f32>> = serde_json::from_value(state["memory"]["features"].clone()).unwrap();
-        assert_eq!(state["memory"]["next_seq"], self.frames.len());
+        let features: Vec<Vec<f32>> = serde_json::from_value(state["snapshot"]["features"].clone()).unwrap();
+        assert_eq!(state["snapshot"]["next_seq"], self.frames.len());
         let last = &self.frames[self.frames.len() - spec.context..];
         for (frame, found) in last.iter().zip(&features) {
             let pixels = Tensor::from_vec(spec.preprocess.forward(frame), (1, spec.pixels()), &Device::Cpu).unwrap();
-            let expected = model.model.encode_frames(&pixels).unwrap().flatten_all().unwrap();
+            let expected = model.network.encode_frames(&pixels).unwrap().flatten_all().unwrap();
             for (found, expected) in found.iter().zip(expected.to_vec1::<f32>().unwrap()) {
                 assert!((found - expected).abs() <= 1e-5, "{found} {expected}");
             }
@@ -163,7 +163,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
         };
-        let together = model.model.predict_futures(&features, &windows, &condition).unwrap();
+        let together = model.network.predict_futures(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
             let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
             let condition = foreframe_core::nn::ConditioningTensors {

@@ -130,11 +130,11 @@ fn request_memory_is_bounded_by_the_body_length() {
         ("/v1/models/moving/rollouts", filled(r#"{"candidates":[["#, "[],", long)),
         (
             "/v1/sessions",
-            filled(r#"{"state":{"memory":{"features":["#, "[],", long),
+            filled(r#"{"state":{"snapshot":{"features":["#, "[],", long),
         ),
         (
             "/v1/sessions",
-            filled(r#"{"state":{"memory":{"actions":["#, "[],", long),
+            filled(r#"{"state":{"snapshot":{"actions":["#, "[],", long),
         ),
         (
             "/v1/jobs",

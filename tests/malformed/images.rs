@@ -40,7 +40,7 @@ fn a_huge_image_size_is_refused_before_allocation() {
         let refused = within_memory(4 << 20, &file.name, || predict(&file.name, &file.bytes));
         assert_eq!(
             refused.detail(422),
-            "frames[0] is 65535×65535 px; model \"plain\" takes 16×12; set fit to crop, letterbox or stretch to resize it"
+            "frames[0] is 65535×65535 px; model \"plain\" takes 16×12; set resize to crop, letterbox or stretch"
         );
     }
 }

@@ -1,14 +1,14 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
-//! from the model's value range, [`quality`] compares two images, [`fit`] resizes, [`warp`] moves pixels.
+//! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels.
 
 use jpeg::JpegDamage;
 
+mod catmull_rom;
 pub mod codec;
-pub mod fit;
 pub mod jpeg;
 pub mod preprocess;
 pub mod quality;
-mod resize;
+pub mod resize;
 pub mod warp;
 
 /// The largest accepted width and height of a frame, in pixels.

@@ -25,7 +25,7 @@ pub use input::PredictionInput;
 pub use local::{Session, predict};
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
-pub use session::{SessionMemory, SessionState};
+pub use session::{SessionSnapshot, SessionState};
 pub use task::{Features, Task, check_size};
 
 #[cfg(test)]
@@ -79,7 +79,7 @@ pub fn test_flow_model() -> LoadedModel {
             camera: None,
         }),
         frame_width_px: 8,
-        ..test_model().model.spec().clone()
+        ..test_model().network.spec().clone()
     })
 }
 
@@ -96,6 +96,6 @@ fn loaded(spec: crate::nn::ModelSpec) -> LoadedModel {
     });
     LoadedModel {
         manifest: Arc::new(serde_json::from_value(manifest).unwrap()),
-        model: Model::detached(spec, &parameters).unwrap(),
+        network: Model::detached(spec, &parameters).unwrap(),
     }
 }

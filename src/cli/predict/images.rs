@@ -8,7 +8,7 @@ use tracing::info;
 use crate::cli::error::CliError;
 use foreframe_core::error_text;
 use foreframe_core::files::natural_order;
-use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::nn::ModelSpec;
 
@@ -18,14 +18,14 @@ const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// The image files of a directory.
 pub(super) struct ImagePaths {
     paths: Vec<PathBuf>,
-    fit: Option<Fit>,
+    resize: Option<Resize>,
     /// Whether it was said that color images are converted.
     has_reported_color: bool,
 }
 
 impl ImagePaths {
-    /// Lists the images of a directory; `fit` says what to do with images of another size than the model's.
-    pub(super) fn list(dir: &Path, fit: Option<Fit>) -> Result<Self, CliError> {
+    /// Lists the images of a directory; `resize` says what to do with images of another size than the model's.
+    pub(super) fn list(dir: &Path, resize: Option<Resize>) -> Result<Self, CliError> {
         let unreadable = |error| CliError::io("read", dir, &error);
         let mut paths = std::fs::read_dir(dir)
             .map_err(unreadable)?
@@ -39,7 +39,7 @@ impl ImagePaths {
         paths.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
         Ok(Self {
             paths,
-            fit,
+            resize,
             has_reported_color: false,
         })
     }
@@ -49,7 +49,7 @@ impl ImagePaths {
     }
 
     /// Reads some of the images as frames of the model's size. Errors: `Usage` for an image of another size that is not to
-    /// be fitted.
+    /// be resized.
     pub(super) fn read(&mut self, range: Range<usize>, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, CliError> {
         let paths: Vec<PathBuf> = self.paths.get(range).unwrap_or_default().to_vec();
         paths.iter().map(|path| self.read_one(path, model, spec)).collect()
@@ -64,10 +64,10 @@ impl ImagePaths {
             self.has_reported_color = true;
         }
         let (width, height) = (spec.frame_width_px, spec.frame_height_px);
-        match self.fit {
-            Some(way) => fit(&frame, width, height, way).map_err(unreadable),
+        match self.resize {
+            Some(way) => resize(&frame, width, height, way).map_err(unreadable),
             None if (frame.width(), frame.height()) != (width, height) => Err(CliError::Usage(format!(
-                "{} is {}×{} px; model {model:?} takes {width}×{height}; add --fit crop, --fit letterbox or --fit stretch",
+                "{} is {}×{} px; model {model:?} takes {width}×{height}; add --resize crop, --resize letterbox or --resize stretch",
                 path.display(),
                 frame.width(),
                 frame.height()

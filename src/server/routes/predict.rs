@@ -16,7 +16,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
 use foreframe_core::types::{Action, RobotState, ValueError};
@@ -38,7 +38,7 @@ struct PredictRequest {
     format: ImageFormat,
     /// How an image of another size is resized; without it, another size is an error.
     #[serde(default)]
-    fit: Option<Fit>,
+    resize: Option<Resize>,
     /// The action at each frame, oldest first. Without `future_actions`, the last one is repeated.
     #[serde(default)]
     actions: Vec<Vec<f32>>,
@@ -186,10 +186,10 @@ impl PredictRequest {
         manifest: &Manifest,
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, Task), PredictError> {
-        let (format, fit) = (self.format, self.fit);
+        let (format, resize) = (self.format, self.resize);
         check_steps(self.steps, manifest, config)?;
         self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
-        let frames = decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
+        let frames = decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let seen = picture::context_for(wanted, &frames);
         let input = PredictionInput {
             state: last_state(self.state, self.states, frames.len())?,

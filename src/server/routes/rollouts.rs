@@ -18,7 +18,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{ConditioningInput, Prediction, Rollout, Task, Timing};
 use foreframe_core::types::RobotState;
@@ -41,7 +41,7 @@ struct RolloutRequest {
     format: ImageFormat,
     /// How an image of another size is resized; without it, another size is an error.
     #[serde(default)]
-    fit: Option<Fit>,
+    resize: Option<Resize>,
     /// The robot's state at the last frame.
     #[serde(default)]
     state: Option<Vec<f32>>,
@@ -190,8 +190,8 @@ impl RolloutRequest {
         manifest: &Manifest,
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, Task), PredictError> {
-        let (format, fit) = (self.format, self.fit);
-        let frames = predict::decode_frames(self.frames, ImageInput { format, fit }, manifest, config.max_frames)?;
+        let (format, resize) = (self.format, self.resize);
+        let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, frames.len())?;
         let conditioning = conditioning((self.candidates, self.steps), state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);

@@ -148,8 +148,8 @@ async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
         on_gap: settings.on_gap,
         on_late: settings.on_late,
         format: settings.format,
-        fit: settings.fit,
-        memory: state.memory(),
+        resize: settings.resize,
+        snapshot: state.snapshot(),
     })
 }
 

@@ -29,7 +29,7 @@ use crate::server::http::message_bytes::MessageBytes;
 use crate::server::http::task_limit::{TaskLimit, stop_requested};
 use crate::server::images::ImageFormat;
 use foreframe_core::error_text::without_middle;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::metric_names;
 use foreframe_core::serving::Predictor;
 
@@ -174,7 +174,7 @@ impl StreamConnection {
         inbox: &mpsc::Sender<PipelinedItem>,
     ) -> Result<ClosingReason, ClientGone> {
         // Frames are read before the messages ahead of them are answered, so the reader keeps its own copy.
-        let mut fit = self.ownership.session().settings().fit;
+        let mut resize = self.ownership.session().settings().resize;
         loop {
             // The message before this one was decoded: only its frame is left, in the model's size.
             self.services.messages.message_read();
@@ -194,13 +194,13 @@ impl StreamConnection {
                 Ok(ClientMessage::Frame(frame)) => {
                     trace!(seq = frame.seq, "frame");
                     self.frames.increment(1);
-                    self.checked(frame, fit).await.map_or_else(
+                    self.checked(frame, resize).await.map_or_else(
                         |error| PipelinedItem::refused(error.code(), &error),
                         |step| PipelinedItem::Frame(Box::new(step)),
                     )
                 }
                 Ok(ClientMessage::Configure(message)) => {
-                    fit = message.fit.or(fit);
+                    resize = message.resize.or(resize);
                     PipelinedItem::Configure(message)
                 }
                 Ok(ClientMessage::Ping(ping)) => {
@@ -253,13 +253,13 @@ impl StreamConnection {
     }
 
     /// The frame, if it fits the model. Raw pixels need no other thread; an image file does.
-    async fn checked(&self, message: FrameMessage, fit: Option<Fit>) -> Result<FrameStep, StepError> {
+    async fn checked(&self, message: FrameMessage, resize: Option<Resize>) -> Result<FrameStep, StepError> {
         let manifest = Arc::clone(&self.ownership.session().model().manifest);
         let max_steps = self.services.config.max_steps;
         if message.format == ImageFormat::Raw {
-            return FrameStep::new(message, fit, &manifest, max_steps);
+            return FrameStep::new(message, resize, &manifest, max_steps);
         }
-        let check = move || FrameStep::new(message, fit, &manifest, max_steps);
+        let check = move || FrameStep::new(message, resize, &manifest, max_steps);
         self.services.blocking.run(check).await?
     }
 

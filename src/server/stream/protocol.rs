@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::server::config::ServerConfig;
 use crate::server::images::{ImageBytes, ImageFormat};
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::nn::ModelSpec;
 
 pub use codec::Codec;
@@ -72,7 +72,7 @@ pub struct ConfigureMessage {
     pub format: Option<ImageFormat>,
     /// How a frame of another size is resized.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fit: Option<Fit>,
+    pub resize: Option<Resize>,
 }
 
 /// Settings of a session.
@@ -88,7 +88,7 @@ pub struct SessionSettings {
     pub format: Option<ImageFormat>,
     /// How a frame of another size is resized; absent: it is refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fit: Option<Fit>,
+    pub resize: Option<Resize>,
 }
 
 /// What happens if frames are missing.

@@ -118,7 +118,7 @@ impl Session {
         settings.on_gap = message.on_gap.unwrap_or(settings.on_gap);
         settings.on_late = message.on_late.unwrap_or(settings.on_late);
         settings.format = message.format.map(ImageFormat::answer).or(settings.format);
-        settings.fit = message.fit.or(settings.fit);
+        settings.resize = message.resize.or(settings.resize);
         ServerMessage::Configured(*settings)
     }
 
@@ -194,7 +194,7 @@ impl Ownership {
         step: FrameStep,
     ) -> Result<ServerMessage, StepError> {
         let (key, model) = (self.session.key, &self.session.model);
-        let spec = model.model.spec();
+        let spec = model.network.spec();
         let (format, missing, task) = {
             let inner = self.inner()?;
             let core = &inner.core;
@@ -217,7 +217,9 @@ impl Ownership {
         };
         if answer.must_compress(format) {
             let model = Arc::clone(model);
-            return blocking.run(move || answer.message(format, model.model.spec())).await?;
+            return blocking
+                .run(move || answer.message(format, model.network.spec()))
+                .await?;
         }
         answer.message(format, spec)
     }

@@ -7,7 +7,7 @@ use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::frame::Frame;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{
@@ -31,7 +31,7 @@ impl FrameStep {
     /// Checks the message and decodes its image, which takes long unless the image is raw. Errors name the field.
     pub(in crate::server) fn new(
         message: FrameMessage,
-        fit: Option<Fit>,
+        resize: Option<Resize>,
         manifest: &Manifest,
         max_steps: usize,
     ) -> Result<Self, StepError> {
@@ -60,7 +60,7 @@ impl FrameStep {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
             conditioning: ConditioningInput::new(given, &STEP_FIELDS, &manifest.name, &manifest.spec)?,
-            frame: images::decode("image", message.image, ImageInput { format, fit }, manifest)?,
+            frame: images::decode("image", message.image, ImageInput { format, resize }, manifest)?,
             format,
             is_overtaken: false,
         })

@@ -24,7 +24,7 @@ pub struct LoadedModel {
     /// The model's description.
     pub manifest: Arc<Manifest>,
     /// The network, ready to predict.
-    pub model: Model,
+    pub network: Model,
 }
 
 /// A model's verified weights, from which a training can start.
@@ -40,13 +40,13 @@ pub struct StoredWeights {
 /// `Weights`.
 pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
-    let model = Model::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
+    let network = Model::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
         path: model_dir.join(WEIGHTS_FILE),
         source,
     })?;
     Ok(LoadedModel {
         manifest: Arc::new(manifest),
-        model,
+        network,
     })
 }
 
@@ -109,7 +109,7 @@ pub fn load_as(model_dir: &Path, name: &str) -> Result<LoadedModel, RegistryErro
     };
     Ok(LoadedModel {
         manifest: Arc::new(manifest),
-        model: loaded.model,
+        network: loaded.network,
     })
 }
 

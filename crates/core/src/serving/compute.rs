@@ -64,7 +64,7 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Predictio
 
 /// The features of all the tasks' frames, in order.
 fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let frames: Vec<&Frame> = tasks.iter().flat_map(|task| &task.frames).collect();
     if frames.is_empty() {
         return Ok(Vec::new());
@@ -74,7 +74,7 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
         .map_err(tensor_error)
         .and_then(|frames| {
             loaded
-                .model
+                .network
                 .encode_frames(&frames)
                 .map_err(|source| model_error(loaded, source))
         })?;
@@ -92,9 +92,9 @@ fn predict_windows(
     window_of: &[u32],
     conditioning_inputs: &[&ConditioningInput],
 ) -> Result<Vec<Rollout>, ServingError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let contexts = match &loaded.manifest.calibration {
-        Some(_) => ContextStatistics::of_codes(&loaded.model, &values, spec.context)
+        Some(_) => ContextStatistics::of_codes(&loaded.network, &values, spec.context)
             .map_err(|source| model_error(loaded, source))?,
         None => Vec::new(),
     };
@@ -136,10 +136,10 @@ struct Windows<'a> {
 impl Windows<'_> {
     /// Rollouts of `steps` frames. A row is the index of a window and a conditioning input.
     fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
-        let (loaded, spec) = (self.loaded, self.loaded.model.spec());
+        let (loaded, spec) = (self.loaded, self.loaded.network.spec());
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
         let codes = loaded
-            .model
+            .network
             .predict_steps(&self.features, &window_of, &condition(spec, &inputs, steps)?, steps)
             .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
             .map_err(|source| model_error(loaded, source))?;
@@ -167,7 +167,7 @@ impl Windows<'_> {
         codes: &[f32],
         frames: Vec<Frame>,
     ) -> Rollout {
-        let spec = self.loaded.model.spec();
+        let spec = self.loaded.network.spec();
         let (Some(calibration), Some(context)) =
             (&self.loaded.manifest.calibration, self.contexts.get(window as usize))
         else {
@@ -205,7 +205,7 @@ fn decode(loaded: &LoadedModel, codes: &Tensor, total: usize) -> Result<Vec<Fram
             .narrow(0, first, DECODED_FRAMES.min(total - first))
             .map_err(tensor_error)?;
         let pixels = loaded
-            .model
+            .network
             .decode_frames(&part)
             .map_err(|source| model_error(loaded, source))?;
         frames.extend(with_values(&pixels, |values| images(loaded, values)).map_err(tensor_error)??);
@@ -214,7 +214,7 @@ fn decode(loaded: &LoadedModel, codes: &Tensor, total: usize) -> Result<Vec<Fram
 }
 
 fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let frame = |pixels| {
         spec.preprocess
             .frame_from(pixels, spec.frame_width_px, spec.frame_height_px)

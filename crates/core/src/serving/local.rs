@@ -8,7 +8,7 @@ use super::error::{InputError, ServingError};
 use super::input::PredictionInput;
 use super::prediction::Rollout;
 use super::ranges::range_warnings;
-use super::session::{MemoryError, SessionMemory, SessionState};
+use super::session::{SnapshotError, SessionSnapshot, SessionState};
 use super::task::{Task, check_size};
 use crate::frame::Frame;
 use crate::registry::{LoadedModel, Manifest};
@@ -19,7 +19,11 @@ use crate::types::{Action, RobotState};
 pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
-        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.model.spec())?))
+        .map(|input| {
+            Ok((*input)
+                .clone()
+                .into_task(&loaded.manifest.name, loaded.network.spec())?)
+        })
         .collect::<Result<Vec<Task>, ServingError>>()?;
     let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
     Ok(predictions
@@ -43,7 +47,7 @@ impl ConditioningInput {
             state,
             steps: None,
         };
-        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.model.spec())
+        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.network.spec())
     }
 
     /// What is out of the range that the model saw in training; nothing if its manifest has no ranges.
@@ -71,9 +75,9 @@ impl Session {
         }
     }
 
-    /// Continues an exported session. Errors: what of the memory does not fit the model.
-    pub fn restore(model: Arc<LoadedModel>, memory: SessionMemory) -> Result<Self, MemoryError> {
-        let state = SessionState::restore(memory, &model.manifest.name, model.model.spec())?;
+    /// Continues an exported session. Errors: what of the snapshot does not fit the model.
+    pub fn restore(model: Arc<LoadedModel>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
+        let state = SessionState::restore(snapshot, &model.manifest.name, model.network.spec())?;
         Ok(Self { model, state })
     }
 
@@ -88,7 +92,7 @@ impl Session {
         future_actions: Option<&[Action]>,
     ) -> Result<Option<Rollout>, ServingError> {
         let conditioning = ConditioningInput::for_model(&self.model, future_actions, state)?;
-        let spec = self.model.model.spec();
+        let spec = self.model.network.spec();
         check_size(
             "frame",
             &self.model.manifest.name,
@@ -108,7 +112,7 @@ impl Session {
     /// Predicts one rollout for each plan from the last frame and state: one action for each frame to predict, the same
     /// number in all plans. Empty until the context is full. Errors: `Input` if a plan does not fit the model.
     pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
-        let spec = self.model.model.spec();
+        let spec = self.model.network.spec();
         let steps = plans.first().map(Vec::len);
         let from = (self.state.robot_state().cloned(), steps);
         let inputs = ConditioningInput::candidates(plans, from, &self.model.manifest.name, spec)?;
@@ -131,8 +135,8 @@ impl Session {
 
     /// What another program or server needs to continue the session.
     #[must_use]
-    pub fn memory(&self) -> SessionMemory {
-        self.state.memory()
+    pub fn snapshot(&self) -> SessionSnapshot {
+        self.state.snapshot()
     }
 
     /// Its model.
@@ -162,7 +166,7 @@ mod tests {
             assert!(session.rollouts(vec![actions.clone()]).unwrap().is_empty());
             predicted = session.step(frame, Some(&state), Some(&actions)).unwrap();
         }
-        let again = Session::restore(Arc::new(model.clone()), session.memory()).unwrap();
+        let again = Session::restore(Arc::new(model.clone()), session.snapshot()).unwrap();
         let shorter = again.rollouts(vec![actions[..1].to_vec(); 2]).unwrap();
         assert_eq!(
             again.rollouts(vec![actions.clone()]).unwrap(),
@@ -202,8 +206,8 @@ mod tests {
     }
 
     fn check_steps(model: &LoadedModel) {
-        let width = model.model.spec().frame_width_px;
-        let spec = model.model.spec();
+        let width = model.network.spec().frame_width_px;
+        let spec = model.network.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
             let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
@@ -243,6 +247,6 @@ mod tests {
         let frame = Frame::new(5, 4, vec![0; 20]).unwrap();
         let error = session.step(frame, Some(&state), Some(&actions)).unwrap_err();
         assert_eq!(error.to_string(), "frame is 5×4 px; model \"test\" takes 6×4");
-        assert_eq!(session.memory(), SessionState::default().memory());
+        assert_eq!(session.snapshot(), SessionState::default().snapshot());
     }
 }

@@ -189,13 +189,13 @@ mod tests {
     /// A model without context: its computation divides by zero.
     fn panicking_model() -> LoadedModel {
         let model = test_model();
-        let parameters = Parameters::initialize(model.model.spec(), Seed(1)).unwrap();
+        let parameters = Parameters::initialize(model.network.spec(), Seed(1)).unwrap();
         let spec = ModelSpec {
             context: 0,
-            ..model.model.spec().clone()
+            ..model.network.spec().clone()
         };
         LoadedModel {
-            model: Model::detached(model.model.spec().clone(), &parameters)
+            network: Model::detached(model.network.spec().clone(), &parameters)
                 .unwrap()
                 .with_spec(spec),
             ..model
@@ -203,9 +203,9 @@ mod tests {
     }
 
     fn task(model: &LoadedModel) -> Task {
-        let input = worker::blank_input(model.model.spec()).unwrap();
+        let input = worker::blank_input(model.network.spec()).unwrap();
         Task {
-            conditioning_inputs: vec![input.conditioning("test", model.model.spec()).unwrap()],
+            conditioning_inputs: vec![input.conditioning("test", model.network.spec()).unwrap()],
             frames: input.frames,
             ..Task::default()
         }

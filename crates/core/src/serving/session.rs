@@ -15,9 +15,9 @@ use crate::types::{Action, RobotState};
 /// Why an imported session state does not fit the model.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
-pub enum MemoryError {
+pub enum SnapshotError {
     /// More frames than the context.
-    #[error("memory.features holds {found} frames; the model keeps at most {most}")]
+    #[error("snapshot.features holds {found} frames; the model keeps at most {most}")]
     FrameCount {
         /// Frames given.
         found: usize,
@@ -25,7 +25,7 @@ pub enum MemoryError {
         most: usize,
     },
     /// A frame has the wrong number of features.
-    #[error("memory.features[{index}] holds {found} numbers; the model's frames have {expected} features")]
+    #[error("snapshot.features[{index}] holds {found} numbers; the model's frames have {expected} features")]
     FeatureCount {
         /// Which frame.
         index: usize,
@@ -35,7 +35,7 @@ pub enum MemoryError {
         expected: usize,
     },
     /// A value that no frame can produce.
-    #[error("memory.features[{index}][{place}] is {value}; a feature is -1 to 1")]
+    #[error("snapshot.features[{index}][{place}] is {value}; a feature is -1 to 1")]
     Feature {
         /// Which frame.
         index: usize,
@@ -45,7 +45,7 @@ pub enum MemoryError {
         value: f32,
     },
     /// `next_seq` contradicts the number of frames.
-    #[error("memory.next_seq is {next_seq}; that contradicts the {frames} frames in memory.features")]
+    #[error("snapshot.next_seq is {next_seq}; that contradicts the {frames} frames in snapshot.features")]
     Count {
         /// As given.
         next_seq: u64,
@@ -53,7 +53,7 @@ pub enum MemoryError {
         frames: usize,
     },
     /// The actions or the state do not fit the model.
-    #[error("memory: {0}")]
+    #[error("snapshot: {0}")]
     ConditioningInput(#[from] InputError),
 }
 
@@ -61,7 +61,7 @@ pub enum MemoryError {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
-pub struct SessionMemory {
+pub struct SessionSnapshot {
     /// The expected sequence number of the next frame.
     pub next_seq: u64,
     /// The features of the last frames, oldest first, -1 to 1; at most as many frames as the model's context.
@@ -87,21 +87,21 @@ pub struct SessionState {
 
 impl SessionState {
     /// Restores an exported state for the model named `model`. Errors name the field that does not fit.
-    pub fn restore(memory: SessionMemory, model: &str, spec: &ModelSpec) -> Result<Self, MemoryError> {
-        let frames = memory.features.len();
+    pub fn restore(snapshot: SessionSnapshot, model: &str, spec: &ModelSpec) -> Result<Self, SnapshotError> {
+        let frames = snapshot.features.len();
         if frames > spec.context {
-            return Err(MemoryError::FrameCount {
+            return Err(SnapshotError::FrameCount {
                 found: frames,
                 most: spec.context,
             });
         }
-        if (frames == 0) != (memory.next_seq == 0) || memory.next_seq < frames as u64 {
-            return Err(MemoryError::Count {
-                next_seq: memory.next_seq,
+        if (frames == 0) != (snapshot.next_seq == 0) || snapshot.next_seq < frames as u64 {
+            return Err(SnapshotError::Count {
+                next_seq: snapshot.next_seq,
                 frames,
             });
         }
-        for (index, features) in memory.features.iter().enumerate() {
+        for (index, features) in snapshot.features.iter().enumerate() {
             check_features(index, features, spec)?;
         }
         let conditioning = match frames {
@@ -109,26 +109,26 @@ impl SessionState {
             _ => ConditioningInput::new(
                 RawConditioning {
                     past: &[],
-                    future: Some(&memory.actions),
-                    state: memory.state.as_ref(),
-                    steps: memory.steps,
+                    future: Some(&snapshot.actions),
+                    state: snapshot.state.as_ref(),
+                    steps: snapshot.steps,
                 },
-                &MEMORY_FIELDS,
+                &SNAPSHOT_FIELDS,
                 model,
                 spec,
             )?,
         };
         Ok(Self {
-            next_seq: memory.next_seq,
-            features: memory.features.into_iter().map(Features::from).collect(),
+            next_seq: snapshot.next_seq,
+            features: snapshot.features.into_iter().map(Features::from).collect(),
             conditioning,
         })
     }
 
     /// Exports the state, so that another server can continue the session.
     #[must_use]
-    pub fn memory(&self) -> SessionMemory {
-        SessionMemory {
+    pub fn snapshot(&self) -> SessionSnapshot {
+        SessionSnapshot {
             next_seq: self.next_seq,
             features: self.features.iter().map(|features| features.to_vec()).collect(),
             actions: self.conditioning.actions.clone(),
@@ -200,15 +200,15 @@ impl SessionState {
     }
 }
 
-const MEMORY_FIELDS: FieldNames = FieldNames {
+const SNAPSHOT_FIELDS: FieldNames = FieldNames {
     past: |_| "actions".to_owned(),
     future: "actions",
     missing: "actions",
 };
 
-fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), MemoryError> {
+fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), SnapshotError> {
     if features.len() != spec.code_len() {
-        return Err(MemoryError::FeatureCount {
+        return Err(SnapshotError::FeatureCount {
             index,
             found: features.len(),
             expected: spec.code_len(),
@@ -220,7 +220,7 @@ fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<()
         .enumerate()
         .find(|(_, value)| !(-1.0..=1.0).contains(*value))
     {
-        Some((place, &value)) => Err(MemoryError::Feature { index, place, value }),
+        Some((place, &value)) => Err(SnapshotError::Feature { index, place, value }),
         None => Ok(()),
     }
 }
@@ -244,23 +244,23 @@ mod tests {
             actions in proptest::collection::vec(-2.0f32..2.0, 0..4),
             state in proptest::option::of(-2.0f32..2.0),
         ) {
-            let spec = test_model().model.spec().clone();
-            let memory = SessionMemory {
+            let spec = test_model().network.spec().clone();
+            let snapshot = SessionSnapshot {
                 next_seq,
                 features,
                 actions: actions.into_iter().map(action).collect(),
                 state: state.and_then(|value| RobotState::try_from(vec![value]).ok()),
                 steps: None,
             };
-            let is_sound = memory.features.len() <= 3
-                && memory.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
-                && (memory.features.is_empty() == (next_seq == 0) && next_seq >= memory.features.len() as u64)
-                && (memory.features.is_empty() || (memory.actions.len() == 2 && memory.state.is_some()));
-            match SessionState::restore(memory.clone(), "test", &spec) {
+            let is_sound = snapshot.features.len() <= 3
+                && snapshot.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
+                && (snapshot.features.is_empty() == (next_seq == 0) && next_seq >= snapshot.features.len() as u64)
+                && (snapshot.features.is_empty() || (snapshot.actions.len() == 2 && snapshot.state.is_some()));
+            match SessionState::restore(snapshot.clone(), "test", &spec) {
                 Ok(restored) => {
                     prop_assert!(is_sound);
                     if next_seq > 0 {
-                        prop_assert_eq!(restored.memory(), memory);
+                        prop_assert_eq!(restored.snapshot(), snapshot);
                     }
                 }
                 Err(_) => prop_assert!(!is_sound),
@@ -270,16 +270,19 @@ mod tests {
 
     #[test]
     fn a_feature_out_of_range_is_refused_with_its_position() {
-        let spec = test_model().model.spec().clone();
-        let mut memory = SessionMemory {
+        let spec = test_model().network.spec().clone();
+        let mut snapshot = SessionSnapshot {
             next_seq: 1,
             features: vec![vec![0.0; 5]],
             actions: vec![action(0.0); 2],
             state: RobotState::try_from(vec![0.0]).ok(),
             steps: None,
         };
-        memory.features[0][3] = f32::NAN;
-        let error = SessionState::restore(memory, "test", &spec).unwrap_err();
-        assert_eq!(error.to_string(), "memory.features[0][3] is NaN; a feature is -1 to 1");
+        snapshot.features[0][3] = f32::NAN;
+        let error = SessionState::restore(snapshot, "test", &spec).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "snapshot.features[0][3] is NaN; a feature is -1 to 1"
+        );
     }
 }

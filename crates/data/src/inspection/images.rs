@@ -276,7 +276,7 @@ impl ImageSummary {
             if share > CLIPPED_SHARE {
                 warnings.push(format!(
                     "{:.0} % of the pixels are pure {what}, so they show nothing. Record with {right} exposure; bars of \
-                     --fit letterbox count as black, too.",
+                     --resize letterbox count as black, too.",
                     100.0 * share
                 ));
             }

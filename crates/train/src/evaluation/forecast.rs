@@ -46,16 +46,16 @@ pub(super) fn contexts(
     windows: &[Window],
     watched: &EvaluationContext,
 ) -> Result<Vec<ContextStatistics>, EvaluationError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let mut found = Vec::with_capacity(windows.len());
     for batch in windows.chunks(watched.batch) {
         let ends: Vec<usize> = batch
             .iter()
             .flat_map(|window| ends(window.first_frame, spec.context))
             .collect();
-        let frames = inference::fitted_frames(dataset, spec, &ends)?;
+        let frames = inference::resized_frames(dataset, spec, &ends)?;
         let codes = inference::encode(loaded, &frames)?;
-        found.extend(ContextStatistics::of_codes(&loaded.model, &codes, 2)?);
+        found.extend(ContextStatistics::of_codes(&loaded.network, &codes, 2)?);
         watched.report(EvaluationStage::Calibration, found.len(), windows.len())?;
     }
     Ok(found)
@@ -72,10 +72,10 @@ fn forecast_batch(
     windows: &[Window],
     novelty: &NoveltyScale,
 ) -> Result<Vec<Forecast>, EvaluationError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let (pixels, length) = (spec.pixels(), spec.code_len());
     let predicted = inference::predict_with_codes(loaded, dataset, windows, ActionSource::Recorded)?;
-    let contexts = ContextStatistics::of_codes(&loaded.model, &predicted.seen, spec.context)?;
+    let contexts = ContextStatistics::of_codes(&loaded.network, &predicted.seen, spec.context)?;
     let actions_each = predicted.actions.len() / windows.len().max(1);
     let mut found = Vec::with_capacity(windows.len());
     for (index, (window, context)) in windows.iter().zip(contexts).enumerate() {

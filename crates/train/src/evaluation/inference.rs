@@ -4,8 +4,8 @@ use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::EvaluationError;
-use foreframe_core::frame::fit::{Fit, fit};
 use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::nn::{ConditioningTensors, Feedback, ModelSpec};
 use foreframe_core::registry::LoadedModel;
 use foreframe_data::dataset::{Dataset, Window};
@@ -44,11 +44,11 @@ pub fn predict(
     windows: &[Window],
     source: ActionSource,
 ) -> Result<Vec<f32>, EvaluationError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
     let frames = Tensor::from_vec(inputs, (windows.len(), spec.context, spec.pixels()), &Device::Cpu)?;
     let condition = condition(spec, dataset, windows, source)?;
-    let predicted = values(&loaded.model.predict_frames(&frames, &condition)?)?;
+    let predicted = values(&loaded.network.predict_frames(&frames, &condition)?)?;
     let window_values = spec.horizon * spec.pixels();
     match predicted.iter().position(|value| !value.is_finite()) {
         Some(place) => Err(EvaluationError::NotFinite {
@@ -68,7 +68,7 @@ pub fn predict_with_ceiling(
     dataset: &Dataset,
     windows: &[Window],
 ) -> Result<Predicted, EvaluationError> {
-    let spec = loaded.model.spec();
+    let spec = loaded.network.spec();
     let frames = predict(loaded, dataset, windows, ActionSource::Recorded)?;
     let truth = model_space(
         dataset,
@@ -77,7 +77,7 @@ pub fn predict_with_ceiling(
         spec.context..spec.context + spec.horizon,
     )?;
     let targets = Tensor::from_slice(&truth, (windows.len() * spec.horizon, spec.pixels()), &Device::Cpu)?;
-    let codec = values(&loaded.model.decode_frames(&loaded.model.encode_frames(&targets)?)?)?;
+    let codec = values(&loaded.network.decode_frames(&loaded.network.encode_frames(&targets)?)?)?;
     Ok(Predicted {
         frames,
         truth,
@@ -89,7 +89,7 @@ pub fn predict_with_ceiling(
 /// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space. Empty if it
 /// does not reconstruct.
 pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
-    let (model, spec) = (&loaded.model, loaded.model.spec());
+    let (model, spec) = (&loaded.network, loaded.network.spec());
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
     let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
@@ -121,7 +121,7 @@ pub(super) fn predict_with_codes(
     windows: &[Window],
     source: ActionSource,
 ) -> Result<PredictedCodes, EvaluationError> {
-    let (model, spec) = (&loaded.model, loaded.model.spec());
+    let (model, spec) = (&loaded.network, loaded.network.spec());
     let (batch, code) = (windows.len(), spec.code_len());
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
     let seen = encode(loaded, &inputs)?;
@@ -139,24 +139,24 @@ pub(super) fn predict_with_codes(
 
 /// Codes of frames in the model's space, both one after another. Errors: those of the network.
 pub(super) fn encode(loaded: &LoadedModel, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
-    let pixels = loaded.model.spec().pixels();
+    let pixels = loaded.network.spec().pixels();
     let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
-    values(&loaded.model.encode_frames(&frames)?)
+    values(&loaded.network.encode_frames(&frames)?)
 }
 
 /// Frames of a data set of any size in the model's space, one after another. Another size is cropped and resized.
-pub(super) fn fitted_frames(
+pub(super) fn resized_frames(
     dataset: &Dataset,
     spec: &ModelSpec,
     frames: &[usize],
 ) -> Result<Vec<f32>, EvaluationError> {
     let mut all = Vec::with_capacity(frames.len() * spec.pixels());
     for &frame in frames {
-        let frame = fit(
+        let frame = resize(
             &dataset.frame(frame)?,
             spec.frame_width_px,
             spec.frame_height_px,
-            Fit::Crop,
+            Resize::Crop,
         )?;
         all.extend(spec.preprocess.forward(&frame));
     }

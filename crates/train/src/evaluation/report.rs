@@ -186,7 +186,7 @@ pub struct ModelSummary {
 
 impl ModelSummary {
     pub(super) fn of(loaded: &LoadedModel) -> Self {
-        let spec = loaded.model.spec();
+        let spec = loaded.network.spec();
         Self {
             frame_width_px: spec.frame_width_px,
             frame_height_px: spec.frame_height_px,

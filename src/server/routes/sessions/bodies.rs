@@ -10,9 +10,9 @@ use crate::server::images::ImageFormat;
 use crate::server::state::App;
 use crate::server::stream::protocol::{OnGap, OnLate, SessionSettings, StreamLimits};
 use crate::server::stream::session::Session;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::registry::LoadedModel;
-use foreframe_core::serving::{SessionMemory, SessionState};
+use foreframe_core::serving::{SessionSnapshot, SessionState};
 
 /// The session to open.
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
@@ -32,7 +32,7 @@ pub(super) struct CreateSession {
     pub(super) format: Option<ImageFormat>,
     /// How a frame of another size is resized; without it, another size is an error.
     #[serde(default)]
-    pub(super) fit: Option<Fit>,
+    pub(super) resize: Option<Resize>,
     /// A state from `GET /v1/sessions/{id}/state` of this or another server: the session continues from it.
     #[serde(default)]
     pub(super) state: Option<ExportedState>,
@@ -58,9 +58,9 @@ pub(super) struct ExportedState {
     pub(super) format: Option<ImageFormat>,
     /// How a frame of another size is resized; absent: it is an error.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) fit: Option<Fit>,
+    pub(super) resize: Option<Resize>,
     /// The session state.
-    pub(super) memory: SessionMemory,
+    pub(super) snapshot: SessionSnapshot,
 }
 
 /// A new session.
@@ -109,7 +109,7 @@ pub(super) struct SessionList {
 
 impl CreateSession {
     pub(super) fn resolve(self, app: &App) -> Result<(Arc<LoadedModel>, SessionState, SessionSettings), ApiError> {
-        let (on_gap, on_late, fit) = (self.on_gap, self.on_late, self.fit);
+        let (on_gap, on_late, resize) = (self.on_gap, self.on_late, self.resize);
         let format = self.format.map(ImageFormat::answer);
         let Some(exported) = self.state else {
             let Some(name) = self.model else {
@@ -121,7 +121,7 @@ impl CreateSession {
                 on_gap: on_gap.unwrap_or_default(),
                 on_late: on_late.unwrap_or_default(),
                 format,
-                fit,
+                resize,
             };
             return Ok((app.predictor().active(&name)?, SessionState::default(), settings));
         };
@@ -143,9 +143,9 @@ impl CreateSession {
             on_gap: on_gap.unwrap_or(exported.on_gap),
             on_late: on_late.unwrap_or(exported.on_late),
             format: format.or(exported.format.map(ImageFormat::answer)),
-            fit: fit.or(exported.fit),
+            resize: resize.or(exported.resize),
         };
-        let state = SessionState::restore(exported.memory, &manifest.name, &manifest.spec)
+        let state = SessionState::restore(exported.snapshot, &manifest.name, &manifest.spec)
             .map_err(|error| ApiError::Unprocessable(format!("state.{error}")))?;
         Ok((model, state, settings))
     }

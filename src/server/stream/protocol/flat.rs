@@ -6,7 +6,7 @@ use serde::{Deserialize, Deserializer};
 
 use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
 use crate::server::images::{ImageBytes, ImageFormat};
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 
 /// The maximum number of items of a list in a message: more than any model takes.
 const MAX_ITEMS: usize = 4096;
@@ -26,7 +26,7 @@ pub(super) struct AnyMessage {
     steps: Option<usize>,
     on_gap: Option<OnGap>,
     on_late: Option<OnLate>,
-    fit: Option<Fit>,
+    resize: Option<Resize>,
 }
 
 #[derive(Clone, Copy, Deserialize)]
@@ -89,7 +89,7 @@ impl TryFrom<AnyMessage> for ClientMessage {
                 on_gap: any.on_gap.take(),
                 on_late: any.on_late.take(),
                 format: any.format.take(),
-                fit: any.fit.take(),
+                resize: any.resize.take(),
             }),
             MessageKind::Ping => Self::Ping(PingMessage {
                 timestamp_us: any.timestamp_us.take().unwrap_or_default(),
@@ -116,7 +116,7 @@ impl AnyMessage {
             ("steps", self.steps.is_some()),
             ("on_gap", self.on_gap.is_some()),
             ("on_late", self.on_late.is_some()),
-            ("fit", self.fit.is_some()),
+            ("resize", self.resize.is_some()),
         ];
         fields
             .into_iter()

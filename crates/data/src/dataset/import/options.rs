@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::error::ImportError;
 use foreframe_core::frame::MAX_SIDE_PX;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 
 /// The largest [`ImportOptions::every`].
 const MAX_EVERY: usize = 1_000_000;
@@ -39,9 +39,9 @@ pub struct ImportOptions {
     /// Height of the data set's frames in pixels
     #[cfg_attr(feature = "cli", arg(skip))]
     pub frame_height_px: u32,
-    /// How images of another shape are fitted: crop, letterbox or stretch
+    /// How images of another shape are resized: crop, letterbox or stretch
     #[cfg_attr(feature = "cli", arg(long, default_value = "crop"))]
-    pub fit: Fit,
+    pub resize: Resize,
     /// Frames per second: of the data set or, where the source has no times, of the recording
     #[cfg_attr(feature = "cli", arg(long = "rate", value_name = "HZ"))]
     pub rate_hz: Option<f64>,
@@ -81,7 +81,7 @@ impl Default for ImportOptions {
         Self {
             frame_width_px: 64,
             frame_height_px: 64,
-            fit: Fit::Crop,
+            resize: Resize::Crop,
             rate_hz: None,
             every: 1,
             csv: None,

@@ -29,7 +29,7 @@ pub(super) struct Recording {
     pub(super) name: String,
     pub(super) action_channels: Vec<Channel>,
     pub(super) state_channels: Vec<Channel>,
-    /// How the camera projects the fitted images, where the source says it.
+    /// How the camera projects the resized images, where the source says it.
     pub(super) camera: Option<CameraModel>,
     pub(super) records: Vec<Record>,
     pub(super) images: Box<dyn ImageSource>,
@@ -53,21 +53,21 @@ impl Recording {
 
 /// Where the images of a recording are.
 pub(super) trait ImageSource: Send + Sync {
-    /// Decodes images as gray and passes each to `fit`, in parallel. They are wanted in the order of the recording. Errors, for
-    /// each image: `Image`, `Io`, `Record`, `Program`, `Stopped`, and those of `fit`.
+    /// Decodes images as gray and passes each to `resize`, in parallel. They are wanted in the order of the recording. Errors, for
+    /// each image: `Image`, `Io`, `Record`, `Program`, `Stopped`, and those of `resize`.
     fn read_all(
         &self,
         wanted: &[WantedImage<'_>],
-        fit: FitImage<'_>,
+        resize: ResizeImage<'_>,
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
-        let fitted = |wanted: &WantedImage<'_>| {
+        let resized = |wanted: &WantedImage<'_>| {
             if cancelled.load(Ordering::Relaxed) {
                 return Err(ImportError::Stopped);
             }
-            fit(&self.read(wanted, cancelled)?, wanted.place)
+            resize(&self.read(wanted, cancelled)?, wanted.place)
         };
-        wanted.par_iter().map(fitted).collect()
+        wanted.par_iter().map(resized).collect()
     }
 
     /// Decodes one image as gray. Errors: as [`Self::read_all`].
@@ -82,7 +82,7 @@ pub(super) struct WantedImage<'a> {
 }
 
 /// Resizes an image; the second argument is its place.
-pub(super) type FitImage<'a> = &'a (dyn Fn(&Frame, &str) -> Result<Frame, ImportError> + Sync);
+pub(super) type ResizeImage<'a> = &'a (dyn Fn(&Frame, &str) -> Result<Frame, ImportError> + Sync);
 
 /// Seconds per unit of a time column, by its name's ending.
 pub(super) fn seconds_per_unit(name: &str) -> f64 {

@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::files::stem;
-use super::recording::{FitImage, ImageSource, Record, Recording, WantedImage};
+use super::recording::{ImageSource, Record, Recording, ResizeImage, WantedImage};
 use super::skipped::SkippedList;
 use super::{ImportError, ImportOptions};
 use crate::dataset::program::{ProgramError, ProgramOutput};
@@ -161,20 +161,21 @@ impl VideoFrames {
 }
 
 impl ImageSource for VideoFrames {
-    /// Decodes the frames one after the other and fits some of them together.
+    /// Decodes the frames one after the other and resizes some of them together.
     fn read_all(
         &self,
         wanted: &[WantedImage<'_>],
-        fit: FitImage<'_>,
+        resize: ResizeImage<'_>,
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
-        let mut fitted = Vec::with_capacity(wanted.len());
+        let mut resized = Vec::with_capacity(wanted.len());
         for some in wanted.chunks(DECODED_FRAMES) {
             let decoded: Vec<_> = some.iter().map(|wanted| self.read(wanted, cancelled)).collect();
-            let fit = |(decoded, wanted): (Result<Frame, ImportError>, &WantedImage<'_>)| fit(&decoded?, wanted.place);
-            fitted.par_extend(decoded.into_par_iter().zip(some).map(fit));
+            let resize =
+                |(decoded, wanted): (Result<Frame, ImportError>, &WantedImage<'_>)| resize(&decoded?, wanted.place);
+            resized.par_extend(decoded.into_par_iter().zip(some).map(resize));
         }
-        fitted
+        resized
     }
 
     fn read(&self, wanted: &WantedImage<'_>, cancelled: &AtomicBool) -> Result<Frame, ImportError> {
@@ -320,7 +321,7 @@ mod tests {
         let frames = VideoFrames::new(vec![(path.clone(), 3)], places.to_vec());
         let read = |images: std::ops::Range<usize>| -> Vec<Vec<u8>> {
             let wanted: Vec<_> = images.map(|image| WantedImage { image, place: "" }).collect();
-            let whole: FitImage<'_> = &|frame, _| Ok(frame.clone());
+            let whole: ResizeImage<'_> = &|frame, _| Ok(frame.clone());
             let read = frames.read_all(&wanted, whole, &AtomicBool::new(false));
             read.into_iter().map(|frame| frame.unwrap().pixels().to_vec()).collect()
         };

@@ -21,7 +21,7 @@ use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::{ShardWriter, shard_ranges};
 use foreframe_core::files::remove_partials;
 use foreframe_core::frame::Frame;
-use foreframe_core::frame::fit::fit;
+use foreframe_core::frame::resize::resize;
 
 /// Images that are decoded in parallel.
 const CHUNK_FRAMES: usize = 256;
@@ -265,7 +265,7 @@ impl EpisodeEncoder<'_> {
         let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
         let resize = |image: &Frame, place: &str| {
             let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
-            fit(image, width, height, self.options.fit).map_err(ImportError::image(place, place))
+            resize(image, width, height, self.options.resize).map_err(ImportError::image(place, place))
         };
         for episode in &self.plan.episodes[episodes] {
             let mut data = EpisodeData::default();

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::{AvailableInputs, check_name};
 use crate::jobs::JobError;
 use foreframe_core::error_text;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_data::dataset::import::{
     DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, check_out, parse_size,
 };
@@ -32,10 +32,10 @@ pub struct ImportSpec {
     #[serde(default = "default_size")]
     #[schema(default = "64x64", pattern = "^[0-9]{1,4}x[0-9]{1,4}$")]
     pub size: String,
-    /// How images of another shape are fitted.
-    #[serde(default = "default_fit")]
+    /// How images of another shape are resized.
+    #[serde(default = "default_resize")]
     #[schema(default = "crop")]
-    pub fit: Fit,
+    pub resize: Resize,
     /// Frames per second, 0.01 to 1000: of the data set or, where the source has no times, of the recording. By default, the
     /// recording's rate is kept.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -77,8 +77,8 @@ fn default_size() -> String {
     format!("{}x{}", options.frame_width_px, options.frame_height_px)
 }
 
-fn default_fit() -> Fit {
-    ImportOptions::default().fit
+fn default_resize() -> Resize {
+    ImportOptions::default().resize
 }
 
 fn default_every() -> usize {
@@ -148,7 +148,7 @@ impl ImportSpec {
         let options = ImportOptions {
             frame_width_px,
             frame_height_px,
-            fit: self.fit,
+            resize: self.resize,
             rate_hz: self.rate,
             every: self.every,
             csv: None,

@@ -1,8 +1,8 @@
-//! The camera model of a data set, from a camera's `CameraInfo` and how its images are fitted.
+//! The camera model of a data set, from a camera's `CameraInfo` and how its images are resized.
 
 use super::messages::Projection;
 use crate::dataset::import::options::ImportOptions;
-use foreframe_core::frame::fit::Fit;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::warp::CameraModel;
 
 /// Focal lengths in columns and rows may differ by this share; a camera model has square pixels.
@@ -23,13 +23,13 @@ pub(super) fn model(projection: &Projection, topic: &str, options: &ImportOption
     }
     let (width, height) = (f64::from(projection.width_px), f64::from(projection.height_px));
     let aspect = f64::from(options.frame_width_px) / f64::from(options.frame_height_px);
-    let shown_width = match options.fit {
-        Fit::Crop => width.min(height * aspect),
-        Fit::Letterbox => width.max(height * aspect),
-        Fit::Stretch => width,
+    let shown_width = match options.resize {
+        Resize::Crop => width.min(height * aspect),
+        Resize::Letterbox => width.max(height * aspect),
+        Resize::Stretch => width,
     };
-    let vertical_scale = match options.fit {
-        Fit::Stretch => width / (height * aspect),
+    let vertical_scale = match options.resize {
+        Resize::Stretch => width / (height * aspect),
         _ => 1.0,
     };
     if (focal_y / focal_x / vertical_scale - 1.0).abs() > SQUARE_TOLERANCE {
@@ -50,21 +50,21 @@ mod tests {
         is_distorted: false,
     };
 
-    fn fov(projection: &Projection, topic: &str, fit: Fit) -> Option<f32> {
+    fn fov(projection: &Projection, topic: &str, resize: Resize) -> Option<f32> {
         let options = ImportOptions {
-            fit,
+            resize,
             ..ImportOptions::default()
         };
         model(projection, topic, &options).map(|model| model.horizontal_fov_rad.to_degrees().round())
     }
 
     #[test]
-    fn the_field_of_view_is_that_of_the_fitted_image() {
+    fn the_field_of_view_is_that_of_the_resized_image() {
         // 480 of 640 columns are kept: 2 · atan(240 / 320).
-        assert_eq!(fov(&PROJECTION, "/image_raw", Fit::Crop), Some(74.0));
-        assert_eq!(fov(&PROJECTION, "/image_raw", Fit::Letterbox), Some(90.0));
-        assert_eq!(fov(&PROJECTION, "/image_raw", Fit::Stretch), None);
-        assert_eq!(fov(&PROJECTION, "/image_rect", Fit::Crop), Some(90.0));
+        assert_eq!(fov(&PROJECTION, "/image_raw", Resize::Crop), Some(74.0));
+        assert_eq!(fov(&PROJECTION, "/image_raw", Resize::Letterbox), Some(90.0));
+        assert_eq!(fov(&PROJECTION, "/image_raw", Resize::Stretch), None);
+        assert_eq!(fov(&PROJECTION, "/image_rect", Resize::Crop), Some(90.0));
     }
 
     #[test]
@@ -73,7 +73,7 @@ mod tests {
             is_distorted: true,
             ..PROJECTION
         };
-        assert_eq!(fov(&distorted, "/image_raw", Fit::Crop), None);
-        assert_eq!(fov(&distorted, "/image_rect", Fit::Crop), Some(90.0));
+        assert_eq!(fov(&distorted, "/image_raw", Resize::Crop), None);
+        assert_eq!(fov(&distorted, "/image_rect", Resize::Crop), Some(90.0));
     }
 }

@@ -1,8 +1,13 @@
 //! Frames of another size: resized where the client asks for it, else refused.
 
+<<<<<<< HEAD:tests/it/fit.rs
+=======
+use foreframe_core::frame::resize::{Resize, resize};
+use foreframe_core::frame::{Frame, codec};
+>>>>>>> words:tests/it/resize.rs
 use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, ErrorCode, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
-use foreframe_core::frame::fit::{Fit, fit};
+use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, codec};
 use serde_json::{Value, json};
 
@@ -31,16 +36,16 @@ async fn a_prediction_resizes_its_frames_as_asked() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     for (name, way) in [
-        ("crop", Fit::Crop),
-        ("letterbox", Fit::Letterbox),
-        ("stretch", Fit::Stretch),
+        ("crop", Resize::Crop),
+        ("letterbox", Resize::Letterbox),
+        ("stretch", Resize::Stretch),
     ] {
-        let fitted: Vec<Frame> = large_frames()
+        let resized: Vec<Frame> = large_frames()
             .iter()
-            .map(|frame| fit(frame, WIDTH, HEIGHT, way).unwrap())
+            .map(|frame| resize(frame, WIDTH, HEIGHT, way).unwrap())
             .collect();
-        let expected = post(&app, PREDICT, &json!({"frames": files(&fitted)})).await.json();
-        let body = json!({"frames": files(&large_frames()), "fit": name});
+        let expected = post(&app, PREDICT, &json!({"frames": files(&resized)})).await.json();
+        let body = json!({"frames": files(&large_frames()), "resize": name});
         let answer = post(&app, PREDICT, &body).await.json();
         assert!(
             answer["frames"].is_array() && answer["frames"] == expected["frames"],
@@ -53,19 +58,19 @@ async fn a_prediction_resizes_its_frames_as_asked() {
 async fn rollouts_resize_their_frames_as_asked() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let body = |frames: &[Frame], fit: Option<&str>| {
+    let body = |frames: &[Frame], resize: Option<&str>| {
         let mut body = json!({"frames": files(frames), "state": [0.0], "candidates": [[[0.1, 0.0], [0.1, 0.0]]]});
-        if let Some(fit) = fit {
-            body["fit"] = json!(fit);
+        if let Some(resize) = resize {
+            body["resize"] = json!(resize);
         }
         body
     };
-    let fitted: Vec<Frame> = large_frames()
+    let resized: Vec<Frame> = large_frames()
         .iter()
-        .map(|frame| fit(frame, WIDTH, HEIGHT, Fit::Crop).unwrap())
+        .map(|frame| resize(frame, WIDTH, HEIGHT, Resize::Crop).unwrap())
         .collect();
     let path = "/v1/models/moving/rollouts";
-    let expected = post(&app, path, &body(&fitted, None)).await.json();
+    let expected = post(&app, path, &body(&resized, None)).await.json();
     let answer = post(&app, path, &body(&large_frames(), Some("crop"))).await.json();
     assert!(
         answer["futures"].is_array() && answer["futures"] == expected["futures"],
@@ -84,9 +89,9 @@ async fn a_session_resizes_its_frames_as_asked() {
         message.format = ImageFormat::Png;
         ClientMessage::Frame(message)
     };
-    let with_fit = SessionHandle::open(&app, &json!({"model": "moving", "fit": "letterbox"})).await;
+    let with_resize = SessionHandle::open(&app, &json!({"model": "moving", "resize": "letterbox"})).await;
     let without = SessionHandle::open(&app, &json!({"model": "moving"})).await;
-    let mut resized = Client::connect(server.address, &with_fit.path("/stream"), Codec::Msgpack)
+    let mut resizing = Client::connect(server.address, &with_resize.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
     let mut exact = Client::connect(server.address, &without.path("/stream"), Codec::Json)
@@ -94,18 +99,18 @@ async fn a_session_resizes_its_frames_as_asked() {
         .unwrap();
     for (seq, frame) in large_frames().iter().enumerate() {
         let seq = seq as u64;
-        let fitted = fit(frame, WIDTH, HEIGHT, Fit::Letterbox).unwrap();
+        let resized = resize(frame, WIDTH, HEIGHT, Resize::Letterbox).unwrap();
         let file = codec::encode_png(frame).unwrap();
-        let answer = resized.ask(&frame_message(seq, file)).await;
+        let answer = resizing.ask(&frame_message(seq, file)).await;
         let expected = exact
-            .ask(&frame_message(seq, codec::encode_png(&fitted).unwrap()))
+            .ask(&frame_message(seq, codec::encode_png(&resized).unwrap()))
             .await;
         if seq as usize + 1 == CONTEXT {
             assert_eq!(frames(&answer), frames(&expected));
         }
     }
-    let state: Value = get(&app, &with_fit.path("/state")).await.json();
-    assert_eq!(state["fit"], "letterbox");
+    let state: Value = get(&app, &with_resize.path("/state")).await.json();
+    assert_eq!(state["resize"], "letterbox");
 
     // A configure message changes it for the frames that follow.
     let seq = CONTEXT as u64;
@@ -113,7 +118,7 @@ async fn a_session_resizes_its_frames_as_asked() {
     let refused = exact.ask(&frame_message(seq, file.clone())).await;
     assert_eq!(code(&refused), (ErrorCode::Invalid, seq));
     let configure = ClientMessage::Configure(ConfigureMessage {
-        fit: Some(Fit::Stretch),
+        resize: Some(Resize::Stretch),
         ..ConfigureMessage::default()
     });
     exact.send(&configure).await;
@@ -121,7 +126,7 @@ async fn a_session_resizes_its_frames_as_asked() {
     let ServerMessage::Configured(settings) = exact.receive().await else {
         panic!("no configured")
     };
-    assert_eq!(settings.fit, Some(Fit::Stretch));
+    assert_eq!(settings.resize, Some(Resize::Stretch));
     assert_eq!(frames(&exact.receive().await).len(), 2);
     server.stop().await;
 }
@@ -131,13 +136,13 @@ async fn an_image_too_large_to_resize_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let huge = png(&Frame::new(4096, 2000, vec![0; 4096 * 2000]).unwrap());
-    let body = json!({"frames": vec![huge; CONTEXT], "fit": "crop"});
+    let body = json!({"frames": vec![huge; CONTEXT], "resize": "crop"});
     let detail = post(&app, PREDICT, &body).await.detail(422);
     assert_eq!(
         detail,
         "frames[0] is 4096×2000 px; an image to resize has at most 4194304 pixels"
     );
-    let unknown = post(&app, PREDICT, &json!({"frames": [], "fit": "zoom"}))
+    let unknown = post(&app, PREDICT, &json!({"frames": [], "resize": "zoom"}))
         .await
         .detail(422);
     assert!(unknown.contains("`crop`, `letterbox`, `stretch`"), "{unknown}");
