@@ -6,7 +6,7 @@ use candle_core::{DType, Device, Tensor};
 use criterion::{Criterion, criterion_group};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::{
-    Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, FlowSpec, Loss, Model, ModelSpec,
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, FlowSpec, Loss, ModelSpec, Network,
     Parameters,
 };
 use foreframe_core::types::Seed;
@@ -61,7 +61,7 @@ fn specs() -> [(&'static str, ModelSpec); 2] {
 fn prediction(c: &mut Criterion) {
     for (name, spec) in specs() {
         let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-        let model = Model::detached(spec.clone(), &parameters).unwrap();
+        let model = Network::detached(spec.clone(), &parameters).unwrap();
         for windows in [1, WINDOWS] {
             let frames = values((windows, spec.context, spec.pixels()));
             let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap();
@@ -80,7 +80,7 @@ fn prediction(c: &mut Criterion) {
 fn training(c: &mut Criterion) {
     let spec = ModelSpec::default();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let model = Model::new(spec.clone(), &parameters).unwrap();
+    let model = Network::new(spec.clone(), &parameters).unwrap();
     let (context, horizon, pixels, features) = (spec.context, spec.horizon, spec.pixels(), spec.code_len());
     let (seen, ahead) = (values((WINDOWS, context, pixels)), values((WINDOWS, horizon, pixels)));
     let mut adam = Optimizer::new(OptimizerConfig::default());
@@ -94,7 +94,7 @@ fn training(c: &mut Criterion) {
             update(&Loss::Mse.between(&predicted, &ahead).unwrap())
         });
     });
-    let frozen = Model::with_frozen(spec, &parameters, &["frame_"]).unwrap();
+    let frozen = Network::with_frozen(spec, &parameters, &["frame_"]).unwrap();
     let (seen, ahead) = (
         values((WINDOWS, context, features)),
         values((WINDOWS, horizon, features)),

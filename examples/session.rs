@@ -39,7 +39,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         let prediction = session.step(frame, Some(&recording.states[i]), Some(&plan))?;
         predicted = prediction.and_then(|rollout| rollout.frames.into_iter().next());
     }
-    println!("the session holds {} frames of context", session.snapshot().features.len());
+    println!(
+        "the session holds {} frames of context",
+        session.snapshot().features.len()
+    );
     Ok(())
 }
 

@@ -51,9 +51,9 @@ pub use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,
 };
 #[doc(inline)]
-pub use foreframe_core::registry::{DatasetStamp, LoadedModel, Manifest, ProgramStamp, RegistryError, load, load_as};
+pub use foreframe_core::registry::{DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load, load_as};
 #[doc(inline)]
-pub use foreframe_core::serving::session::{SnapshotError, SessionSnapshot};
+pub use foreframe_core::serving::session::{SessionSnapshot, SnapshotError};
 #[doc(inline)]
 pub use foreframe_core::serving::{
     InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError, Session, Timing,
@@ -67,11 +67,11 @@ pub mod images {
     #[doc(inline)]
     pub use foreframe_core::frame::codec::{decode, encode_gif, encode_png};
     #[doc(inline)]
-    pub use foreframe_core::frame::resize::{Resize, ResizeError, resize};
-    #[doc(inline)]
     pub use foreframe_core::frame::preprocess::Preprocess;
     #[doc(inline)]
     pub use foreframe_core::frame::quality::{mse, psnr_db, ssim};
+    #[doc(inline)]
+    pub use foreframe_core::frame::resize::{Resize, ResizeError, resize};
     #[doc(inline)]
     pub use foreframe_core::frame::warp::CameraModel;
 }

@@ -10,7 +10,7 @@ use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
-use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::registry::{self, Model};
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_jobs::jobs::spec::MAX_RESAMPLES;
@@ -98,7 +98,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         .twin
         .iter()
         .map(|twin| Ok(workspace.load_model(twin)?.1))
-        .collect::<Result<Vec<LoadedModel>, CliError>>()?;
+        .collect::<Result<Vec<Model>, CliError>>()?;
     let out = args
         .out
         .clone()

@@ -8,7 +8,7 @@ use super::error::CliError;
 use super::settings::open_store;
 use crate::config::Config;
 use crate::server::ServerConfig;
-use foreframe_core::registry::{self, LoadedModel, RegistryError, StoredWeights};
+use foreframe_core::registry::{self, Model, RegistryError, StoredWeights};
 use foreframe_data::dataset::{self, Dataset};
 use foreframe_jobs::jobs;
 use foreframe_jobs::versions::{VersionError, Versions};
@@ -70,7 +70,7 @@ impl Workspace {
     }
 
     /// Loads a model by its directory, its name or NAME@VERSION. A name alone is the version that a server would serve.
-    pub(super) fn load_model(&self, model: &str) -> Result<(PathBuf, LoadedModel), CliError> {
+    pub(super) fn load_model(&self, model: &str) -> Result<(PathBuf, Model), CliError> {
         if let Some(dir) = registry::directory_of(model)? {
             let loaded = registry::load(&dir)?;
             return Ok((dir, loaded));
@@ -95,7 +95,7 @@ impl Workspace {
         })
     }
 
-    fn load_shipped(&self, name: &str, version: Option<u32>) -> Result<(PathBuf, LoadedModel), CliError> {
+    fn load_shipped(&self, name: &str, version: Option<u32>) -> Result<(PathBuf, Model), CliError> {
         let dir = registry::find(&self.server().models_dir, name)?;
         let loaded = registry::load_as(&dir, name)?;
         let found = loaded.manifest.version;
@@ -147,7 +147,7 @@ impl Workspace {
 }
 
 /// The scenario that the model was trained on: the default name of its data set.
-pub(super) fn trained_on(loaded: &LoadedModel) -> Result<PathBuf, CliError> {
+pub(super) fn trained_on(loaded: &Model) -> Result<PathBuf, CliError> {
     let manifest = &loaded.manifest;
     manifest.dataset.scenario.as_ref().map(PathBuf::from).ok_or_else(|| {
         CliError::Usage(format!(

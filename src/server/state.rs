@@ -20,7 +20,7 @@ use super::http::tls::ServerTls;
 use super::render_cache::RenderCache;
 use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::{Predictor, ServingError};
 use foreframe_jobs::jobs::child;
 use foreframe_jobs::jobs::pipeline::Pipeline;
@@ -112,14 +112,14 @@ impl App {
 
     /// Starts the threads that predict with these models and that run jobs. To be called within a tokio runtime.
     /// Errors: `Config`, `Serving`, `Jobs`.
-    pub fn start(config: ServerConfig, models: Vec<LoadedModel>, store: Store) -> Result<Self, ServerError> {
+    pub fn start(config: ServerConfig, models: Vec<Model>, store: Store) -> Result<Self, ServerError> {
         let versions = Versions::new(store.clone(), &config.models_dir);
         Self::start_with(config, models, store, versions)
     }
 
     fn start_with(
         config: ServerConfig,
-        models: Vec<LoadedModel>,
+        models: Vec<Model>,
         store: Store,
         versions: Versions,
     ) -> Result<Self, ServerError> {

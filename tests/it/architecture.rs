@@ -77,10 +77,10 @@ fn a_circle_is_found() {
     );
     let found = circles_with(
         "crates/core/src/types.rs",
-        "#[cfg(test)] mod more { use crate::nn::Model; }",
+        "#[cfg(test)] mod more { use crate::nn::Network; }",
     );
     assert!(
-        found.contains(&"foreframe_core/types uses foreframe_core/nn/model".to_owned()),
+        found.contains(&"foreframe_core/types uses foreframe_core/nn/network".to_owned()),
         "{found:?}"
     );
 }

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use foreframe::server::ServerConfig;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::registry::{self, Model};
 use foreframe_core::serving::Session;
 use foreframe_core::serving::{self, PredictionInput};
 use foreframe_core::types::{Action, RobotState};
@@ -28,7 +28,7 @@ fn spec() -> ModelSpec {
 }
 
 /// An untrained model below `dir/models`, calibrated on the squares.
-fn calibrated(dir: &std::path::Path, dataset: &Dataset) -> LoadedModel {
+fn calibrated(dir: &std::path::Path, dataset: &Dataset) -> Model {
     let model_dir = dir.join("models/squares");
     fixtures::model(&model_dir, "squares", spec(), fixtures::stamp(dataset));
     evaluation::calibrate_trained(&model_dir, dataset, &false.into()).unwrap();

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::atomic::AtomicBool;
 
 use foreframe_core::nn::{ChannelScale, Conditioning, ModelSpec};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::{CollectConfig, Dataset, Split, Splits, collect};
 use foreframe_sim::{Scenario, WorldConfig};
@@ -28,7 +28,7 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
 }
 
 /// An untrained model whose manifest names this data set as its training data.
-fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> LoadedModel {
+fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> Model {
     fixtures::model(
         tempfile::tempdir().unwrap().path(),
         name,
@@ -47,15 +47,11 @@ fn config() -> EvaluateConfig<'static> {
     }
 }
 
-fn evaluate(
-    loaded: &LoadedModel,
-    dataset: &Dataset,
-    config: &EvaluateConfig,
-) -> Result<EvaluationReport, EvaluationError> {
+fn evaluate(loaded: &Model, dataset: &Dataset, config: &EvaluateConfig) -> Result<EvaluationReport, EvaluationError> {
     evaluation::run(loaded, dataset, config, &|_| {})
 }
 
-fn refusal(loaded: &LoadedModel, dataset: &Dataset, config: &EvaluateConfig) -> String {
+fn refusal(loaded: &Model, dataset: &Dataset, config: &EvaluateConfig) -> String {
     evaluate(loaded, dataset, config).unwrap_err().to_string()
 }
 

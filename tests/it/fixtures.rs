@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use foreframe_core::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec, Parameters};
-use foreframe_core::registry::{self, DatasetStamp, LoadedModel, Manifest, ProgramStamp};
+use foreframe_core::registry::{self, DatasetStamp, Manifest, Model, ProgramStamp};
 use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 
@@ -83,7 +83,7 @@ pub(crate) fn stamp(dataset: &Dataset) -> DatasetStamp {
 }
 
 /// A model with random weights, published in `model_dir` and loaded from there.
-pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: DatasetStamp) -> LoadedModel {
+pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: DatasetStamp) -> Model {
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let manifest = Manifest {
         name: name.to_owned(),

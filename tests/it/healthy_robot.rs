@@ -8,7 +8,7 @@ use foreframe::server::protocol::{Codec, ServerMessage};
 use foreframe::server::{App, ServerConfig};
 use foreframe_core::frame::Frame;
 use foreframe_core::nn::Conditioning;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::{self, PredictionInput};
 use foreframe_core::types::{Action, RobotState};
 use serde_json::json;
@@ -24,7 +24,7 @@ pub(crate) struct ServerWithRobot {
     pub(crate) dir: tempfile::TempDir,
     pub(crate) app: App,
     pub(crate) server: InProcessServer,
-    model: LoadedModel,
+    model: Model,
     robot: Client,
 }
 

@@ -3,7 +3,7 @@
 use candle_core::{Device, Tensor};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::{
-    Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, FlowLayers, FlowSpec, Model, ModelSpec,
+    Architecture, ChannelScale, Conditioning, ConditioningTensors, DenseSpec, FlowLayers, FlowSpec, ModelSpec, Network,
     NnError, Parameters,
 };
 use foreframe_core::types::Seed;
@@ -96,7 +96,7 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
             let noise = (values(var.dims(), index as f32) * 0.05).unwrap();
             var.set(&(var.as_detached_tensor() + noise).unwrap()).unwrap();
         }
-        let model = Model::new(spec.clone(), &parameters).unwrap();
+        let model = Network::new(spec.clone(), &parameters).unwrap();
         let predicted = model
             .predict_flow(&frames(&spec, 2), &condition(&spec, 2), spec.horizon)
             .unwrap()
@@ -122,7 +122,7 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
 #[test]
 fn the_first_frames_alone_are_those_of_the_whole_horizon() {
     for spec in kinds() {
-        let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+        let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
         let first = |steps: usize| {
             let predicted = model.predict_flow(&frames(&spec, 2), &condition(&spec, 2), steps);
             predicted.unwrap().unwrap().frames
@@ -136,7 +136,7 @@ fn the_first_frames_alone_are_those_of_the_whole_horizon() {
 #[test]
 fn a_future_does_not_depend_on_those_beside_it() {
     for spec in kinds() {
-        let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+        let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
         let windows: Vec<u32> = (0..40).map(|row| row % 2).collect();
         let (seen, told) = (frames(&spec, 2), condition(&spec, windows.len()));
         let together = model.predict_futures(&seen, &windows, &told).unwrap();
@@ -156,7 +156,7 @@ fn a_future_does_not_depend_on_those_beside_it() {
 #[test]
 fn an_untrained_network_turns_the_last_frame_with_the_camera() {
     let spec = small(Conditioning::StateAction, Some(CAMERA));
-    let model = Model::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let mut told = condition(&spec, 1);
     told.actions = Some(Tensor::new(&[[[0.0f32, 0.5], [0.0, 0.5]]], &Device::Cpu).unwrap());
     told.state = Some(Tensor::new(&[[0.1f32, 0.1, 1.0, 0.0, 0.5]], &Device::Cpu).unwrap());
@@ -199,7 +199,7 @@ fn the_recurrent_form_reads_every_frame_of_its_context() {
         let noise = (values(var.dims(), index as f32) * 0.1).unwrap();
         var.set(&(var.as_detached_tensor() + noise).unwrap()).unwrap();
     }
-    let model = Model::detached(spec.clone(), &parameters).unwrap();
+    let model = Network::detached(spec.clone(), &parameters).unwrap();
     let predict = |frames: &Tensor| model.predict_frames(frames, &condition(&spec, 1)).unwrap();
     let seen = frames(&spec, 1);
     for frame in 0..spec.context {

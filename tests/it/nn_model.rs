@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Device, Tensor};
 use foreframe_core::nn::{
-    Conditioning, ConditioningTensors, Feedback, Loss, Model, ModelSpec, Parameters, Reconstruction,
+    Conditioning, ConditioningTensors, Feedback, Loss, ModelSpec, Network, Parameters, Reconstruction,
 };
 use foreframe_core::types::Seed;
 
@@ -10,7 +10,7 @@ use crate::nn_fixtures::{all_kinds, bits, condition, largest_difference, tiny, v
 use crate::nn_reference::{Reference, in_f64};
 
 /// A loss that depends on every tensor of the model.
-fn whole_loss(model: &Model, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
+fn whole_loss(model: &Network, frames: &Tensor, condition: &ConditioningTensors, truth: Option<&Tensor>) -> Tensor {
     let spec = model.spec();
     let batch = frames.dim(0).unwrap();
     let flat = frames.flatten(0, 1).unwrap();
@@ -52,7 +52,7 @@ fn training_agrees_with_the_reference() {
         let truth = values(&[3, spec.horizon, spec.code_len()], 0.7);
         let truth = with_truth.then_some(&truth);
         let condition = condition(&spec, 3);
-        let model = Model::new(spec.clone(), &parameters).unwrap();
+        let model = Network::new(spec.clone(), &parameters).unwrap();
         let loss = whole_loss(&model, &frames, &condition, truth);
         let exact = reference_loss(&reference, &frames, &condition, truth);
         let (value, exact_value) = (loss.to_scalar::<f32>().unwrap(), exact.to_scalar::<f64>().unwrap());
@@ -73,7 +73,7 @@ fn prediction_agrees_with_the_reference() {
         let parameters = Parameters::initialize(&spec, Seed(6)).unwrap();
         let frames = values(&[2, spec.context, spec.pixels()], 0.2);
         let condition = condition(&spec, 2);
-        let model = Model::detached(spec.clone(), &parameters).unwrap();
+        let model = Network::detached(spec.clone(), &parameters).unwrap();
         let predicted = model.predict_frames(&frames, &condition).unwrap();
         let [exact, _] = Reference::new(&spec, &parameters)
             .frames(&frames, &condition, None)
@@ -93,7 +93,7 @@ fn results_do_not_depend_on_other_threads() {
     let frames = values(&[8, spec.context, spec.pixels()], 0.0);
     let run = || {
         let parameters = Parameters::initialize(&spec, Seed(11)).unwrap();
-        let model = Model::new(spec.clone(), &parameters).unwrap();
+        let model = Network::new(spec.clone(), &parameters).unwrap();
         let loss = whole_loss(&model, &frames, &ConditioningTensors::none(), None);
         let gradients = loss.backward().unwrap();
         let of = |(_, var): (&str, &candle_core::Var)| bits(gradients.get(var.as_tensor()).unwrap());
@@ -113,7 +113,7 @@ fn results_do_not_depend_on_other_threads() {
 #[test]
 fn a_batched_window_is_predicted_as_a_single_one() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
-    let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let model = Network::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let (frames, condition) = (values(&[5, spec.context, spec.pixels()], 0.0), condition(&spec, 5));
     let together = model.predict_frames(&frames, &condition).unwrap();
     for window in 0..5 {
@@ -130,7 +130,7 @@ fn a_batched_window_is_predicted_as_a_single_one() {
 #[test]
 fn an_unconditioned_model_ignores_actions() {
     let spec = tiny(Conditioning::None, Reconstruction::Sequence);
-    let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let model = Network::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
     let without = model.predict_frames(&frames, &ConditioningTensors::none()).unwrap();
     let with = model.predict_frames(&frames, &condition(&spec, 2)).unwrap();
@@ -140,7 +140,7 @@ fn an_unconditioned_model_ignores_actions() {
 #[test]
 fn an_action_changes_only_later_frames() {
     let spec = tiny(Conditioning::Action, Reconstruction::Sequence);
-    let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let model = Network::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[1, spec.context, spec.pixels()], 0.0);
     let predicted = |third: f32| {
         let mut actions = vec![0.1f32; spec.horizon * 2];
@@ -166,7 +166,7 @@ fn an_action_changes_only_later_frames() {
 #[test]
 fn a_missing_or_misshaped_input_names_the_expected_shape() {
     let spec = tiny(Conditioning::StateAction, Reconstruction::Sequence);
-    let model = Model::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let model = Network::new(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
     let frames = values(&[2, spec.context, spec.pixels()], 0.0);
     let error = |frames: &Tensor, condition: &ConditioningTensors| {
         model.predict_frames(frames, condition).unwrap_err().to_string()

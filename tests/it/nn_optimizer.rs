@@ -1,7 +1,9 @@
 //! Adam: the closed form, resuming, clipping, and errors.
 
 use candle_core::{Device, Tensor};
-use foreframe_core::nn::{Architecture, ConditioningTensors, DenseSpec, Feedback, Loss, Model, ModelSpec, Parameters};
+use foreframe_core::nn::{
+    Architecture, ConditioningTensors, DenseSpec, Feedback, Loss, ModelSpec, Network, Parameters,
+};
 use foreframe_core::types::Seed;
 use foreframe_train::training::optimizer::{Gradients, Optimizer, OptimizerConfig, OptimizerError};
 
@@ -59,7 +61,7 @@ fn all_bits(parameters: &Parameters) -> Vec<u32> {
 
 fn train(parameters: &Parameters, adam: &mut Optimizer, steps: std::ops::Range<usize>) {
     let spec = tiny();
-    let model = Model::new(spec.clone(), parameters).unwrap();
+    let model = Network::new(spec.clone(), parameters).unwrap();
     for step in steps {
         let seen = values(&[2, spec.context, spec.code_len()], step as f32);
         let ahead = values(&[2, spec.horizon, spec.code_len()], step as f32 + 0.5);
@@ -172,7 +174,7 @@ fn frozen_tensors_do_not_change() {
 fn half_batch_gradients_average_to_the_batch_gradient() {
     let spec = tiny();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let model = Model::new(spec.clone(), &parameters).unwrap();
+    let model = Network::new(spec.clone(), &parameters).unwrap();
     let (seen, ahead) = (values(&[4, 2, 3], 0.0), values(&[4, 2, 3], 0.5));
     let of = |from: usize, count: usize| {
         let seen = seen.narrow(0, from, count).unwrap();

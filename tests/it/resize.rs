@@ -1,10 +1,5 @@
 //! Frames of another size: resized where the client asks for it, else refused.
 
-<<<<<<< HEAD:tests/it/fit.rs
-=======
-use foreframe_core::frame::resize::{Resize, resize};
-use foreframe_core::frame::{Frame, codec};
->>>>>>> words:tests/it/resize.rs
 use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, ErrorCode, ServerMessage};
 use foreframe::server::{ImageBytes, ImageFormat, ServerConfig};
 use foreframe_core::frame::resize::{Resize, resize};

@@ -11,7 +11,7 @@ use base64::engine::general_purpose::STANDARD;
 use foreframe::server::{self, App, ServerConfig};
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec};
-use foreframe_core::registry::{DatasetStamp, LoadedModel};
+use foreframe_core::registry::{DatasetStamp, Model};
 use foreframe_core::types::Seed;
 use foreframe_jobs::store::{Store, StoreConfig};
 use serde_json::Value;
@@ -66,7 +66,7 @@ pub(crate) fn slow_spec() -> ModelSpec {
 }
 
 /// Publishes a model with random weights below `dir` and loads it.
-pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> LoadedModel {
+pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> Model {
     let trained_on = DatasetStamp {
         name: "none".to_owned(),
         content_hash: String::new(),
@@ -87,7 +87,7 @@ pub(crate) fn app(dir: &Path, config: ServerConfig) -> App {
 }
 
 /// Starts the service with a store in the data directory.
-pub(crate) fn start(config: ServerConfig, models: Vec<LoadedModel>) -> App {
+pub(crate) fn start(config: ServerConfig, models: Vec<Model>) -> App {
     let store = store(&config.data_dir);
     App::start(config, models, store).unwrap()
 }

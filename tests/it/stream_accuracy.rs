@@ -6,7 +6,7 @@ use candle_core::{Device, Tensor};
 use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMessage};
 use foreframe::server::{App, ImageBytes, ImageFormat, ServerConfig};
 use foreframe_core::frame::{Frame, codec};
-use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::registry::{self, Model};
 use foreframe_core::serving::{self, PredictionInput};
 use foreframe_core::types::{Action, RobotState, Seed};
 use rand::Rng as _;
@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use crate::client::{Client, SessionHandle};
 use crate::service::{self, InProcessServer, get, run, with_data};
 
-fn shipped(name: &str) -> LoadedModel {
+fn shipped(name: &str) -> Model {
     registry::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("models").join(name)).unwrap()
 }
 
@@ -41,7 +41,7 @@ impl Recording {
     }
 
     /// Random frames, actions and states, different for each robot.
-    fn noise(model: &LoadedModel, robot: u64, steps: usize) -> Self {
+    fn noise(model: &Model, robot: u64, steps: usize) -> Self {
         let spec = &model.manifest.spec;
         let mut rng = Seed(11).derive("robot", robot).rng();
         let (width, height) = (spec.frame_width_px, spec.frame_height_px);
@@ -76,7 +76,7 @@ impl Recording {
     }
 
     /// The prediction after frame `seq`, computed without a session.
-    fn stateless(&self, model: &LoadedModel, seq: usize) -> Vec<Frame> {
+    fn stateless(&self, model: &Model, seq: usize) -> Vec<Frame> {
         let input = PredictionInput {
             frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
             actions: Action::try_from(self.actions[seq].clone()).into_iter().collect(),
@@ -88,7 +88,7 @@ impl Recording {
     }
 
     /// Checks a prediction against the stateless one. They differ by at most 1e-5, so by at most one intensity after rounding.
-    fn check(&self, model: &LoadedModel, seq: usize, frames: &[ImageBytes]) {
+    fn check(&self, model: &Model, seq: usize, frames: &[ImageBytes]) {
         let expected = self.stateless(model, seq);
         assert_eq!(frames.len(), expected.len());
         for (found, expected) in frames.iter().zip(&expected) {
@@ -99,7 +99,7 @@ impl Recording {
     }
 
     /// Checks that an exported state has the features of the last frames, within 1e-5.
-    fn check_state(&self, model: &LoadedModel, state: &Value) {
+    fn check_state(&self, model: &Model, state: &Value) {
         let spec = &model.manifest.spec;
         let features: Vec<Vec<f32>> = serde_json::from_value(state["snapshot"]["features"].clone()).unwrap();
         assert_eq!(state["snapshot"]["next_seq"], self.frames.len());
@@ -114,7 +114,7 @@ impl Recording {
     }
 }
 
-async fn start(dir: &Path, models: &[LoadedModel]) -> (App, InProcessServer) {
+async fn start(dir: &Path, models: &[Model]) -> (App, InProcessServer) {
     let app = service::start(with_data(dir, ServerConfig::default()), models.to_vec());
     let server = run(app.clone()).await;
     (app, server)
@@ -184,7 +184,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
 
 /// A robot that sends frames at random times, some ahead of their answers. Every prediction is checked against the
 /// stateless one.
-async fn drive(app: &App, address: std::net::SocketAddr, model: &LoadedModel, robot: u64, steps: usize) {
+async fn drive(app: &App, address: std::net::SocketAddr, model: &Model, robot: u64, steps: usize) {
     let recording = Recording::noise(model, robot, steps);
     let session = SessionHandle::open(app, &json!({"model": "moving"})).await;
     let mut client = Client::connect(address, &session.path("/stream"), Codec::Msgpack)

@@ -6,12 +6,12 @@
 //!
 //! There are two architectures: the paper's in [`dense`] (a codec of single frames, a peephole LSTM that encodes the context,
 //! one LSTM decoder that predicts the next frames and one that reconstructs the context), and [`flow`], which moves the
-//! pixels of the last frame. Neither uses the other. [`model`] is the type that the rest of the program uses for both.
+//! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `ops`
 //! (operations with their gradients) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and meaning of a model) → `tensor_source`,
 //! `conditioning` (actions and state) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
-//! [`model`]. [`costs`] compares the model's cost with other networks.
+//! [`network`]. [`costs`] compares the model's cost with other networks.
 
 mod conditioning;
 pub mod costs;
@@ -22,8 +22,8 @@ pub mod flow;
 pub mod gradient_check;
 mod init;
 pub mod loss;
-pub mod model;
 mod model_size;
+pub mod network;
 mod ops;
 mod options;
 pub mod parameters;
@@ -37,7 +37,7 @@ pub use dense::Feedback;
 pub use error::{NnError, TensorError};
 pub use flow::FlowPrediction;
 pub use loss::Loss;
-pub use model::Model;
+pub use network::Network;
 pub use options::{ArchitectureKind, Conditioning, PredictorOutput, Reconstruction, UnknownName};
 pub use parameters::Parameters;
 pub use spec::{Architecture, ChannelScale, DenseSpec, FlowLayers, FlowSpec, ModelSpec};

@@ -15,7 +15,7 @@ pub use self::calibration::Calibration;
 pub use self::embedded::{EmbeddedModel, embed};
 pub use self::error::RegistryError;
 pub use self::layout::{MANIFEST_FILE, WEIGHTS_FILE, is_valid_name};
-pub use self::loader::{LoadedModel, StoredWeights, load, load_as, load_weights};
+pub use self::loader::{Model, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;

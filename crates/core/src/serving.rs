@@ -32,11 +32,11 @@ pub use task::{Features, Task, check_size};
 use std::sync::Arc;
 
 #[cfg(test)]
-use crate::registry::LoadedModel;
+use crate::registry::Model;
 
 /// A small model with random weights.
 #[cfg(test)]
-pub fn test_model() -> LoadedModel {
+pub fn test_model() -> Model {
     use crate::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec};
     let channel = |name: &str| ChannelScale {
         name: name.to_owned(),
@@ -64,7 +64,7 @@ pub fn test_model() -> LoadedModel {
 
 /// As [`test_model`], with the flow network, on frames of 8×4 px.
 #[cfg(test)]
-pub fn test_flow_model() -> LoadedModel {
+pub fn test_flow_model() -> Model {
     use crate::nn::{Architecture, FlowLayers, FlowSpec, ModelSpec};
     loaded(ModelSpec {
         architecture: Architecture::Flow(FlowSpec {
@@ -85,8 +85,8 @@ pub fn test_flow_model() -> LoadedModel {
 
 /// A model of that specification with fresh weights.
 #[cfg(test)]
-fn loaded(spec: crate::nn::ModelSpec) -> LoadedModel {
-    use crate::nn::{Model, Parameters};
+fn loaded(spec: crate::nn::ModelSpec) -> Model {
+    use crate::nn::{Network, Parameters};
     let parameters = Parameters::initialize(&spec, crate::types::Seed(1)).unwrap();
     let manifest = serde_json::json!({
         "name": "test", "version": 1, "spec": spec, "weights_sha256": "00",
@@ -94,8 +94,8 @@ fn loaded(spec: crate::nn::ModelSpec) -> LoadedModel {
         "seed": 1, "command": "", "training": {}, "metrics": {}, "parameters": 1, "multiply_adds_per_frame": 1,
         "program": {"version": "0", "git_commit": null},
     });
-    LoadedModel {
+    Model {
         manifest: Arc::new(serde_json::from_value(manifest).unwrap()),
-        network: Model::detached(spec, &parameters).unwrap(),
+        network: Network::detached(spec, &parameters).unwrap(),
     }
 }

@@ -16,7 +16,7 @@ use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
 use foreframe_core::files::{is_transient, write_atomically};
 use foreframe_core::metric_names;
-use foreframe_core::registry::{self, LoadedModel, Manifest, RegistryError};
+use foreframe_core::registry::{self, Manifest, Model, RegistryError};
 use foreframe_core::serving::{Predictor, ServingError};
 
 /// Why a version could not be loaded, published, activated or deleted.
@@ -182,7 +182,7 @@ impl Versions {
 
     /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions
     /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
-    pub async fn load_serving(&self) -> Result<Vec<LoadedModel>, VersionError> {
+    pub async fn load_serving(&self) -> Result<Vec<Model>, VersionError> {
         self.sweep().await?;
         let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
         for path in registry::misnamed(&self.shipped_dir)? {
@@ -212,14 +212,14 @@ impl Versions {
     }
 
     /// Loads the active version, else the shipped one, else the newest. Errors: `Unknown`, `Refused`, `Store`.
-    pub async fn load_active(&self, model: &str) -> Result<LoadedModel, VersionError> {
+    pub async fn load_active(&self, model: &str) -> Result<Model, VersionError> {
         let version = self.active(model).await?.unwrap_or_default();
         self.load(model, version).await
     }
 
     /// Loads a version after checking its hash and shapes. Fetches it into the data directory if necessary.
     /// Errors: `Unknown`, `Refused`, `Store`.
-    pub async fn load(&self, model: &str, version: u32) -> Result<LoadedModel, VersionError> {
+    pub async fn load(&self, model: &str, version: u32) -> Result<Model, VersionError> {
         let dir = self.directory(model, version).await?;
         let refused = |reason: String| VersionError::Refused {
             model: model.to_owned(),

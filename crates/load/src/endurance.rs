@@ -16,7 +16,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::registry::{self, Model};
 use futures_util::future::join_all;
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, sleep_until, timeout};
@@ -179,7 +179,7 @@ struct LoadResults {
 }
 
 impl Load {
-    fn start(args: &EnduranceArgs, run: &Arc<EnduranceRun>, model: &LoadedModel) -> Self {
+    fn start(args: &EnduranceArgs, run: &Arc<EnduranceRun>, model: &Model) -> Self {
         let recordings: Vec<RobotRecording> = (0..args.robots)
             .map(|robot| RobotRecording::new(robot, &run.workload, model))
             .collect();

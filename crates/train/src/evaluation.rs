@@ -43,7 +43,7 @@ use self::method::Method;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::uncertainty::NoveltyScores;
 use self::windows::{evenly, window_shape};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
@@ -52,7 +52,7 @@ use foreframe_data::dataset::sampler::{Split, Splits};
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Errors: model and data set that
 /// don't fit together, settings out of range, nothing held out, `TrainedOn`, `Cancelled`, those of the network.
 pub fn run(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     config: &EvaluateConfig,
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
@@ -108,7 +108,7 @@ pub fn run(
 /// The baselines for this data set. Where all of it is for testing, they are fitted to its own frames, and there is no
 /// training window to find. Errors: those of [`Splits::windows`].
 fn fitted_baselines(
-    loaded: &LoadedModel,
+    loaded: &Model,
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
 ) -> Result<Baselines, EvaluationError> {
@@ -129,7 +129,7 @@ fn fitted_baselines(
 
 /// How well novelty tells the other data sets from the windows with the novelty `own`.
 fn compare_novelty(
-    loaded: &LoadedModel,
+    loaded: &Model,
     config: &EvaluateConfig,
     own: &[f64],
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
@@ -150,7 +150,7 @@ fn compare_novelty(
 
 /// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
-    loaded: &LoadedModel,
+    loaded: &Model,
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
     baselines: &Baselines,

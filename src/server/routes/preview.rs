@@ -15,7 +15,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::nn::{Conditioning, ModelSpec};
-use foreframe_core::registry::{LoadedModel, Manifest};
+use foreframe_core::registry::{Manifest, Model};
 use foreframe_core::serving::{PredictionInput, ServingError};
 use foreframe_core::types::{Action, RobotState, Seed};
 use foreframe_sim::{Scenario, SimError, World, WorldConfig};
@@ -54,7 +54,7 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
     Ok(([(header::CONTENT_TYPE, "image/png")], png).into_response())
 }
 
-async fn make(app: &App, model: Arc<LoadedModel>, key: String) -> Result<Bytes, ApiError> {
+async fn make(app: &App, model: Arc<Model>, key: String) -> Result<Bytes, ApiError> {
     let manifest = Arc::clone(&model.manifest);
     let simulated = app.render_cache().threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;

@@ -12,7 +12,7 @@ use crate::server::blocking::BlockingWork;
 use crate::server::http::keys::Caller;
 use crate::server::images::ImageFormat;
 use crate::server::token::{Token, TokenHash};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::{Predictor, SessionState};
 
 /// Who may step a session.
@@ -30,7 +30,7 @@ pub(in crate::server) struct Session {
     pub(super) maker: Caller,
     /// The session's number in the predictor.
     key: u64,
-    model: Arc<LoadedModel>,
+    model: Arc<Model>,
     inner: Mutex<SessionInner>,
     owner: watch::Sender<Owner>,
 }
@@ -47,7 +47,7 @@ struct SessionInner {
 impl Session {
     /// A session and its token's text. The session keeps only the token's hash. Errors: the system gave no random bytes.
     pub(in crate::server) fn new(
-        model: Arc<LoadedModel>,
+        model: Arc<Model>,
         state: SessionState,
         settings: SessionSettings,
         maker: Caller,
@@ -79,7 +79,7 @@ impl Session {
         self.key
     }
 
-    pub(in crate::server) fn model(&self) -> &Arc<LoadedModel> {
+    pub(in crate::server) fn model(&self) -> &Arc<Model> {
         &self.model
     }
 

@@ -10,7 +10,7 @@ mod lstm;
 mod lstm_cell;
 mod recurrence;
 
-pub(super) use autoencoder::DenseModel;
+pub(super) use autoencoder::DenseNetwork;
 pub use autoencoder::Feedback;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub use lstm::unroll;

@@ -31,5 +31,5 @@ mod wheel_dynamics;
 
 pub(super) use beyond_horizon::predict_beyond_horizon;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
-pub(super) use network::FlowModel;
+pub(super) use network::FlowNetwork;
 pub use network::FlowPrediction;

@@ -13,18 +13,18 @@ use super::error::RegistryError;
 use super::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 use super::manifest::{self, Manifest};
 use crate::files::sha256_hex;
-use crate::nn::{Model, NnError, Parameters};
+use crate::nn::{Network, NnError, Parameters};
 
 /// The largest weights file that is accepted, in bytes.
 const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
 
 /// A loaded model with its manifest.
 #[derive(Clone)]
-pub struct LoadedModel {
+pub struct Model {
     /// The model's description.
     pub manifest: Arc<Manifest>,
     /// The network, ready to predict.
-    pub network: Model,
+    pub network: Network,
 }
 
 /// A model's verified weights, from which a training can start.
@@ -38,13 +38,13 @@ pub struct StoredWeights {
 
 /// Reads, verifies and builds the model in a directory. Errors: `Io`, `Manifest`, `ManifestValue`, `Hash`, `Safetensors`,
 /// `Weights`.
-pub fn load(model_dir: &Path) -> Result<LoadedModel, RegistryError> {
+pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
-    let network = Model::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
+    let network = Network::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
         path: model_dir.join(WEIGHTS_FILE),
         source,
     })?;
-    Ok(LoadedModel {
+    Ok(Model {
         manifest: Arc::new(manifest),
         network,
     })
@@ -101,13 +101,13 @@ fn read_weights(path: &Path) -> Result<Vec<u8>, RegistryError> {
 }
 
 /// As [`load`], under another name than the manifest's. Errors: as [`load`].
-pub fn load_as(model_dir: &Path, name: &str) -> Result<LoadedModel, RegistryError> {
+pub fn load_as(model_dir: &Path, name: &str) -> Result<Model, RegistryError> {
     let loaded = load(model_dir)?;
     let manifest = Manifest {
         name: name.to_owned(),
         ..(*loaded.manifest).clone()
     };
-    Ok(LoadedModel {
+    Ok(Model {
         manifest: Arc::new(manifest),
         network: loaded.network,
     })

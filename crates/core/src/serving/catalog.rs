@@ -5,20 +5,20 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::error::ServingError;
-use crate::registry::LoadedModel;
+use crate::registry::Model;
 
 /// Number of panics in a row after which the predictor is not ready.
 const MAX_PANICS: u32 = 3;
 
 pub(super) struct Catalog {
-    models: RwLock<BTreeMap<String, Arc<LoadedModel>>>,
+    models: RwLock<BTreeMap<String, Arc<Model>>>,
     ready: AtomicBool,
     /// Panics of the inference thread since its last batch.
     panics: AtomicU32,
 }
 
 impl Catalog {
-    pub(super) fn new(models: Vec<LoadedModel>) -> Self {
+    pub(super) fn new(models: Vec<Model>) -> Self {
         let named = models
             .into_iter()
             .map(|model| (model.manifest.name.clone(), Arc::new(model)));
@@ -29,17 +29,17 @@ impl Catalog {
         }
     }
 
-    pub(super) fn insert(&self, model: LoadedModel) {
+    pub(super) fn insert(&self, model: Model) {
         let mut models = self.models.write().unwrap_or_else(PoisonError::into_inner);
         models.insert(model.manifest.name.clone(), Arc::new(model));
     }
 
-    pub(super) fn all(&self) -> Vec<Arc<LoadedModel>> {
+    pub(super) fn all(&self) -> Vec<Arc<Model>> {
         let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
         models.values().cloned().collect()
     }
 
-    pub(super) fn find(&self, name: &str) -> Result<Arc<LoadedModel>, ServingError> {
+    pub(super) fn find(&self, name: &str) -> Result<Arc<Model>, ServingError> {
         let models = self.models.read().unwrap_or_else(PoisonError::into_inner);
         models.get(name).cloned().ok_or_else(|| ServingError::UnknownModel {
             name: name.to_owned(),

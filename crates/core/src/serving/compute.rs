@@ -12,7 +12,7 @@ use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec};
-use crate::registry::LoadedModel;
+use crate::registry::Model;
 use crate::registry::calibration::{ContextStatistics, PredictedFuture};
 use crate::types::{Action, RobotState};
 
@@ -21,7 +21,7 @@ const DECODED_FRAMES: usize = 1024;
 
 /// Computes the tasks as one batch, without warnings and timing: one matrix product encodes all new frames, and one predicts all rollouts.
 /// Errors: `Model` if a task does not fit the model, `Tensor`, `Frame`.
-pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Prediction>, ServingError> {
+pub(super) fn run(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, ServingError> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
     let mut predictions: Vec<Prediction> = tasks
         .iter()
@@ -63,7 +63,7 @@ pub(super) fn run(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Predictio
 }
 
 /// The features of all the tasks' frames, in order.
-fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
+fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
     let spec = loaded.network.spec();
     let frames: Vec<&Frame> = tasks.iter().flat_map(|task| &task.frames).collect();
     if frames.is_empty() {
@@ -87,7 +87,7 @@ fn encode(loaded: &LoadedModel, tasks: &[&Task]) -> Result<Vec<Features>, Servin
 /// The rollout of each conditioning input. `values` holds the features of all windows, one after the other; `window_of` is the
 /// index of the window of each conditioning input. Rollouts of the same number of steps are computed together.
 fn predict_windows(
-    loaded: &LoadedModel,
+    loaded: &Model,
     values: Vec<f32>,
     window_of: &[u32],
     conditioning_inputs: &[&ConditioningInput],
@@ -126,7 +126,7 @@ fn predict_windows(
 
 /// The contexts of a batch.
 struct Windows<'a> {
-    loaded: &'a LoadedModel,
+    loaded: &'a Model,
     /// Empty if the model is not calibrated.
     contexts: Vec<ContextStatistics>,
     /// The features of all windows `[windows, context, F]`.
@@ -198,7 +198,7 @@ impl Windows<'_> {
 }
 
 /// The frames of `total` predicted codes.
-fn decode(loaded: &LoadedModel, codes: &Tensor, total: usize) -> Result<Vec<Frame>, ServingError> {
+fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, ServingError> {
     let mut frames = Vec::with_capacity(total);
     for first in (0..total).step_by(DECODED_FRAMES) {
         let part = codes
@@ -213,7 +213,7 @@ fn decode(loaded: &LoadedModel, codes: &Tensor, total: usize) -> Result<Vec<Fram
     Ok(frames)
 }
 
-fn images(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
+fn images(loaded: &Model, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
     let spec = loaded.network.spec();
     let frame = |pixels| {
         spec.preprocess
@@ -258,7 +258,7 @@ fn condition(
     })
 }
 
-fn model_error(loaded: &LoadedModel, source: crate::nn::NnError) -> ServingError {
+fn model_error(loaded: &Model, source: crate::nn::NnError) -> ServingError {
     ServingError::Model {
         model: loaded.manifest.name.clone(),
         source: Arc::new(source),

@@ -8,15 +8,15 @@ use super::error::{InputError, ServingError};
 use super::input::PredictionInput;
 use super::prediction::Rollout;
 use super::ranges::range_warnings;
-use super::session::{SnapshotError, SessionSnapshot, SessionState};
+use super::session::{SessionSnapshot, SessionState, SnapshotError};
 use super::task::{Task, check_size};
 use crate::frame::Frame;
-use crate::registry::{LoadedModel, Manifest};
+use crate::registry::{Manifest, Model};
 use crate::types::{Action, RobotState};
 
 /// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
 /// `Model`, `Tensor`, `Frame`.
-pub fn predict(loaded: &LoadedModel, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
+pub fn predict(loaded: &Model, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
         .map(|input| {
@@ -37,7 +37,7 @@ impl ConditioningInput {
     /// acts from the last frame to the first predicted one. A model ignores what it does not take. Errors name the field,
     /// its value and the expected value.
     pub fn for_model(
-        loaded: &LoadedModel,
+        loaded: &Model,
         future_actions: Option<&[Action]>,
         state: Option<&RobotState>,
     ) -> Result<Self, InputError> {
@@ -61,14 +61,14 @@ impl ConditioningInput {
 /// of the last frames.
 #[derive(Clone)]
 pub struct Session {
-    model: Arc<LoadedModel>,
+    model: Arc<Model>,
     state: SessionState,
 }
 
 impl Session {
     /// A session before its first frame.
     #[must_use]
-    pub fn new(model: Arc<LoadedModel>) -> Self {
+    pub fn new(model: Arc<Model>) -> Self {
         Self {
             model,
             state: SessionState::default(),
@@ -76,7 +76,7 @@ impl Session {
     }
 
     /// Continues an exported session. Errors: what of the snapshot does not fit the model.
-    pub fn restore(model: Arc<LoadedModel>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
+    pub fn restore(model: Arc<Model>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
         let state = SessionState::restore(snapshot, &model.manifest.name, model.network.spec())?;
         Ok(Self { model, state })
     }
@@ -141,7 +141,7 @@ impl Session {
 
     /// Its model.
     #[must_use]
-    pub fn model(&self) -> &LoadedModel {
+    pub fn model(&self) -> &Model {
         &self.model
     }
 }
@@ -205,7 +205,7 @@ mod tests {
         }
     }
 
-    fn check_steps(model: &LoadedModel) {
+    fn check_steps(model: &Model) {
         let width = model.network.spec().frame_width_px;
         let spec = model.network.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());

@@ -14,7 +14,7 @@ use super::queue::{ModelLoad, Queue, QueuedTask};
 use super::ranges::range_warnings;
 use super::task::Task;
 use super::worker;
-use crate::registry::{LoadedModel, Manifest};
+use crate::registry::{Manifest, Model};
 
 /// A task with many rollouts gets one part in this many of a batch at a time, so that other requests wait less.
 const PARTS_IN_A_BATCH: usize = 4;
@@ -63,7 +63,7 @@ impl Drop for PredictorInner {
 impl Predictor {
     /// Starts the thread. It first predicts once with every model, so that the first request does not pay for the warm-up;
     /// requests wait in the queue until then. Errors: `Thread`.
-    pub fn start(models: Vec<LoadedModel>, config: PredictorConfig) -> Result<Self, ServingError> {
+    pub fn start(models: Vec<Model>, config: PredictorConfig) -> Result<Self, ServingError> {
         let queue = Arc::new(Queue::new(config.queue_capacity, config.batch_limit));
         let catalog = Arc::new(Catalog::new(models));
         let worker = worker::spawn(Arc::clone(&queue), Arc::clone(&catalog))?;
@@ -98,7 +98,7 @@ impl Predictor {
 
     /// The active version of a model. It stays usable for its holder after another version becomes active.
     /// Errors: `UnknownModel`.
-    pub fn active(&self, name: &str) -> Result<Arc<LoadedModel>, ServingError> {
+    pub fn active(&self, name: &str) -> Result<Arc<Model>, ServingError> {
         self.shared.catalog.find(name)
     }
 
@@ -115,7 +115,7 @@ impl Predictor {
     /// Errors: `QueueFull`, `Deadline`, `Stopped`, and the errors of the computation.
     pub async fn compute(
         &self,
-        model: &Arc<LoadedModel>,
+        model: &Arc<Model>,
         mut task: Task,
         session: Option<u64>,
     ) -> Result<Prediction, ServingError> {
@@ -135,7 +135,7 @@ impl Predictor {
 
     async fn compute_part(
         &self,
-        model: &Arc<LoadedModel>,
+        model: &Arc<Model>,
         task: Task,
         session: Option<u64>,
         deadline: Instant,
@@ -162,7 +162,7 @@ impl Predictor {
 
     /// Adds a model, or replaces the one of the same name, after it has made its first prediction. Blocks until then.
     /// Errors: `Stopped`, or the error of that prediction; the old model then stays active.
-    pub fn load(&self, model: LoadedModel) -> Result<(), ServingError> {
+    pub fn load(&self, model: Model) -> Result<(), ServingError> {
         let (reply, answer) = std::sync::mpsc::sync_channel(1);
         self.shared.queue.load(ModelLoad { model, reply })?;
         answer.recv().map_err(|_| ServingError::Stopped)?
@@ -182,27 +182,27 @@ impl Predictor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::{Model, ModelSpec, Parameters};
+    use crate::nn::{ModelSpec, Network, Parameters};
     use crate::serving::test_model;
     use crate::types::Seed;
 
     /// A model without context: its computation divides by zero.
-    fn panicking_model() -> LoadedModel {
+    fn panicking_model() -> Model {
         let model = test_model();
         let parameters = Parameters::initialize(model.network.spec(), Seed(1)).unwrap();
         let spec = ModelSpec {
             context: 0,
             ..model.network.spec().clone()
         };
-        LoadedModel {
-            network: Model::detached(model.network.spec().clone(), &parameters)
+        Model {
+            network: Network::detached(model.network.spec().clone(), &parameters)
                 .unwrap()
                 .with_spec(spec),
             ..model
         }
     }
 
-    fn task(model: &LoadedModel) -> Task {
+    fn task(model: &Model) -> Task {
         let input = worker::blank_input(model.network.spec()).unwrap();
         Task {
             conditioning_inputs: vec![input.conditioning("test", model.network.spec()).unwrap()],

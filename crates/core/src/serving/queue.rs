@@ -12,14 +12,14 @@ use super::error::ServingError;
 use super::meter;
 use super::prediction::Prediction;
 use super::task::Task;
-use crate::registry::LoadedModel;
+use crate::registry::Model;
 
 /// A full queue of the reference model's predictions is computed well within this time.
 const RETRY_AFTER_S: u64 = 1;
 
 /// A waiting task.
 pub(super) struct QueuedTask {
-    pub(super) model: Arc<LoadedModel>,
+    pub(super) model: Arc<Model>,
     pub(super) task: Task,
     /// The session that it is a step of.
     pub(super) session: Option<u64>,
@@ -32,7 +32,7 @@ pub(super) struct QueuedTask {
 
 /// A model to load.
 pub(super) struct ModelLoad {
-    pub(super) model: LoadedModel,
+    pub(super) model: Model,
     pub(super) reply: SyncSender<Result<(), ServingError>>,
 }
 
@@ -180,7 +180,7 @@ mod tests {
 
     type Answer = oneshot::Receiver<Result<Prediction, ServingError>>;
 
-    fn request(model: &Arc<LoadedModel>) -> (QueuedTask, Answer) {
+    fn request(model: &Arc<Model>) -> (QueuedTask, Answer) {
         let (reply, answer) = oneshot::channel();
         let accepted = Instant::now();
         let waiting = QueuedTask {

@@ -17,7 +17,7 @@ use super::task::Task;
 use super::{compute, local, meter};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
-use crate::registry::LoadedModel;
+use crate::registry::Model;
 use crate::types::{Action, RobotState};
 
 pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHandle<()>, ServingError> {
@@ -84,7 +84,7 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
 }
 
 /// Predicts once from black frames, to warm up memory and caches.
-fn warm_up(model: &LoadedModel) -> Result<(), ServingError> {
+fn warm_up(model: &Model) -> Result<(), ServingError> {
     let started = Instant::now();
     local::predict(model, &[&blank_input(model.network.spec())?])?;
     let warm_up_us = micros_since(started);

@@ -24,7 +24,7 @@ use crate::store::{ModelMetrics, PublishedVersion, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
 use foreframe_data::dataset::{self, Dataset, DatasetError};
@@ -287,7 +287,7 @@ impl Pipeline {
         })
     }
 
-    async fn model(&self, name: &str, version: Option<u32>) -> Result<LoadedModel, VersionError> {
+    async fn model(&self, name: &str, version: Option<u32>) -> Result<Model, VersionError> {
         match version {
             Some(version) => self.versions.load(name, version).await,
             None => self.versions.load_active(name).await,

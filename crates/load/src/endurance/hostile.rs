@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use foreframe::server::protocol::Codec;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use futures_util::{SinkExt as _, StreamExt as _};
 use proptest::strategy::{Strategy as _, ValueTree as _};
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
@@ -58,7 +58,7 @@ struct MutatedFile {
 }
 
 /// Starts all hostile clients. Dropping the set ends them.
-pub(super) fn start(run: &Arc<EnduranceRun>, model: &LoadedModel, counts: &Arc<HostileCounts>) -> JoinSet<()> {
+pub(super) fn start(run: &Arc<EnduranceRun>, model: &Model, counts: &Arc<HostileCounts>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
     for seed in 0..MUTATORS {
         let weights = model.manifest.weights_sha256.clone();

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use foreframe::server::protocol::{ClientMessage, FrameMessage};
 use foreframe::server::{ImageBytes, ImageFormat};
 use foreframe_core::frame::{Frame, codec};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::Session;
 use foreframe_core::types::{Action, RobotState};
 use tokio_tungstenite::tungstenite::Message;
@@ -26,7 +26,7 @@ pub(super) struct RobotRecording {
 }
 
 impl RobotRecording {
-    pub(super) fn new(robot: u64, workload: &Workload, model: &LoadedModel) -> Self {
+    pub(super) fn new(robot: u64, workload: &Workload, model: &Model) -> Self {
         let messages: Vec<FrameMessage> = (0..PERIOD).map(|index| message(robot, index, workload)).collect();
         let context = workload.context();
         let (mut session, mut expected) = (Session::new(Arc::new(model.clone())), Vec::new());

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use foreframe::server::ImageBytes;
 use foreframe_core::frame::Frame;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::{PredictionInput, predict};
 use foreframe_core::types::{Action, RobotState};
 use serde_json::{Value, json};
@@ -27,7 +27,7 @@ const EPISODES: u64 = 10;
 const PLANS: usize = 16;
 
 /// The prediction that the library makes of the workload's request.
-pub(super) fn expected(workload: &Workload, model: &LoadedModel) -> Vec<Frame> {
+pub(super) fn expected(workload: &Workload, model: &Model) -> Vec<Frame> {
     let spec = workload.spec();
     let frame = |index| {
         Frame::new(

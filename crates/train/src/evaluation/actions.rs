@@ -13,7 +13,7 @@ use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -60,7 +60,7 @@ impl Variant {
 
 /// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, has
 /// seen other data, or lacks neither the action nor the state.
-pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant, EvaluationError> {
+pub fn twin_variant(loaded: &Model, twin: &Model) -> Result<Variant, EvaluationError> {
     let (spec, other) = (loaded.network.spec(), twin.network.spec());
     let refused = |found: String, wanted: String| EvaluationError::Twin {
         twin: twin.manifest.name.clone(),
@@ -72,7 +72,7 @@ pub fn twin_variant(loaded: &LoadedModel, twin: &LoadedModel) -> Result<Variant,
     if window(spec) != window(other) {
         return Err(refused(window(other), window(spec)));
     }
-    let data = |loaded: &LoadedModel| format!("training data \"{}\"", loaded.manifest.dataset.name);
+    let data = |loaded: &Model| format!("training data \"{}\"", loaded.manifest.dataset.name);
     if loaded.manifest.dataset.content_hash != twin.manifest.dataset.content_hash {
         return Err(refused(data(twin), format!("the same {}", data(loaded))));
     }
@@ -136,8 +136,8 @@ pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
 
 /// Errors of each variant, per window and step. Errors: those of the network, `NotFinite`.
 pub fn compare(
-    loaded: &LoadedModel,
-    twins: &[&LoadedModel],
+    loaded: &Model,
+    twins: &[&Model],
     dataset: &Dataset,
     windows: &[Window],
     watched: &EvaluationContext,
@@ -179,7 +179,7 @@ pub fn compare(
 }
 
 fn errors_of(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     source: ActionSource,

@@ -14,7 +14,7 @@ use super::{EvaluationError, compatible};
 use foreframe_core::registry::calibration::{
     APPEARANCE, Calibration, ContextStatistics, ERROR_INPUTS, NoveltyScale, StepErrors, ValueRange,
 };
-use foreframe_core::registry::{self, LoadedModel};
+use foreframe_core::registry::{self, Model};
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -37,7 +37,7 @@ const RIDGE: f64 = 1e-2;
 /// many validation windows are used at most, and what goes through the model at once. Errors: model and data set that do not
 /// fit together, no validation trials, `Cancelled`, those of the network.
 pub fn calibrate(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     config: &EvaluateConfig,
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),

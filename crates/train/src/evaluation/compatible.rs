@@ -3,7 +3,7 @@
 use super::EvaluationError;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 
@@ -11,7 +11,7 @@ use foreframe_data::dataset::{Dataset, DatasetInfo};
 const PERIOD_TOLERANCE: f64 = 0.01;
 
 /// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model cannot run on the data set.
-pub fn check(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), EvaluationError> {
+pub fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
     let (spec, info) = (loaded.network.spec(), dataset.info());
     let model = || loaded.manifest.name.clone();
     if (info.frame_width_px, info.frame_height_px) != (spec.frame_width_px, spec.frame_height_px) {
@@ -59,7 +59,7 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
 }
 
 /// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.
-pub fn check_untrained(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), EvaluationError> {
+pub fn check_untrained(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
     if loaded.manifest.dataset.content_hash == dataset.info().content_hash {
         return Err(EvaluationError::TrainedOn {
             model: loaded.manifest.name.clone(),
@@ -71,7 +71,7 @@ pub fn check_untrained(loaded: &LoadedModel, dataset: &Dataset) -> Result<(), Ev
 
 /// The seed of the split to test with: that of the model's training, unless another is asked for.
 /// Errors: `SplitSeed` where that would test on training data.
-pub fn split_seed(loaded: &LoadedModel, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {
+pub fn split_seed(loaded: &Model, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {
     let trained = &loaded.manifest.dataset;
     let seed = asked.unwrap_or(trained.split_seed);
     if seed != trained.split_seed && trained.content_hash == dataset.info().content_hash {

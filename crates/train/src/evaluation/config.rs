@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::EvaluationError;
 use super::bootstrap::Bootstrap;
 use super::progress::{EvaluationContext, EvaluationProgress};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::sampler::{Split, Splits};
@@ -68,7 +68,7 @@ pub struct EvaluateConfig<'a> {
     /// Windows that go through the model at once.
     pub batch: usize,
     /// Models trained with the same budget without the action, without the state or without both, for the action table.
-    pub twins: Vec<&'a LoadedModel>,
+    pub twins: Vec<&'a Model>,
     /// Other data sets, which the model's novelty must tell from the scored windows.
     pub novel: Vec<&'a Dataset>,
     /// The command line, for the stamp.

@@ -5,7 +5,7 @@ use super::inference::{self, ActionSource};
 use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::{Frame, quality};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ERROR_INPUTS, ExpectedError, NoveltyScale, PredictedFuture,
 };
@@ -26,7 +26,7 @@ pub(super) struct Forecast {
 
 /// Predicts the windows. Errors: those of the network, `Cancelled`.
 pub(super) fn forecasts(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     (windows, novelty): (&[Window], &NoveltyScale),
     watched: &EvaluationContext,
@@ -41,7 +41,7 @@ pub(super) fn forecasts(
 
 /// The contexts of the windows, without predicting. Errors: as [`forecasts`].
 pub(super) fn contexts(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     watched: &EvaluationContext,
@@ -67,7 +67,7 @@ fn ends(first: usize, context: usize) -> [usize; 2] {
 }
 
 fn forecast_batch(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     novelty: &NoveltyScale,

@@ -7,7 +7,7 @@ use super::EvaluationError;
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::nn::{ConditioningTensors, Feedback, ModelSpec};
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_data::dataset::{Dataset, Window};
 
 /// Which future actions the model gets.
@@ -39,7 +39,7 @@ pub struct Predicted {
 
 /// Predicts each window's frames to come. Errors: those of the network, `NotFinite`.
 pub fn predict(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     source: ActionSource,
@@ -64,7 +64,7 @@ pub fn predict(
 /// As [`predict`] with the true actions, the true frames to come through the frame encoder and decoder, and the
 /// reconstruction of those seen.
 pub fn predict_with_ceiling(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
 ) -> Result<Predicted, EvaluationError> {
@@ -88,7 +88,7 @@ pub fn predict_with_ceiling(
 
 /// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space. Empty if it
 /// does not reconstruct.
-pub fn reconstruct(loaded: &LoadedModel, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
+pub fn reconstruct(loaded: &Model, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
     let (model, spec) = (&loaded.network, loaded.network.spec());
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
@@ -116,7 +116,7 @@ pub(super) struct PredictedCodes {
 
 /// As [`predict`], with the codes. Errors: those of the network.
 pub(super) fn predict_with_codes(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     source: ActionSource,
@@ -138,7 +138,7 @@ pub(super) fn predict_with_codes(
 }
 
 /// Codes of frames in the model's space, both one after another. Errors: those of the network.
-pub(super) fn encode(loaded: &LoadedModel, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
+pub(super) fn encode(loaded: &Model, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
     let pixels = loaded.network.spec().pixels();
     let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
     values(&loaded.network.encode_frames(&frames)?)

@@ -14,7 +14,7 @@ use super::windows::evenly;
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::types::{Action, Seed};
 use foreframe_data::dataset::{Dataset, Window};
 use foreframe_sim::{World, WorldConfig};
@@ -59,7 +59,7 @@ type Futures = Option<Vec<Vec<f32>>>;
 
 /// Measures a model that takes actions on these windows. Errors: those of the network and the simulator, `Cancelled`.
 pub fn identify(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     watched: &EvaluationContext,

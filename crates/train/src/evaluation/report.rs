@@ -14,7 +14,7 @@ use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
 use super::skill::{Skill, skill};
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
-use foreframe_core::registry::{DatasetStamp, LoadedModel, ProgramStamp};
+use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -115,13 +115,13 @@ pub struct ReportStamp {
 
 impl ReportStamp {
     pub(super) fn new(
-        loaded: &LoadedModel,
+        loaded: &Model,
         dataset: &Dataset,
         split_seed: Seed,
         config: &EvaluateConfig,
         wall_time: Duration,
     ) -> Self {
-        let named = |model: &LoadedModel| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
+        let named = |model: &Model| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
         let (model, model_sha256) = named(loaded);
         Self {
             dataset: dataset.info().name.clone(),
@@ -185,7 +185,7 @@ pub struct ModelSummary {
 }
 
 impl ModelSummary {
-    pub(super) fn of(loaded: &LoadedModel) -> Self {
+    pub(super) fn of(loaded: &Model) -> Self {
         let spec = loaded.network.spec();
         Self {
             frame_width_px: spec.frame_width_px,

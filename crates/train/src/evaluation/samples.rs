@@ -8,7 +8,7 @@ use super::markdown::set_title;
 use super::method::Method;
 use super::report::{EvaluationReport, SampleWindow, SetScores};
 use foreframe_core::frame::Frame;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::sampler::{Split, WindowShape};
 
@@ -18,7 +18,7 @@ const MAX_MOMENTS: usize = 40;
 /// The figures' content: median, best and worst window and a chart of each set that was scored; reconstruction and
 /// animation of the first. Errors: those of the network.
 pub fn figure_inputs(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     report: &EvaluationReport,
 ) -> Result<FigureInputs, EvaluationError> {
@@ -46,7 +46,7 @@ pub fn figure_inputs(
     Ok(inputs)
 }
 
-fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Result<SampleFigure, EvaluationError> {
+fn show(loaded: &Model, dataset: &Dataset, sample: &SampleWindow) -> Result<SampleFigure, EvaluationError> {
     let spec = loaded.network.spec();
     let window = [sample.window()];
     let seen = sample.first_frame..sample.first_frame + spec.context;
@@ -60,7 +60,7 @@ fn show(loaded: &LoadedModel, dataset: &Dataset, sample: &SampleWindow) -> Resul
     })
 }
 
-fn frames(loaded: &LoadedModel, values: &[f32]) -> Result<Vec<Frame>, EvaluationError> {
+fn frames(loaded: &Model, values: &[f32]) -> Result<Vec<Frame>, EvaluationError> {
     let spec = loaded.network.spec();
     let frame = |values| {
         spec.preprocess
@@ -89,7 +89,7 @@ fn chart(split: Split, scores: &SetScores) -> Chart {
 
 /// The trial of the median window from its start to its end, each frame predicted at the greatest horizon.
 fn animate(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     (report, split): (&EvaluationReport, Split),
     scores: &SetScores,

@@ -12,13 +12,13 @@ use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, DatasetError, Window};
 
 /// Scores every window. Errors: those of the network, `NotFinite`.
 pub fn score(
-    loaded: &LoadedModel,
+    loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     baselines: &Baselines,

@@ -9,7 +9,7 @@ use super::forecast::{Forecast, contexts, forecasts};
 use super::metrics::StepCurve;
 use super::progress::EvaluationContext;
 use super::windows::evenly;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::registry::calibration::Calibration;
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -44,7 +44,7 @@ pub struct NoveltyScores {
 
 /// Scores the calibration on these windows; also gives their novelty. Errors: those of the network, `Cancelled`.
 pub(super) fn measure(
-    loaded: &LoadedModel,
+    loaded: &Model,
     calibration: &Calibration,
     (dataset, windows): (&Dataset, &[Window]),
     watched: &EvaluationContext,
@@ -102,7 +102,7 @@ fn correlation(found: &[Forecast], step: usize) -> f64 {
 /// Compares the novelty of another data set's contexts with that of `own`. Frames of another size are cropped and resized.
 /// Errors: those of the network, `NoContext` if no recording is long enough.
 pub(super) fn compare(
-    loaded: &LoadedModel,
+    loaded: &Model,
     calibration: &Calibration,
     (other, own, limit): (&Dataset, &[f64], usize),
     watched: &EvaluationContext,

@@ -9,7 +9,7 @@ use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan};
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
-use foreframe_core::nn::{Feedback, Model, Parameters};
+use foreframe_core::nn::{Feedback, Network, Parameters};
 
 /// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
@@ -37,7 +37,7 @@ impl<'a> SequenceObjective<'a> {
     }
 
     /// Encodes frames `[B, T, P]` to features `[B, T, F]`.
-    fn features(&self, model: &Model, frames: &Tensor) -> Result<Tensor, TrainError> {
+    fn features(&self, model: &Network, frames: &Tensor) -> Result<Tensor, TrainError> {
         let (batch, time, pixels) = frames.dims3()?;
         let features = model.encode_frames(&frames.reshape((batch * time, pixels))?)?;
         Ok(features.reshape((batch, time, self.plan.spec.code_len()))?)
@@ -45,7 +45,7 @@ impl<'a> SequenceObjective<'a> {
 
     /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
     /// In the frame and SSIM losses, only the first `counting` frames count.
-    fn flow_loss(&self, model: &Model, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
+    fn flow_loss(&self, model: &Network, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
         let fit = &self.config.fit;
         let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition, counting)? else {
             return Err(TrainError::Config("only the flow network has this loss".to_owned()));
@@ -72,7 +72,7 @@ impl<'a> SequenceObjective<'a> {
     }
 
     /// Decodes features `[B, T, F]` to frames `[B, T, P]`.
-    fn frames(model: &Model, features: &Tensor) -> Result<Tensor, TrainError> {
+    fn frames(model: &Network, features: &Tensor) -> Result<Tensor, TrainError> {
         let (batch, time, width) = features.dims3()?;
         let frames = model.decode_frames(&features.reshape((batch * time, width))?)?;
         Ok(frames.reshape((batch, time, ()))?)
@@ -106,7 +106,7 @@ impl Objective for SequenceObjective<'_> {
             .source
             .windows(&windows, self.config.window_shape(), is_teacher_forced)?;
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
-        let model = Model::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
+        let model = Network::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
         if self.plan.spec.flow().is_some() {
             let counting = fit.frames_that_count(step, self.plan.spec.horizon);
             return self.flow_loss(&model, &batch, counting);
@@ -134,7 +134,7 @@ impl Objective for SequenceObjective<'_> {
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
-        let model = Model::new(self.plan.spec.clone(), parameters)?;
+        let model = Network::new(self.plan.spec.clone(), parameters)?;
         let windows: Vec<DrawnWindow> = self.plan.validation.iter().map(DrawnWindow::unchanged).collect();
         let mut sum = 0.0;
         for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {

@@ -8,7 +8,7 @@ use super::observer::TrainingStage;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan, window_frames};
 use foreframe_core::nn::loss::Loss;
-use foreframe_core::nn::{Model, Parameters};
+use foreframe_core::nn::{Network, Parameters};
 
 /// Largest number of validation frames used to choose the best codec.
 const MAX_VALIDATION_FRAMES: usize = 1024;
@@ -40,7 +40,7 @@ impl<'a> CodecObjective<'a> {
     }
 
     fn reconstruct(&self, parameters: &Parameters, inputs: &Tensor) -> Result<Tensor, TrainError> {
-        let model = Model::new(self.plan.spec.clone(), parameters)?;
+        let model = Network::new(self.plan.spec.clone(), parameters)?;
         Ok(model.decode_frames(&model.encode_frames(inputs)?)?)
     }
 }

@@ -123,7 +123,7 @@ fn norm(row: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use foreframe_core::nn::{Architecture, DenseSpec, Model, ModelSpec};
+    use foreframe_core::nn::{Architecture, DenseSpec, ModelSpec, Network};
 
     #[test]
     fn the_codec_restores_frames_of_few_components() {
@@ -153,7 +153,7 @@ mod tests {
         assert!(set_codec(&parameters, (&frames, &frames), Seed(4), &go_on).unwrap());
         let cancelled = AtomicBool::new(true);
         assert!(!set_codec(&parameters, (&frames, &frames), Seed(4), &cancelled).unwrap());
-        let model = Model::new(spec, &parameters).unwrap();
+        let model = Network::new(spec, &parameters).unwrap();
         let back = model.decode_frames(&model.encode_frames(&frames).unwrap()).unwrap();
         let error = (back - &frames)
             .unwrap()

@@ -25,7 +25,7 @@ mod tests {
     use candle_core::Device;
 
     use super::*;
-    use foreframe_core::nn::{Architecture, DenseSpec, Model, ModelSpec};
+    use foreframe_core::nn::{Architecture, DenseSpec, ModelSpec, Network};
     use foreframe_core::types::Seed;
 
     #[test]
@@ -46,7 +46,7 @@ mod tests {
         let frames = Tensor::from_vec(frames, (20, 1024), &Device::Cpu).unwrap();
         let parameters = Parameters::initialize(&spec, Seed(3)).unwrap();
         let largest = |parameters: &Parameters| {
-            let model = Model::new(spec.clone(), parameters).unwrap();
+            let model = Network::new(spec.clone(), parameters).unwrap();
             let features = model.encode_frames(&frames).unwrap();
             features.abs().unwrap().mean_all().unwrap().to_scalar::<f32>().unwrap()
         };

@@ -11,7 +11,7 @@ use crate::server::state::App;
 use crate::server::stream::protocol::{OnGap, OnLate, SessionSettings, StreamLimits};
 use crate::server::stream::session::Session;
 use foreframe_core::frame::resize::Resize;
-use foreframe_core::registry::LoadedModel;
+use foreframe_core::registry::Model;
 use foreframe_core::serving::{SessionSnapshot, SessionState};
 
 /// The session to open.
@@ -108,7 +108,7 @@ pub(super) struct SessionList {
 }
 
 impl CreateSession {
-    pub(super) fn resolve(self, app: &App) -> Result<(Arc<LoadedModel>, SessionState, SessionSettings), ApiError> {
+    pub(super) fn resolve(self, app: &App) -> Result<(Arc<Model>, SessionState, SessionSettings), ApiError> {
         let (on_gap, on_late, resize) = (self.on_gap, self.on_late, self.resize);
         let format = self.format.map(ImageFormat::answer);
         let Some(exported) = self.state else {

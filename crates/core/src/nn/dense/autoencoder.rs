@@ -24,7 +24,7 @@ pub enum Feedback<'a> {
 /// The network: a frame codec, an LSTM encoder and two LSTM decoders. It holds only weights and no stream state, so many
 /// streams can share one model. Its callers check the shapes of frames and features.
 #[derive(Clone, Debug)]
-pub(in crate::nn) struct DenseModel {
+pub(in crate::nn) struct DenseNetwork {
     spec: ModelSpec,
     sizes: DenseSpec,
     frame_encoder: Linear,
@@ -36,7 +36,7 @@ pub(in crate::nn) struct DenseModel {
     reconstructor_output: Linear,
 }
 
-impl DenseModel {
+impl DenseNetwork {
     /// The network of these tensors. Errors: `TensorMissing`, `TensorShape`.
     pub(in crate::nn) fn new(spec: ModelSpec, sizes: DenseSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
         let cell = |name: &str| {

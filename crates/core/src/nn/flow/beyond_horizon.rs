@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 
-use super::network::FlowModel;
+use super::network::FlowNetwork;
 use super::state_channels::StateChannels;
 use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
@@ -12,7 +12,7 @@ use crate::nn::spec::ModelSpec;
 /// Frames `[N, steps, P]` of N futures: the windows' frames, the window of each future, and its conditioning with `steps`
 /// actions. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
 pub(in crate::nn) fn predict_beyond_horizon(
-    flow: &FlowModel,
+    flow: &FlowNetwork,
     spec: &ModelSpec,
     (frames, windows, conditioning): (&Tensor, &[u32], &ConditioningTensors),
     steps: usize,

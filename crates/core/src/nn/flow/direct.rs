@@ -4,7 +4,7 @@ use candle_core::{Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
 use super::future_rows::FutureRows;
-use super::network::{FlowModel, FlowPrediction};
+use super::network::{FlowNetwork, FlowPrediction};
 use super::rays::{CameraPose, Viewer, turning_places};
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
@@ -13,7 +13,7 @@ use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
 
-impl FlowModel {
+impl FlowNetwork {
     /// All steps of the futures at once; gives the frames of the first `steps`.
     pub(super) fn predict_directly(
         &self,
@@ -100,7 +100,7 @@ impl FlowModel {
         })
     }
 
-    /// As [`FlowModel::places`] where nothing is known of the camera: an affine map of the image learned from the motion,
+    /// As [`FlowNetwork::places`] where nothing is known of the camera: an affine map of the image learned from the motion,
     /// or every pixel where it is.
     fn places_without_camera(&self, spec: &ModelSpec, motion: &Tensor) -> Result<ItemPlaces, NnError> {
         let size = spec.image_size();

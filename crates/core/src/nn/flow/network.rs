@@ -30,7 +30,7 @@ pub struct FlowPrediction {
 
 /// The network. Holds weights only.
 #[derive(Clone, Debug)]
-pub(in crate::nn) struct FlowModel {
+pub(in crate::nn) struct FlowNetwork {
     pub(super) sizes: FlowSpec,
     stem: Convolution3,
     halving: Convolution3,
@@ -45,7 +45,7 @@ pub(in crate::nn) struct FlowModel {
     head: Convolution3,
 }
 
-impl FlowModel {
+impl FlowNetwork {
     /// The network of these tensors. Errors: `TensorMissing`, `TensorShape`.
     pub(in crate::nn) fn new(spec: &ModelSpec, sizes: FlowSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
         let layers = &sizes.layers;

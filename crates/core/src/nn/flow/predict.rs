@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 
 use super::future_rows::FutureRows;
-use super::network::{FlowModel, FlowPrediction};
+use super::network::{FlowNetwork, FlowPrediction};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
@@ -11,7 +11,7 @@ use crate::nn::spec::ModelSpec;
 /// Futures that are computed together without gradients, so that many take no more memory than few.
 const FUTURES_AT_ONCE: usize = 16;
 
-impl FlowModel {
+impl FlowNetwork {
     /// N futures of B windows of frames `[B, context, P]`: future n follows window `windows[n]` under row n of the
     /// conditioning. Errors: `Shape`, `Missing`.
     pub(in crate::nn) fn predict(
@@ -24,7 +24,7 @@ impl FlowModel {
         self.predict_first(spec, (frames, windows), conditioning, spec.horizon)
     }
 
-    /// As [`FlowModel::predict`], with the frames of the first `steps` only.
+    /// As [`FlowNetwork::predict`], with the frames of the first `steps` only.
     pub(in crate::nn) fn predict_first(
         &self,
         spec: &ModelSpec,

@@ -6,7 +6,7 @@ use candle_core::{DType, Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
 use super::future_rows::FutureRows;
-use super::network::{FlowModel, FlowPrediction};
+use super::network::{FlowNetwork, FlowPrediction};
 use super::rays::CameraPose;
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
@@ -18,7 +18,7 @@ use crate::nn::tensors::with_values;
 /// Of the blocks to move, the channels that hold pixels; the last one says how much of a block is inside the frame.
 const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
-impl FlowModel {
+impl FlowNetwork {
     /// The futures of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
     pub(super) fn predict_recurrently(
         &self,

@@ -3,7 +3,7 @@
 use candle_core::{Device, Tensor};
 
 use crate::nn::tensors::with_values;
-use crate::nn::{Model, NnError};
+use crate::nn::{Network, NnError};
 
 /// Cosine waves along each side, the constant one included.
 const WAVES: usize = 4;
@@ -52,7 +52,7 @@ impl ContextStatistics {
 
     /// Of windows whose frames have these codes, `frames` for each window, oldest first. What the codes do not hold, the
     /// statistics do not see. Errors: those of the network.
-    pub fn of_codes(model: &Model, codes: &[f32], frames: usize) -> Result<Vec<Self>, NnError> {
+    pub fn of_codes(model: &Network, codes: &[f32], frames: usize) -> Result<Vec<Self>, NnError> {
         let (spec, length) = (model.spec(), model.spec().code_len());
         let mut ends = Vec::new();
         for window in codes.chunks_exact(frames * length) {

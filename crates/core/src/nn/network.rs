@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use candle_core::Tensor;
 
 use super::conditioning::ConditioningTensors;
-use super::dense::{DenseModel, Feedback};
+use super::dense::{DenseNetwork, Feedback};
 use super::error::NnError;
-use super::flow::{FlowModel, FlowPrediction, predict_beyond_horizon};
+use super::flow::{FlowNetwork, FlowPrediction, predict_beyond_horizon};
 use super::parameters::Parameters;
 use super::spec::{Architecture, ModelSpec, in_range};
 use super::tensor_source::TensorSource;
@@ -15,15 +15,15 @@ use super::tensor_source::TensorSource;
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
 /// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
 #[derive(Clone, Debug)]
-pub struct Model {
+pub struct Network {
     spec: ModelSpec,
-    network: Network,
+    variant: Variant,
 }
 
 #[derive(Clone, Debug)]
-enum Network {
-    Dense(Box<DenseModel>),
-    Flow(Box<FlowModel>),
+enum Variant {
+    Dense(Box<DenseNetwork>),
+    Flow(Box<FlowNetwork>),
 }
 
 /// A model's tensors by name, some of them without gradients.
@@ -53,7 +53,7 @@ impl TensorSource for NamedTensors<'_> {
     }
 }
 
-impl Model {
+impl Network {
     /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor.
     /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
     pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
@@ -73,11 +73,11 @@ impl Model {
             parameters,
             frozen,
         };
-        let network = match spec.architecture {
-            Architecture::Dense(sizes) => Network::Dense(Box::new(DenseModel::new(spec.clone(), sizes, &tensors)?)),
-            Architecture::Flow(sizes) => Network::Flow(Box::new(FlowModel::new(&spec, sizes, &tensors)?)),
+        let variant = match spec.architecture {
+            Architecture::Dense(sizes) => Variant::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors)?)),
+            Architecture::Flow(sizes) => Variant::Flow(Box::new(FlowNetwork::new(&spec, sizes, &tensors)?)),
         };
-        Ok(Self { spec, network })
+        Ok(Self { spec, variant })
     }
 
     /// The same network with a description that may not fit it, to test failures.
@@ -95,18 +95,18 @@ impl Model {
     /// Codes `[N, code_len]` of frames `[N, P]` in the model's space. Errors: `Shape`.
     pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
-        match &self.network {
-            Network::Dense(dense) => dense.encode_frames(frames),
-            Network::Flow(_) => Ok(frames.clone()),
+        match &self.variant {
+            Variant::Dense(dense) => dense.encode_frames(frames),
+            Variant::Flow(_) => Ok(frames.clone()),
         }
     }
 
     /// Frames `[N, P]` in the model's space, not clamped, of codes `[N, code_len]`. Errors: `Shape`.
     pub fn decode_frames(&self, codes: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", codes, &[None, Some(self.spec.code_len())])?;
-        match &self.network {
-            Network::Dense(dense) => dense.decode_frames(codes),
-            Network::Flow(_) => Ok(codes.clone()),
+        match &self.variant {
+            Variant::Dense(dense) => dense.decode_frames(codes),
+            Variant::Flow(_) => Ok(codes.clone()),
         }
     }
 
@@ -123,9 +123,9 @@ impl Model {
             let shape = [Some(batch), Some(self.spec.horizon), Some(self.spec.code_len())];
             self.check("true features", truth, &shape)?;
         }
-        match &self.network {
-            Network::Dense(dense) => dense.predict(codes, conditioning, feedback),
-            Network::Flow(flow) => Ok(flow.predict(&self.spec, codes, &each_once(batch), conditioning)?.frames),
+        match &self.variant {
+            Variant::Dense(dense) => dense.predict(codes, conditioning, feedback),
+            Variant::Flow(flow) => Ok(flow.predict(&self.spec, codes, &each_once(batch), conditioning)?.frames),
         }
     }
 
@@ -138,9 +138,9 @@ impl Model {
         conditioning: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
         self.check_windows(codes)?;
-        match &self.network {
-            Network::Dense(dense) => dense.predict_futures(codes, windows, conditioning),
-            Network::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
+        match &self.variant {
+            Variant::Dense(dense) => dense.predict_futures(codes, windows, conditioning),
+            Variant::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
         }
     }
 
@@ -159,9 +159,9 @@ impl Model {
             return self.predict_futures(codes, windows, conditioning);
         }
         self.check_windows(codes)?;
-        match &self.network {
-            Network::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
-            Network::Flow(flow) => predict_beyond_horizon(flow, &self.spec, (codes, windows, conditioning), steps),
+        match &self.variant {
+            Variant::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
+            Variant::Flow(flow) => predict_beyond_horizon(flow, &self.spec, (codes, windows, conditioning), steps),
         }
     }
 
@@ -175,9 +175,9 @@ impl Model {
     ) -> Result<Option<FlowPrediction>, NnError> {
         let batch = self.check_windows(frames)?;
         in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
-        match &self.network {
-            Network::Dense(_) => Ok(None),
-            Network::Flow(flow) => flow
+        match &self.variant {
+            Variant::Dense(_) => Ok(None),
+            Variant::Flow(flow) => flow
                 .predict_first(&self.spec, (frames, &each_once(batch)), conditioning, steps)
                 .map(Some),
         }
@@ -187,9 +187,9 @@ impl Model {
     /// network, which does not reconstruct. Errors: `Shape`.
     pub fn reconstruct(&self, codes: &Tensor) -> Result<Option<Tensor>, NnError> {
         self.check_windows(codes)?;
-        match &self.network {
-            Network::Dense(dense) => dense.reconstruct(codes).map(Some),
-            Network::Flow(_) => Ok(None),
+        match &self.variant {
+            Variant::Dense(dense) => dense.reconstruct(codes).map(Some),
+            Variant::Flow(_) => Ok(None),
         }
     }
 
@@ -276,7 +276,7 @@ mod tests {
     }
 
     fn futures(spec: &ModelSpec, steps: usize) -> Tensor {
-        let model = Model::detached(spec.clone(), &Parameters::initialize(spec, Seed(3)).unwrap()).unwrap();
+        let model = Network::detached(spec.clone(), &Parameters::initialize(spec, Seed(3)).unwrap()).unwrap();
         let frames: Vec<f32> = (0..3 * 64).map(|at| ((at * 7) % 64) as f32 / 64.0).collect();
         let codes = model
             .encode_frames(&Tensor::from_vec(frames, (3, 64), &Device::Cpu).unwrap())
