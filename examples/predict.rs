@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let out = PathBuf::from(std::env::args().nth(1).ok_or("usage: predict OUT_DIR")?);
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let model = load(&root.join("models/moving"))?;
-    let spec = model.network.spec();
+    let spec = model.spec();
     let recording: Recording = serde_json::from_slice(&std::fs::read(root.join("examples/frames/actions.json"))?)?;
 
     let mut frames = Vec::new();

@@ -23,7 +23,7 @@ struct Recording {
 fn main() -> Result<(), Box<dyn Error>> {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let model = load(&root.join("models/moving"))?;
-    let horizon = model.network.spec().horizon;
+    let horizon = model.spec().horizon;
     let recording: Recording = serde_json::from_slice(&std::fs::read(root.join("examples/frames/actions.json"))?)?;
 
     let mut session = Session::new(Arc::new(model));

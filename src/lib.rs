@@ -16,7 +16,7 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let model = load(Path::new("models/moving"))?;
 //! let mut frames = Vec::new();
-//! for i in 0..model.network.spec().context {
+//! for i in 0..model.spec().context {
 //!     frames.push(decode(&std::fs::read(format!("examples/frames/frame-{i:03}.png"))?)?);
 //! }
 //! // This model is conditioned on the robot's state at the last frame and on its next actions. `GET /v1/models/moving`
@@ -24,11 +24,11 @@
 //! let input = PredictionInput {
 //!     frames,
 //!     state: Some(RobotState::try_from(vec![2.7, 0.13, 0.64, 0.77, 0.0, -0.8])?),
-//!     future_actions: Some(vec![Action::try_from(vec![0.0, -0.8])?; model.network.spec().horizon]),
+//!     future_actions: Some(vec![Action::try_from(vec![0.0, -0.8])?; model.spec().horizon]),
 //!     ..PredictionInput::default()
 //! };
 //! let predictions = predict(&model, &[&input])?;
-//! assert_eq!(predictions[0].frames.len(), model.network.spec().horizon);
+//! assert_eq!(predictions[0].frames.len(), model.spec().horizon);
 //! # Ok(())
 //! # }
 //! ```

@@ -76,7 +76,7 @@ struct Selected {
 pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (_, loaded) = workspace.load_model(&args.model)?;
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let most = workspace.config().server.max_steps.max(spec.horizon);
     let steps = args.steps.unwrap_or(spec.horizon);
     if !(1..=most).contains(&steps) {

@@ -172,7 +172,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             };
             let window = features.narrow(0, window as usize, 1).unwrap();
             let alone = model
-                .model
+                .network
                 .predict(&window, &condition, foreframe_core::nn::Feedback::Prediction)
                 .unwrap();
             let apart = (alone - together.narrow(0, future, 1).unwrap()).unwrap().abs().unwrap();

@@ -77,7 +77,7 @@ pub fn run(
             split_seed: split_seed.0,
         });
     }
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let mut baselines = fitted_baselines(loaded, (dataset, &splits), config)?;
     if spec.flow().is_some() {
         // Its codes are the frames themselves, so there is no codec to measure.
@@ -112,7 +112,7 @@ fn fitted_baselines(
     (dataset, splits): (&Dataset, &Splits),
     config: &EvaluateConfig,
 ) -> Result<Baselines, EvaluationError> {
-    let shape = window_shape(loaded.network.spec());
+    let shape = window_shape(loaded.spec());
     let mut baselines = match config.purpose {
         ScoredSplit::WholeSet => {
             let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
@@ -156,7 +156,7 @@ fn score_split(
     baselines: &Baselines,
     watched: &EvaluationContext,
 ) -> Result<(SetOutcome, Vec<f64>), EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let available = splits.windows(dataset, watched.split, window_shape(spec), config.stride)?;
     if available.is_empty() {
         let reason = match watched.split {

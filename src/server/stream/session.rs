@@ -194,7 +194,7 @@ impl Ownership {
         step: FrameStep,
     ) -> Result<ServerMessage, StepError> {
         let (key, model) = (self.session.key, &self.session.model);
-        let spec = model.network.spec();
+        let spec = model.spec();
         let (format, missing, task) = {
             let inner = self.inner()?;
             let core = &inner.core;
@@ -217,9 +217,7 @@ impl Ownership {
         };
         if answer.must_compress(format) {
             let model = Arc::clone(model);
-            return blocking
-                .run(move || answer.message(format, model.network.spec()))
-                .await?;
+            return blocking.run(move || answer.message(format, model.spec())).await?;
         }
         answer.message(format, spec)
     }

@@ -13,7 +13,7 @@ use super::error::RegistryError;
 use super::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 use super::manifest::{self, Manifest};
 use crate::files::sha256_hex;
-use crate::nn::{Network, NnError, Parameters};
+use crate::nn::{ModelSpec, Network, NnError, Parameters};
 
 /// The largest weights file that is accepted, in bytes.
 const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
@@ -23,8 +23,18 @@ const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
 pub struct Model {
     /// The model's description.
     pub manifest: Arc<Manifest>,
-    /// The network, ready to predict.
+    /// The network, ready to predict. Its tensors are those of the tensor library, so it is no part of the library's
+    /// interface.
+    #[doc(hidden)]
     pub network: Network,
+}
+
+impl Model {
+    /// Sizes of its frames, context and horizon, and its channels.
+    #[must_use]
+    pub fn spec(&self) -> &ModelSpec {
+        &self.manifest.spec
+    }
 }
 
 /// A model's verified weights, from which a training can start.

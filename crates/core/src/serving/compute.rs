@@ -64,7 +64,7 @@ pub(super) fn run(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Se
 
 /// The features of all the tasks' frames, in order.
 fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let frames: Vec<&Frame> = tasks.iter().flat_map(|task| &task.frames).collect();
     if frames.is_empty() {
         return Ok(Vec::new());
@@ -92,7 +92,7 @@ fn predict_windows(
     window_of: &[u32],
     conditioning_inputs: &[&ConditioningInput],
 ) -> Result<Vec<Rollout>, ServingError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let contexts = match &loaded.manifest.calibration {
         Some(_) => ContextStatistics::of_codes(&loaded.network, &values, spec.context)
             .map_err(|source| model_error(loaded, source))?,
@@ -136,7 +136,7 @@ struct Windows<'a> {
 impl Windows<'_> {
     /// Rollouts of `steps` frames. A row is the index of a window and a conditioning input.
     fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
-        let (loaded, spec) = (self.loaded, self.loaded.network.spec());
+        let (loaded, spec) = (self.loaded, self.loaded.spec());
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
         let codes = loaded
             .network
@@ -167,7 +167,7 @@ impl Windows<'_> {
         codes: &[f32],
         frames: Vec<Frame>,
     ) -> Rollout {
-        let spec = self.loaded.network.spec();
+        let spec = self.loaded.spec();
         let (Some(calibration), Some(context)) =
             (&self.loaded.manifest.calibration, self.contexts.get(window as usize))
         else {
@@ -214,7 +214,7 @@ fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, Se
 }
 
 fn images(loaded: &Model, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let frame = |pixels| {
         spec.preprocess
             .frame_from(pixels, spec.frame_width_px, spec.frame_height_px)

@@ -19,11 +19,7 @@ use crate::types::{Action, RobotState};
 pub fn predict(loaded: &Model, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
-        .map(|input| {
-            Ok((*input)
-                .clone()
-                .into_task(&loaded.manifest.name, loaded.network.spec())?)
-        })
+        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.spec())?))
         .collect::<Result<Vec<Task>, ServingError>>()?;
     let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
     Ok(predictions
@@ -47,7 +43,7 @@ impl ConditioningInput {
             state,
             steps: None,
         };
-        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.network.spec())
+        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.spec())
     }
 
     /// What is out of the range that the model saw in training; nothing if its manifest has no ranges.
@@ -77,7 +73,7 @@ impl Session {
 
     /// Continues an exported session. Errors: what of the snapshot does not fit the model.
     pub fn restore(model: Arc<Model>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
-        let state = SessionState::restore(snapshot, &model.manifest.name, model.network.spec())?;
+        let state = SessionState::restore(snapshot, &model.manifest.name, model.spec())?;
         Ok(Self { model, state })
     }
 
@@ -92,7 +88,7 @@ impl Session {
         future_actions: Option<&[Action]>,
     ) -> Result<Option<Rollout>, ServingError> {
         let conditioning = ConditioningInput::for_model(&self.model, future_actions, state)?;
-        let spec = self.model.network.spec();
+        let spec = self.model.spec();
         check_size(
             "frame",
             &self.model.manifest.name,
@@ -112,7 +108,7 @@ impl Session {
     /// Predicts one rollout for each plan from the last frame and state: one action for each frame to predict, the same
     /// number in all plans. Empty until the context is full. Errors: `Input` if a plan does not fit the model.
     pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
-        let spec = self.model.network.spec();
+        let spec = self.model.spec();
         let steps = plans.first().map(Vec::len);
         let from = (self.state.robot_state().cloned(), steps);
         let inputs = ConditioningInput::candidates(plans, from, &self.model.manifest.name, spec)?;
@@ -206,8 +202,8 @@ mod tests {
     }
 
     fn check_steps(model: &Model) {
-        let width = model.network.spec().frame_width_px;
-        let spec = model.network.spec();
+        let width = model.spec().frame_width_px;
+        let spec = model.spec();
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
             let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);

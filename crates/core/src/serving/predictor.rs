@@ -189,13 +189,13 @@ mod tests {
     /// A model without context: its computation divides by zero.
     fn panicking_model() -> Model {
         let model = test_model();
-        let parameters = Parameters::initialize(model.network.spec(), Seed(1)).unwrap();
+        let parameters = Parameters::initialize(model.spec(), Seed(1)).unwrap();
         let spec = ModelSpec {
             context: 0,
-            ..model.network.spec().clone()
+            ..model.spec().clone()
         };
         Model {
-            network: Network::detached(model.network.spec().clone(), &parameters)
+            network: Network::detached(model.spec().clone(), &parameters)
                 .unwrap()
                 .with_spec(spec),
             ..model
@@ -203,9 +203,9 @@ mod tests {
     }
 
     fn task(model: &Model) -> Task {
-        let input = worker::blank_input(model.network.spec()).unwrap();
+        let input = worker::blank_input(model.spec()).unwrap();
         Task {
-            conditioning_inputs: vec![input.conditioning("test", model.network.spec()).unwrap()],
+            conditioning_inputs: vec![input.conditioning("test", model.spec()).unwrap()],
             frames: input.frames,
             ..Task::default()
         }

@@ -86,7 +86,7 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
 /// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &Model) -> Result<(), ServingError> {
     let started = Instant::now();
-    local::predict(model, &[&blank_input(model.network.spec())?])?;
+    local::predict(model, &[&blank_input(model.spec())?])?;
     let warm_up_us = micros_since(started);
     info!(model.id = %model.manifest.name, warm_up_us, "first prediction made");
     Ok(())

@@ -75,7 +75,7 @@ fn message(robot: u64, index: u64, workload: &Workload) -> FrameMessage {
 }
 
 fn predict(session: &mut Session, message: &FrameMessage) -> Option<Vec<Frame>> {
-    let spec = session.model().network.spec();
+    let spec = session.model().spec();
     let frame = Frame::new(spec.frame_width_px, spec.frame_height_px, message.image.0.clone()).unwrap();
     let action = message.action.clone().map(|action| Action::try_from(action).unwrap());
     let state = message.state.clone().map(|state| RobotState::try_from(state).unwrap());

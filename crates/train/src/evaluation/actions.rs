@@ -61,7 +61,7 @@ impl Variant {
 /// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, has
 /// seen other data, or lacks neither the action nor the state.
 pub fn twin_variant(loaded: &Model, twin: &Model) -> Result<Variant, EvaluationError> {
-    let (spec, other) = (loaded.network.spec(), twin.network.spec());
+    let (spec, other) = (loaded.spec(), twin.spec());
     let refused = |found: String, wanted: String| EvaluationError::Twin {
         twin: twin.manifest.name.clone(),
         found,
@@ -184,7 +184,7 @@ fn errors_of(
     windows: &[Window],
     source: ActionSource,
 ) -> Result<Vec<Vec<f64>>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let predicted = inference::predict(loaded, dataset, windows, source)?;
     let frames = predicted.par_chunks_exact(spec.horizon * spec.pixels());
     let error = |(frames, window): (&[f32], &Window)| {

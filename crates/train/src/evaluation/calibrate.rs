@@ -46,7 +46,7 @@ pub fn calibrate(
     compatible::check(loaded, dataset)?;
     let split_seed = compatible::split_seed(loaded, dataset, config.split_seed)?;
     let splits = Splits::new(dataset, split_seed);
-    let shape = window_shape(loaded.network.spec());
+    let shape = window_shape(loaded.spec());
     let windows_of = |split| splits.windows(dataset, split, shape, config.stride);
     let (training, validation) = (windows_of(Split::Train)?, windows_of(Split::Validation)?);
     if training.is_empty() || validation.is_empty() {
@@ -72,7 +72,7 @@ pub fn calibrate(
     novelty.quantiles = (0..=QUANTILE_STEPS)
         .map(|step| quantile(distances.clone(), step as f64 / QUANTILE_STEPS as f64) as f32)
         .collect();
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let range = |used: Option<usize>, values: &dyn Fn(usize) -> Vec<f32>| match used {
         Some(channels) => ranges(&training, shape.frames(), channels, values),
         None => Vec::new(),

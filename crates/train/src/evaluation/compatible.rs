@@ -12,7 +12,7 @@ const PERIOD_TOLERANCE: f64 = 0.01;
 
 /// Errors: `FrameSize`, `FramePeriod`, `Channels` where the model cannot run on the data set.
 pub fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
-    let (spec, info) = (loaded.network.spec(), dataset.info());
+    let (spec, info) = (loaded.spec(), dataset.info());
     let model = || loaded.manifest.name.clone();
     if (info.frame_width_px, info.frame_height_px) != (spec.frame_width_px, spec.frame_height_px) {
         return Err(EvaluationError::FrameSize {

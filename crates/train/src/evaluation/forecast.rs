@@ -46,7 +46,7 @@ pub(super) fn contexts(
     windows: &[Window],
     watched: &EvaluationContext,
 ) -> Result<Vec<ContextStatistics>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let mut found = Vec::with_capacity(windows.len());
     for batch in windows.chunks(watched.batch) {
         let ends: Vec<usize> = batch
@@ -72,7 +72,7 @@ fn forecast_batch(
     windows: &[Window],
     novelty: &NoveltyScale,
 ) -> Result<Vec<Forecast>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let (pixels, length) = (spec.pixels(), spec.code_len());
     let predicted = inference::predict_with_codes(loaded, dataset, windows, ActionSource::Recorded)?;
     let contexts = ContextStatistics::of_codes(&loaded.network, &predicted.seen, spec.context)?;

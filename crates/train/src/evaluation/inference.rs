@@ -44,7 +44,7 @@ pub fn predict(
     windows: &[Window],
     source: ActionSource,
 ) -> Result<Vec<f32>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
     let frames = Tensor::from_vec(inputs, (windows.len(), spec.context, spec.pixels()), &Device::Cpu)?;
     let condition = condition(spec, dataset, windows, source)?;
@@ -68,7 +68,7 @@ pub fn predict_with_ceiling(
     dataset: &Dataset,
     windows: &[Window],
 ) -> Result<Predicted, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let frames = predict(loaded, dataset, windows, ActionSource::Recorded)?;
     let truth = model_space(
         dataset,
@@ -89,7 +89,7 @@ pub fn predict_with_ceiling(
 /// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space. Empty if it
 /// does not reconstruct.
 pub fn reconstruct(loaded: &Model, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
-    let (model, spec) = (&loaded.network, loaded.network.spec());
+    let (model, spec) = (&loaded.network, loaded.spec());
     let (batch, context) = (windows.len(), spec.context);
     let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
     let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
@@ -121,7 +121,7 @@ pub(super) fn predict_with_codes(
     windows: &[Window],
     source: ActionSource,
 ) -> Result<PredictedCodes, EvaluationError> {
-    let (model, spec) = (&loaded.network, loaded.network.spec());
+    let (model, spec) = (&loaded.network, loaded.spec());
     let (batch, code) = (windows.len(), spec.code_len());
     let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
     let seen = encode(loaded, &inputs)?;
@@ -139,7 +139,7 @@ pub(super) fn predict_with_codes(
 
 /// Codes of frames in the model's space, both one after another. Errors: those of the network.
 pub(super) fn encode(loaded: &Model, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
-    let pixels = loaded.network.spec().pixels();
+    let pixels = loaded.spec().pixels();
     let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
     values(&loaded.network.encode_frames(&frames)?)
 }

@@ -82,7 +82,7 @@ pub fn identify(
     if !windows.iter().all(drives) {
         return skipped("the camera stands still in this scenario, whatever the plan");
     }
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let contexts = evenly(windows, MAX_CONTEXTS);
     let mut identified = Vec::with_capacity(contexts.len());
     for (first, part) in contexts.chunks((watched.batch / PLANS).max(1)).enumerate() {

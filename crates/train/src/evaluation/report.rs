@@ -186,7 +186,7 @@ pub struct ModelSummary {
 
 impl ModelSummary {
     pub(super) fn of(loaded: &Model) -> Self {
-        let spec = loaded.network.spec();
+        let spec = loaded.spec();
         Self {
             frame_width_px: spec.frame_width_px,
             frame_height_px: spec.frame_height_px,

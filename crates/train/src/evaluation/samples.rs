@@ -47,7 +47,7 @@ pub fn figure_inputs(
 }
 
 fn show(loaded: &Model, dataset: &Dataset, sample: &SampleWindow) -> Result<SampleFigure, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let window = [sample.window()];
     let seen = sample.first_frame..sample.first_frame + spec.context;
     Ok(SampleFigure {
@@ -61,7 +61,7 @@ fn show(loaded: &Model, dataset: &Dataset, sample: &SampleWindow) -> Result<Samp
 }
 
 fn frames(loaded: &Model, values: &[f32]) -> Result<Vec<Frame>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let frame = |values| {
         spec.preprocess
             .frame_from(values, spec.frame_width_px, spec.frame_height_px)
@@ -94,7 +94,7 @@ fn animate(
     (report, split): (&EvaluationReport, Split),
     scores: &SetScores,
 ) -> Result<Option<Animation>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let Some(median) = scores.samples.first() else {
         return Ok(None);
     };

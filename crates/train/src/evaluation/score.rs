@@ -24,7 +24,7 @@ pub fn score(
     baselines: &Baselines,
     watched: &EvaluationContext,
 ) -> Result<Vec<WindowScores>, EvaluationError> {
-    let spec = loaded.network.spec();
+    let spec = loaded.spec();
     let mut scores = Vec::with_capacity(windows.len());
     for batch in windows.chunks(watched.batch) {
         let predicted = predict_with_ceiling(loaded, dataset, batch)?;

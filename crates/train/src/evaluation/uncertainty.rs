@@ -54,7 +54,7 @@ pub(super) fn measure(
         .iter()
         .map(|forecast| f64::from(calibration.novelty.novelty(&forecast.context)))
         .collect();
-    let steps = 0..calibration.steps.len().min(loaded.network.spec().horizon);
+    let steps = 0..calibration.steps.len().min(loaded.spec().horizon);
     let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new(steps.clone().map(of).collect());
     let mean = |value: &dyn Fn(&Forecast) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
     Ok((
@@ -107,7 +107,7 @@ pub(super) fn compare(
     (other, own, limit): (&Dataset, &[f64], usize),
     watched: &EvaluationContext,
 ) -> Result<NoveltyScores, EvaluationError> {
-    let context = loaded.network.spec().context;
+    let context = loaded.spec().context;
     let windows: Vec<Window> = other
         .episodes()
         .iter()
