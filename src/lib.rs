@@ -44,14 +44,14 @@ pub use foreframe_core::frame::{Frame, FrameError};
 #[doc(inline)]
 pub use foreframe_core::nn::{
     Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec, NnError,
-    PredictorOutput, Reconstruction,
+    PredictorOutput, Reconstruction, TensorError,
 };
 #[doc(inline)]
 pub use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,
 };
 #[doc(inline)]
-pub use foreframe_core::registry::{DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load, load_as};
+pub use foreframe_core::registry::{DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load};
 #[doc(inline)]
 pub use foreframe_core::serving::session::{SessionSnapshot, SnapshotError};
 #[doc(inline)]
@@ -65,7 +65,9 @@ pub use foreframe_core::types::{Action, Channel, RobotState, Seed, ValueError};
 /// Image files, the fitting of images to a model, and the measures of a prediction's error.
 pub mod images {
     #[doc(inline)]
-    pub use foreframe_core::frame::codec::{decode, encode_gif, encode_png};
+    pub use foreframe_core::frame::codec::{decode, encode_png};
+    #[doc(inline)]
+    pub use foreframe_core::frame::jpeg::JpegDamage;
     #[doc(inline)]
     pub use foreframe_core::frame::preprocess::Preprocess;
     #[doc(inline)]
@@ -79,6 +81,10 @@ pub mod images {
 /// The simulated room: robots, physics and a camera.
 #[cfg(feature = "sim")]
 pub mod sim {
+    #[doc(inline)]
+    pub use foreframe_sim::pid::Gains;
+    #[doc(inline)]
+    pub use foreframe_sim::scenario::Route;
     #[doc(inline)]
     pub use foreframe_sim::{
         CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, Scenario, SimError, StepResult,
@@ -101,7 +107,10 @@ pub mod dataset {
         Window, WindowShape, collect,
     };
     #[doc(inline)]
-    pub use foreframe_data::inspection::{Inspection, inspect, page};
+    pub use foreframe_data::inspection::{
+        ActionDelay, ChannelRole, ChannelSummary, ExposureJump, FramePlace, FrameTiming, FrozenSpan, Histogram,
+        ImageSummary, Inspection, LagCorrelation, MotionSignal, TimeGap, inspect, page,
+    };
 }
 
 /// Training on a data set.
@@ -112,6 +121,8 @@ pub mod training {
     #[doc(inline)]
     pub use foreframe_train::settings::{SettingsError, SettingsLayer};
     #[doc(inline)]
+    pub use foreframe_train::training::optimizer::OptimizerError;
+    #[doc(inline)]
     pub use foreframe_train::training::{
         Observer, TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, TrainingStage, run,
     };
@@ -121,17 +132,27 @@ pub mod training {
 #[cfg(feature = "train")]
 pub mod evaluation {
     #[doc(inline)]
+    pub use foreframe_train::evaluation::actions::{ActionRow, ActionTable, Variant};
+    #[doc(inline)]
     pub use foreframe_train::evaluation::bootstrap::Interval;
     #[doc(inline)]
-    pub use foreframe_train::evaluation::metrics::{MethodScores, StepCurve};
+    pub use foreframe_train::evaluation::method::Method;
     #[doc(inline)]
-    pub use foreframe_train::evaluation::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
+    pub use foreframe_train::evaluation::metrics::{BenchmarkScores, MethodScores, StepCurve};
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::plans::{PlanIdentification, PlanOutcome};
+    #[doc(inline)]
+    pub use foreframe_train::evaluation::report::{
+        ModelSummary, ReportStamp, SampleWindow, SetOutcome, SetReport, SetScores,
+    };
     #[doc(inline)]
     pub use foreframe_train::evaluation::skill::Skill;
     #[doc(inline)]
+    pub use foreframe_train::evaluation::uncertainty::{NoveltyScores, UncertaintyScores};
+    #[doc(inline)]
     pub use foreframe_train::evaluation::{
         EvaluateConfig, EvaluationError, EvaluationProgress, EvaluationReport, EvaluationStage, ScoredSplit, calibrate,
-        run, write,
+        run,
     };
 }
 

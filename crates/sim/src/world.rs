@@ -152,6 +152,7 @@ impl World {
 
     /// The camera at its current pose.
     #[must_use]
+    #[doc(hidden)]
     pub fn camera(&self) -> Camera {
         Camera::new(&self.config, self.physics.pose(0))
     }

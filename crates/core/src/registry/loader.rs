@@ -43,6 +43,7 @@ pub struct StoredWeights {
     /// The model's description.
     pub manifest: Manifest,
     /// All tensors, as f32.
+    #[doc(hidden)]
     pub parameters: Parameters,
 }
 

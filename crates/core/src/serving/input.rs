@@ -44,6 +44,7 @@ impl PredictionInput {
     }
 
     /// The conditioning input of the prediction. Errors name the field, its value and the expected value.
+    #[doc(hidden)]
     pub fn conditioning(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
         let raw = RawConditioning {
             past: &self.actions,
@@ -62,6 +63,7 @@ impl PredictionInput {
     }
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
+    #[doc(hidden)]
     pub fn into_task(self, model: &str, spec: &ModelSpec) -> Result<Task, InputError> {
         Ok(Task {
             conditioning_inputs: vec![self.checked(model, spec)?],

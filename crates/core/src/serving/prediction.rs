@@ -16,6 +16,7 @@ pub struct Prediction {
     /// The manifest of the model that predicted.
     pub manifest: Arc<Manifest>,
     /// The features of the task's frames, in order.
+    #[doc(hidden)]
     pub features: Vec<Features>,
     /// One rollout for each conditioning input of the task, in order. A [`super::PredictionInput`] has one.
     pub rollouts: Vec<Rollout>,

@@ -113,6 +113,7 @@ impl Predictor {
     /// Computes a task. If it is a step of a session, a batch holds at most one step of that session. Many rollouts are
     /// computed in several parts, so that other requests run between them. Dropping the returned future cancels the task.
     /// Errors: `QueueFull`, `Deadline`, `Stopped`, and the errors of the computation.
+    #[doc(hidden)]
     pub async fn compute(
         &self,
         model: &Arc<Model>,

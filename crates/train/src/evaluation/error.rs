@@ -204,6 +204,7 @@ impl HasErrorKind for EvaluationError {
     }
 }
 
+#[doc(hidden)]
 impl From<candle_core::Error> for EvaluationError {
     fn from(error: candle_core::Error) -> Self {
         Self::Network(error.into())

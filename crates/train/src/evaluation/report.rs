@@ -31,6 +31,7 @@ pub struct EvaluationReport {
     #[serde(default)]
     pub novelty: Vec<NoveltyScores>,
     /// The pictures in the same directory; filled in when they are written.
+    #[doc(hidden)]
     pub figures: Vec<FigureFile>,
 }
 

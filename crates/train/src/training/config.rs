@@ -24,14 +24,19 @@ pub struct TrainConfig {
     /// The origin of all randomness.
     pub seed: Seed,
     /// Settings of the network.
+    #[doc(hidden)]
     pub model: ModelConfig,
     /// Settings of the windows.
+    #[doc(hidden)]
     pub data: DataConfig,
     /// Stage 1, pre-training: the dense codec alone, as an autoencoder of single frames.
+    #[doc(hidden)]
     pub pretrain: PretrainConfig,
     /// Stage 2, sequence training: the recurrent network.
+    #[doc(hidden)]
     pub fit: FitConfig,
     /// Settings of both stages.
+    #[doc(hidden)]
     pub run: RunConfig,
 }
 

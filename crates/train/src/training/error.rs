@@ -168,6 +168,7 @@ impl HasErrorKind for TrainError {
     }
 }
 
+#[doc(hidden)]
 impl From<candle_core::Error> for TrainError {
     fn from(error: candle_core::Error) -> Self {
         Self::Network(error.into())

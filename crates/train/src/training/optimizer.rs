@@ -16,6 +16,7 @@ use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Tensor};
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::nn::Parameters;
+use foreframe_core::nn::TensorError;
 use foreframe_core::nn::tensors::with_values;
 use foreframe_core::vectorized::vectorized;
 
@@ -53,7 +54,14 @@ pub enum OptimizerError {
     },
     /// The tensor library failed.
     #[error("tensor computation failed")]
-    Tensor(#[from] candle_core::Error),
+    Tensor(#[source] TensorError),
+}
+
+#[doc(hidden)]
+impl From<candle_core::Error> for OptimizerError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Tensor(error.into())
+    }
 }
 
 /// How weights are updated.

@@ -105,6 +105,7 @@ impl StateChannels {
 impl ModelSpec {
     /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left
     /// `[B, T, 3]`, in radians and metres. `None` if the model gets no state or the state has no pose.
+    #[doc(hidden)]
     pub fn measured_motion(&self, state: &Tensor, later: &Tensor) -> Result<Option<Tensor>, NnError> {
         let channels = StateChannels::of(self);
         if channels.pose.is_none() {
