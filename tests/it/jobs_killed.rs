@@ -98,7 +98,7 @@ fn train() -> Value {
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 64, "validation_windows": 8},
         "pretrain": {"steps": 40, "batch_size": 16},
-        "fit": {"steps": 120, "batch_size": 16},
+        "sequence": {"steps": 120, "batch_size": 16},
         "run": {"validate_every_steps": 10, "checkpoint_every_steps": 4},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})

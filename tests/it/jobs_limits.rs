@@ -163,14 +163,14 @@ async fn a_training_that_cannot_fit_is_refused_when_submitted() {
     assert_eq!(ended(&app, "job-1").await["state"], "succeeded");
     let mut body = json!({"kind": "train", "name": "big", "preset": "paper", "dataset": "small", "settings": {
         "data": {"windows": "all"}, "model": {"hidden": 2048, "features": 2048},
-        "pretrain": {"steps": 0, "start": "random"}, "fit": {"steps": 10, "batch_size": 4096},
+        "pretrain": {"steps": 0, "start": "random"}, "sequence": {"steps": 10, "batch_size": 4096},
     }});
     let detail = post(&app, JOBS, &body).await.detail(422);
     assert!(
         detail.starts_with("settings: the training needs at least ") && detail.contains("a job can use 4096 MiB"),
         "{detail}"
     );
-    body["settings"]["fit"]["batch_size"] = json!(2);
+    body["settings"]["sequence"]["batch_size"] = json!(2);
     body["settings"]["model"] = json!({"hidden": 16, "features": 16});
     assert_eq!(post(&app, JOBS, &body).await.status, 202);
 }

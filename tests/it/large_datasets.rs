@@ -117,8 +117,8 @@ fn train(dataset: &Dataset, run_dir: &Path) -> PathBuf {
         "data.validation_windows=4",
         "pretrain.steps=20",
         "pretrain.batch_size=8",
-        "fit.steps=20",
-        "fit.batch_size=4",
+        "sequence.steps=20",
+        "sequence.batch_size=4",
         "run.validate_every_steps=10",
         "run.warmup_steps=5",
     ];

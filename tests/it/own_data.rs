@@ -11,7 +11,7 @@ use crate::readme::{checkout, commands, run};
 use crate::recordings;
 
 /// The only difference from the document: the training takes 4 steps instead of 1,500.
-const FEWER_STEPS: &str = " --set fit.steps=4";
+const FEWER_STEPS: &str = " --set sequence.steps=4";
 /// Frames of the recording: 50 s at 20 frames/s.
 const FRAMES: u32 = 1000;
 

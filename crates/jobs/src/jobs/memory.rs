@@ -133,18 +133,18 @@ fn training_mb(config: &TrainConfig, dataset: &DatasetInfo, held_mb: u64) -> u64
     };
     let weights = VALUE * WEIGHT_COPIES * (codec + network);
     let window = count(config.model.context + config.model.horizon);
-    let fit_frames = count(config.fit.batch_size) * window;
-    let fit_values = match config.model.architecture {
+    let sequence_frames = count(config.sequence.batch_size) * window;
+    let sequence_values = match config.model.architecture {
         ArchitectureKind::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
         ArchitectureKind::Flow => FLOW_PIXEL_VALUES * pixels,
     };
-    let fit = VALUE * fit_frames * fit_values;
+    let sequence = VALUE * sequence_frames * sequence_values;
     let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
     let principal = match config.pretrain.start {
         CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,
         CodecStart::Random => 0,
     };
-    let work = [fit, pretrain, principal].into_iter().max().unwrap_or(0);
+    let work = [sequence, pretrain, principal].into_iter().max().unwrap_or(0);
     let decoded = dataset.decoded_bytes();
     let held = if decoded <= held_mb * MIB { decoded } else { 0 };
     let channels = count(dataset.action_channels.len() + dataset.state_channels.len());
@@ -197,7 +197,7 @@ mod tests {
     fn a_huge_training_needs_more_than_a_usual_one() {
         let dataset = frames(1000);
         let usual = TrainConfig::layered("paper", None, &[]).unwrap();
-        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[fit]\nbatch_size = 4096\n";
+        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[sequence]\nbatch_size = 4096\n";
         let huge = TrainConfig::layered("paper", Some(huge), &[]).unwrap();
         let (usual, huge) = (training_mb(&usual, &dataset, 1024), training_mb(&huge, &dataset, 1024));
         assert!(usual < 2048 && huge > 4096, "{usual} {huge}");
