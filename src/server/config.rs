@@ -84,7 +84,7 @@ pub struct ServerConfig {
     /// are dropped.
     pub max_stream_buffer_bytes: usize,
     /// Maximum number of plans in one rollout request.
-    pub max_candidates: usize,
+    pub max_plans: usize,
     /// Maximum size of the predicted images of one rollout request, in bytes before encoding.
     pub max_rollout_bytes: usize,
     /// Maximum number of frames that a request can ask to predict, if that is more than the model's horizon.
@@ -188,7 +188,7 @@ impl Default for ServerConfig {
             max_sessions: 1024,
             max_pipelined_frames: 16,
             max_stream_buffer_bytes: 4 << 20,
-            max_candidates: 512,
+            max_plans: 512,
             max_rollout_bytes: 64 << 20,
             max_steps: 50,
             max_queued_jobs: 16,

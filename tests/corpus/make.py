@@ -151,7 +151,7 @@ def form(*parts):
 
 def bodies():
     predict = {"frames": [RAW] * 3, "format": "raw", "actions": [[0.5, -0.5]], "state": [1.0]}
-    rollouts = {"frames": [RAW] * 3, "format": "raw", "state": [1.0], "candidates": [[[0.5, 0.0], [0.0, 0.5]]] * 3}
+    rollouts = {"frames": [RAW] * 3, "format": "raw", "state": [1.0], "plans": [[[0.5, 0.0], [0.0, 0.5]]] * 3}
     collect = {"kind": "collect", "name": "small", "scenario": "crowded", "trials": 3}
     train = {"kind": "train", "name": "mine", "preset": "moving", "dataset": "none", "settings": {"sequence": {"steps": 10}}}
     evaluate = {"kind": "evaluate", "model": "moving", "dataset": "none"}
@@ -175,8 +175,8 @@ def bodies():
         "422-predict-action-of-three": predict | {"actions": [[1, 2, 3]]},
         "422-predict-action-too-great": predict | {"actions": [[3e38, -3e38]]},
         "422-predict-state-is-null": predict | {"state": None},
-        "422-rollouts-none": rollouts | {"candidates": []},
-        "422-rollouts-ragged": rollouts | {"candidates": [[[0.0, 0.0], [0.0]]]},
+        "422-rollouts-none": rollouts | {"plans": []},
+        "422-rollouts-ragged": rollouts | {"plans": [[[0.0, 0.0], [0.0]]]},
         "422-sessions-unknown-gap": {"model": "moving", "on_gap": "dance"},
         "422-jobs-name-leaves": collect | {"name": "../outside"},
         "422-jobs-dataset-leaves": train | {"dataset": "../../etc"},

@@ -240,7 +240,7 @@ fn predict_reports_invalid_frames_and_actions() {
         ),
         (
             json!({"states": state, "actions": vec![[0.0]; enough]}),
-            "future_actions[0] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
+            "plan[0] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
         ),
     ] {
         let (code, text) = predict(&actions);

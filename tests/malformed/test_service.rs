@@ -84,12 +84,5 @@ fn names_a_place(detail: &str) -> bool {
 }
 
 const FIELDS: [&str; 8] = [
-    "frames",
-    "actions",
-    "state",
-    "states",
-    "candidates",
-    "action",
-    "plan",
-    "episode",
+    "frames", "actions", "state", "states", "plans", "action", "plan", "episode",
 ];
