@@ -106,10 +106,10 @@ pub struct ServerConfig {
     /// Maximum size of the pictures and reports that are kept to answer the same request again, in bytes; 0 keeps none.
     pub max_cached_bytes: usize,
     /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
-    pub job_memory_mb: u64,
-    /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mb`. The
+    pub job_memory_mib: u64,
+    /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mib`. The
     /// frames of a larger data set are decoded once into a file in its directory (`.cache`) and read from there.
-    pub dataset_memory_mb: u64,
+    pub dataset_memory_mib: u64,
     /// After this many attempts in a row that ended abnormally without progress, a job fails.
     pub job_max_attempts: u32,
     /// How long one attempt of a job can run, in seconds; 0 for no limit.
@@ -198,8 +198,8 @@ impl Default for ServerConfig {
             request_threads: 4,
             picture_threads: 1,
             max_cached_bytes: 64 << 20,
-            job_memory_mb: memory::default_limit_mb(),
-            dataset_memory_mb: memory::default_dataset_mb(),
+            job_memory_mib: memory::default_limit_mib(),
+            dataset_memory_mib: memory::default_dataset_mib(),
             job_max_attempts: 3,
             job_time_limit_s: 0,
             job_stall_limit_s: 7_200,
@@ -271,8 +271,8 @@ impl ServerConfig {
     #[must_use]
     pub fn job_memory(&self) -> JobMemory {
         JobMemory {
-            limit_mb: self.job_memory_mb,
-            dataset_mb: self.dataset_memory_mb,
+            limit_mib: self.job_memory_mib,
+            dataset_mib: self.dataset_memory_mib,
         }
     }
 

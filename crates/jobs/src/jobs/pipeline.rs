@@ -296,7 +296,7 @@ impl Pipeline {
 
     fn dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
         let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
-        Dataset::open_within(&fetched, self.memory.held_mb()).map_err(|error| failed(&error))
+        Dataset::open_within(&fetched, self.memory.held_mib()).map_err(|error| failed(&error))
     }
 
     /// Copies a finished data set to the object store, if there is a shared one.
