@@ -41,8 +41,8 @@ pub struct ServerConfig {
     /// The private key of that certificate as a PEM file.
     #[schema(value_type = Option<String>)]
     pub tls_key: Option<PathBuf>,
-    /// If true, this server accepts jobs but leaves the work to workers.
-    pub no_jobs: bool,
+    /// Whether this server runs jobs. If false, it accepts jobs and leaves the work to workers.
+    pub run_jobs: bool,
     /// Maximum size of a request body and of a message of a stream, in bytes.
     pub max_body_bytes: usize,
     /// Maximum size of the request body of a job, in bytes.
@@ -170,7 +170,7 @@ impl Default for ServerConfig {
             import_dir: None,
             tls_certificate: None,
             tls_key: None,
-            no_jobs: false,
+            run_jobs: true,
             max_body_bytes: 8 << 20,
             max_job_bytes: 64 << 10,
             max_frames: 64,

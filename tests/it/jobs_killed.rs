@@ -218,7 +218,10 @@ fn claimed_by_another_machine(whole: &Path) {
         "job_lease_ms=1000",
     ];
     copy_dataset(whole, &shared.path().join("objects"));
-    let (_server, address) = serve(of_server.path(), &[&shared_settings[..], &["--no-jobs"]].concat());
+    let (_server, address) = serve(
+        of_server.path(),
+        &[&shared_settings[..], &["--run-jobs", "false"]].concat(),
+    );
     let start_worker = |dir: &Path| start(dir, &[&["worker"], &shared_settings[..]].concat()).0;
     ask(&address, "POST /v1/jobs", &train());
     assert_eq!(ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"], "queued");
