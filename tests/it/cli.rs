@@ -471,7 +471,7 @@ fn every_command_finds_what_is_in_the_data_directory() {
     assert_eq!(published, "published mine@1; it is the active version\n");
     succeed(
         dir.path(),
-        "evaluate --model mine --data-dir d --resamples 100 --windows 5 --record --out r",
+        "evaluate --model mine --data-dir d --resamples 100 --windows 5 --save-scores --out r",
     );
     let described = succeed(dir.path(), "inspect mine@1 --data-dir d");
     assert!(

@@ -284,7 +284,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     .unwrap();
     let loaded = registry::load(&dir.path().join("run/model")).unwrap();
     let whole = EvaluateConfig {
-        purpose: ScoredSplit::WholeSet,
+        split: ScoredSplit::WholeSet,
         bootstrap_samples: 100,
         ..EvaluateConfig::default()
     };
