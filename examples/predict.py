@@ -462,7 +462,7 @@ def ask(server, model, images, actions, state):
     """A server's prediction of the same frames."""
     request = {"frames": [base64.b64encode(image).decode() for image in images]}
     if actions is not None:
-        request |= {"future_actions": actions, "state": state}
+        request |= {"plan": actions, "state": state}
     body = json.dumps(request).encode()
     url = f"{server}/v1/models/{model}/predict"
     with urllib.request.urlopen(urllib.request.Request(url, body, {"content-type": "application/json"})) as answer:

@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         frames,
         state: recording.states.get(last).cloned(),
         // The action of a frame acts from that frame to the next.
-        future_actions: recording.actions.get(last..last + spec.horizon).map(<[Action]>::to_vec),
+        plan: recording.actions.get(last..last + spec.horizon).map(<[Action]>::to_vec),
         ..PredictionInput::default()
     };
 

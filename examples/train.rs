@@ -18,7 +18,7 @@ const SETTINGS: [&str; 7] = [
     "model.hidden=32",
     "data.windows=200",
     "data.validation_windows=32",
-    "fit.steps=60",
+    "sequence.steps=60",
     "run.validate_every_steps=20",
 ];
 

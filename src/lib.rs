@@ -24,7 +24,7 @@
 //! let input = PredictionInput {
 //!     frames,
 //!     state: Some(RobotState::try_from(vec![2.7, 0.13, 0.64, 0.77, 0.0, -0.8])?),
-//!     future_actions: Some(vec![Action::try_from(vec![0.0, -0.8])?; model.spec().horizon]),
+//!     plan: Some(vec![Action::try_from(vec![0.0, -0.8])?; model.spec().horizon]),
 //!     ..PredictionInput::default()
 //! };
 //! let predictions = predict(&model, &[&input])?;
@@ -62,7 +62,7 @@ pub use foreframe_core::serving::{
 #[doc(inline)]
 pub use foreframe_core::types::{Action, Channel, RobotState, Seed, ValueError};
 
-/// Image files, the fitting of images to a model, and the measures of a prediction's error.
+/// Image files, resizing, and the measures of a prediction's error.
 pub mod images {
     #[doc(inline)]
     pub use foreframe_core::frame::codec::{decode, encode_png};

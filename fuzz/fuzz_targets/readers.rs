@@ -264,8 +264,8 @@ fn checkpoint() -> Vec<u8> {
         "data.windows=20",
         "data.validation_windows=4",
         "pretrain.steps=1",
-        "fit.steps=1",
-        "fit.batch_size=2",
+        "sequence.steps=1",
+        "sequence.batch_size=2",
     ];
     let config = TrainConfig::layered("paper", None, &settings.map(str::to_owned)).unwrap();
     let training = Training {

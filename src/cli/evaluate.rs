@@ -66,7 +66,7 @@ pub(super) struct EvaluateArgs {
     min_skill: Option<f64>,
     /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
-    record: bool,
+    save_scores: bool,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -112,7 +112,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         .collect::<Result<Vec<Dataset>, CliError>>()?;
     let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
-        purpose: match args.split {
+        split: match args.split {
             SplitChoice::Validation => ScoredSplit::Validation,
             SplitChoice::Test => ScoredSplit::Test,
             SplitChoice::All => ScoredSplit::WholeSet,
@@ -136,9 +136,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
     evaluation::write(output.path(), &mut report, &inputs)?;
     output.finish()?;
-    if args.record {
+    if args.save_scores {
         let mut scores = report.headline();
-        if config.purpose == ScoredSplit::Test {
+        if config.split == ScoredSplit::Test {
             // Earlier versions scored unseen pairs and gains as one set.
             scores["test-unseen"] = serde_json::Value::Null;
         }

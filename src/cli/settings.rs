@@ -94,9 +94,9 @@ pub(super) struct ServerArgs {
     /// The port to listen on; replaces the port of --bind
     #[arg(long, value_name = "PORT", help_heading = HEADING)]
     port: Option<u16>,
-    /// Accept jobs, but leave the work to `foreframe worker`
-    #[arg(long, help_heading = HEADING)]
-    no_jobs: bool,
+    /// Whether to run jobs: true, or false to accept them and leave the work to `foreframe worker` [default: true]
+    #[arg(long, value_name = "BOOL", help_heading = HEADING)]
+    run_jobs: Option<bool>,
     /// Accept requests from other machines although no API key exists
     #[arg(long, help_heading = HEADING)]
     insecure: bool,
@@ -114,8 +114,8 @@ impl ServerArgs {
         if let Some(port) = self.port {
             flags.push(SettingsLayer::value("--port", "port", port));
         }
-        if self.no_jobs {
-            flags.push(SettingsLayer::value("--no-jobs", "no_jobs", true));
+        if let Some(run_jobs) = self.run_jobs {
+            flags.push(SettingsLayer::value("--run-jobs", "run_jobs", run_jobs));
         }
         if self.insecure {
             flags.push(SettingsLayer::value("--insecure", "insecure", true));

@@ -15,16 +15,16 @@ use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, Trai
 
 /// Train a model on a data set.
 ///
-/// Training has two stages: pretrain (the frame codec alone) and fit (the recurrent network). The weights with the lowest
+/// Training has two stages: pretrain (the frame codec alone) and sequence (the recurrent network). The weights with the lowest
 /// validation error are kept, and the model is calibrated (see `foreframe calibrate`). A checkpoint is written every few hundred
 /// steps and on Ctrl-C; the same command continues from it, and ends with the same weights as without the interruption.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe train --preset paper --dataset static-observer
-  foreframe train --preset moving --set seed=2 --set fit.steps=4000 --out runs/moving-2
+  foreframe train --preset moving --set seed=2 --set sequence.steps=4000 --out runs/moving-2
   foreframe train --preset paper --print-config > mine.toml
   foreframe train --preset paper --config mine.toml
-  foreframe train --from moving-flow --dataset mine --set name=mine --set fit.steps=300")]
+  foreframe train --from moving-flow --dataset mine --set name=mine --set sequence.steps=300")]
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow,
     /// moving-flow (flow network; moving-flow takes state and actions), recording (flow network, with actions) or moving-mnist
@@ -32,7 +32,7 @@ pub(super) struct TrainArgs {
     #[arg(long, default_value = "paper", conflicts_with = "from")]
     preset: String,
     /// Start from the weights and settings of this model: its directory, name or NAME@VERSION. A few hundred steps are often
-    /// enough, as with --set fit.steps=300
+    /// enough, as with --set sequence.steps=300
     #[arg(long, value_name = "MODEL")]
     from: Option<String>,
     /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving
@@ -45,7 +45,7 @@ pub(super) struct TrainArgs {
     /// A TOML file of training settings, which replace those of the preset
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// One training setting, as in fit.steps=3000; may be repeated, and replaces that of --config
+    /// One training setting, as in sequence.steps=3000; may be repeated, and replaces that of --config
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
     /// Print the training settings and stop
@@ -151,7 +151,7 @@ impl<'a> TrainingDisplay<'a> {
     fn new(progress: &'a ProgressLine, config: &TrainConfig) -> Self {
         Self {
             progress,
-            steps: [config.pretrain.steps, config.fit.steps],
+            steps: [config.pretrain.steps, config.sequence.steps],
             stage: None,
             best: [None; 2],
         }
@@ -217,7 +217,7 @@ impl<'a> TrainingDisplay<'a> {
 }
 
 fn index(stage: TrainingStage) -> usize {
-    usize::from(stage == TrainingStage::Fit)
+    usize::from(stage == TrainingStage::Sequence)
 }
 
 #[cfg(test)]
@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fit_shows_its_own_best_validation() {
+    fn sequence_shows_its_own_best_validation() {
         let progress = ProgressLine::new("steps");
         let config = TrainConfig::preset("paper").unwrap();
         let mut display = TrainingDisplay::new(&progress, &config);
@@ -236,12 +236,12 @@ mod tests {
                 loss,
                 is_best: false,
             });
-            display.message(TrainingStage::Fit, 0.5)
+            display.message(TrainingStage::Sequence, 0.5)
         };
         assert_eq!(validated(TrainingStage::Pretrain, 0.1), "loss 0.500000");
-        validated(TrainingStage::Fit, 0.3);
+        validated(TrainingStage::Sequence, 0.3);
         assert_eq!(
-            validated(TrainingStage::Fit, 0.4),
+            validated(TrainingStage::Sequence, 0.4),
             "loss 0.500000, best validation 0.300000"
         );
     }

@@ -21,8 +21,10 @@ use foreframe_jobs::versions::Versions;
 /// Runs the jobs that servers of the same store accepted: same --data-dir, or same --database-url and --objects-url. On Ctrl-C
 /// or SIGTERM the running job writes its checkpoint and returns to the queue.
 #[derive(clap::Args)]
-#[command(after_help = "Example, beside `foreframe serve --no-jobs` in the same directory:
-  foreframe worker")]
+#[command(
+    after_help = "Example, beside `foreframe serve --run-jobs false` in the same directory:
+  foreframe worker"
+)]
 pub(super) struct WorkerArgs {
     #[command(flatten)]
     settings: CommonArgs,

@@ -46,7 +46,7 @@ impl Workspace {
 
     /// Reads the data set in a directory.
     pub(super) fn read_dataset(&self, dir: &Path) -> Result<Dataset, CliError> {
-        Ok(Dataset::open_within(dir, self.server().dataset_memory_mb)?)
+        Ok(Dataset::open_within(dir, self.server().dataset_memory_mib)?)
     }
 
     /// The directory of a data set, by its directory or its name; fetched if data sets are shared with other servers.

@@ -41,8 +41,8 @@ pub struct ServerConfig {
     /// The private key of that certificate as a PEM file.
     #[schema(value_type = Option<String>)]
     pub tls_key: Option<PathBuf>,
-    /// If true, this server accepts jobs but leaves the work to workers.
-    pub no_jobs: bool,
+    /// Whether this server runs jobs. If false, it accepts jobs and leaves the work to workers.
+    pub run_jobs: bool,
     /// Maximum size of a request body and of a message of a stream, in bytes.
     pub max_body_bytes: usize,
     /// Maximum size of the request body of a job, in bytes.
@@ -84,7 +84,7 @@ pub struct ServerConfig {
     /// are dropped.
     pub max_stream_buffer_bytes: usize,
     /// Maximum number of plans in one rollout request.
-    pub max_candidates: usize,
+    pub max_plans: usize,
     /// Maximum size of the predicted images of one rollout request, in bytes before encoding.
     pub max_rollout_bytes: usize,
     /// Maximum number of frames that a request can ask to predict, if that is more than the model's horizon.
@@ -106,10 +106,10 @@ pub struct ServerConfig {
     /// Maximum size of the pictures and reports that are kept to answer the same request again, in bytes; 0 keeps none.
     pub max_cached_bytes: usize,
     /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
-    pub job_memory_mb: u64,
-    /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mb`. The
+    pub job_memory_mib: u64,
+    /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mib`. The
     /// frames of a larger data set are decoded once into a file in its directory (`.cache`) and read from there.
-    pub dataset_memory_mb: u64,
+    pub dataset_memory_mib: u64,
     /// After this many attempts in a row that ended abnormally without progress, a job fails.
     pub job_max_attempts: u32,
     /// How long one attempt of a job can run, in seconds; 0 for no limit.
@@ -170,7 +170,7 @@ impl Default for ServerConfig {
             import_dir: None,
             tls_certificate: None,
             tls_key: None,
-            no_jobs: false,
+            run_jobs: true,
             max_body_bytes: 8 << 20,
             max_job_bytes: 64 << 10,
             max_frames: 64,
@@ -188,7 +188,7 @@ impl Default for ServerConfig {
             max_sessions: 1024,
             max_pipelined_frames: 16,
             max_stream_buffer_bytes: 4 << 20,
-            max_candidates: 512,
+            max_plans: 512,
             max_rollout_bytes: 64 << 20,
             max_steps: 50,
             max_queued_jobs: 16,
@@ -198,8 +198,8 @@ impl Default for ServerConfig {
             request_threads: 4,
             picture_threads: 1,
             max_cached_bytes: 64 << 20,
-            job_memory_mb: memory::default_limit_mb(),
-            dataset_memory_mb: memory::default_dataset_mb(),
+            job_memory_mib: memory::default_limit_mib(),
+            dataset_memory_mib: memory::default_dataset_mib(),
             job_max_attempts: 3,
             job_time_limit_s: 0,
             job_stall_limit_s: 7_200,
@@ -271,8 +271,8 @@ impl ServerConfig {
     #[must_use]
     pub fn job_memory(&self) -> JobMemory {
         JobMemory {
-            limit_mb: self.job_memory_mb,
-            dataset_mb: self.dataset_memory_mb,
+            limit_mib: self.job_memory_mib,
+            dataset_mib: self.dataset_memory_mib,
         }
     }
 

@@ -130,7 +130,7 @@ impl App {
             .with_import_dir(config.import_dir.clone())
             .with_import_disk(config.import_disk_mib);
         let executor = child::executor(pipeline, config.job_process());
-        let jobs = Jobs::start(store.clone(), config.jobs(), executor, !config.no_jobs)?;
+        let jobs = Jobs::start(store.clone(), config.jobs(), executor, config.run_jobs)?;
         let app = Self::with_parts(
             config,
             AppParts {

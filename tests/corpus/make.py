@@ -151,9 +151,9 @@ def form(*parts):
 
 def bodies():
     predict = {"frames": [RAW] * 3, "format": "raw", "actions": [[0.5, -0.5]], "state": [1.0]}
-    rollouts = {"frames": [RAW] * 3, "format": "raw", "state": [1.0], "candidates": [[[0.5, 0.0], [0.0, 0.5]]] * 3}
+    rollouts = {"frames": [RAW] * 3, "format": "raw", "state": [1.0], "plans": [[[0.5, 0.0], [0.0, 0.5]]] * 3}
     collect = {"kind": "collect", "name": "small", "scenario": "crowded", "trials": 3}
-    train = {"kind": "train", "name": "mine", "preset": "moving", "dataset": "none", "settings": {"fit": {"steps": 10}}}
+    train = {"kind": "train", "name": "mine", "preset": "moving", "dataset": "none", "settings": {"sequence": {"steps": 10}}}
     evaluate = {"kind": "evaluate", "model": "moving", "dataset": "none"}
     small = {"frame_width_px": 16, "frame_height_px": 12}
     environment = {"scenario": "moving-observer", "seed": 7, "world": small}
@@ -175,8 +175,8 @@ def bodies():
         "422-predict-action-of-three": predict | {"actions": [[1, 2, 3]]},
         "422-predict-action-too-great": predict | {"actions": [[3e38, -3e38]]},
         "422-predict-state-is-null": predict | {"state": None},
-        "422-rollouts-none": rollouts | {"candidates": []},
-        "422-rollouts-ragged": rollouts | {"candidates": [[[0.0, 0.0], [0.0]]]},
+        "422-rollouts-none": rollouts | {"plans": []},
+        "422-rollouts-ragged": rollouts | {"plans": [[[0.0, 0.0], [0.0]]]},
         "422-sessions-unknown-gap": {"model": "moving", "on_gap": "dance"},
         "422-jobs-name-leaves": collect | {"name": "../outside"},
         "422-jobs-dataset-leaves": train | {"dataset": "../../etc"},
@@ -184,7 +184,7 @@ def bodies():
         "422-jobs-no-trials": collect | {"trials": 0},
         "422-jobs-unknown-kind": {"kind": "delete", "name": "all"},
         "422-jobs-huge-layer": train | {"settings": {"model": {"hidden": 10**9}}},
-        "422-jobs-null-setting": train | {"settings": {"fit": None}},
+        "422-jobs-null-setting": train | {"settings": {"sequence": None}},
         "422-jobs-seed-below-zero": collect | {"seed": -1},
         "422-environments-huge-frame": environment | {"world": {"frame_width_px": 100000, "frame_height_px": 100000}},
         "422-environments-no-period": environment | {"world": small | {"frame_period_s": 0}},

@@ -82,7 +82,7 @@ async fn targets_after(
     request: impl Fn(u64) -> (String, Value) + Send + 'static,
 ) -> (Store, Vec<String>) {
     let config = ServerConfig {
-        no_jobs: true,
+        run_jobs: false,
         max_queued_jobs: 1000,
         ..ServerConfig::default()
     };
@@ -124,7 +124,7 @@ async fn jobs_in(store: &Store, state: &str) -> BTreeSet<String> {
 /// Queues jobs, and cancels them if `cancelled`.
 async fn with_jobs(dir: &Path, cancelled: bool) {
     let config = ServerConfig {
-        no_jobs: true,
+        run_jobs: false,
         max_queued_jobs: 1000,
         ..ServerConfig::default()
     };

@@ -139,7 +139,7 @@ async fn answers_carry_expected_errors_and_warnings() {
     );
 
     let plans = json!([[[0.5], [9.0]], [[-4.0], [1.0]]]);
-    let request = json!({"frames": frames, "state": [0.75], "candidates": plans});
+    let request = json!({"frames": frames, "state": [0.75], "plans": plans});
     let answer = post(&app, "/v1/models/squares/rollouts", &request).await.json();
     assert_eq!(answer["expected_mse"][1].as_array().unwrap().len(), 2);
     let expected = [
@@ -170,9 +170,9 @@ async fn fewer_and_more_steps_than_the_horizon() {
             format!("steps is {steps}; this server predicts 1 to 50")
         );
     }
-    let rollouts = json!({"frames": context(), "state": [0.5], "candidates": [[[0.5, 0.0]]], "steps": 1});
+    let rollouts = json!({"frames": context(), "state": [0.5], "plans": [[[0.5, 0.0]]], "steps": 1});
     let answer = post(&app, "/v1/models/moving/rollouts", &rollouts).await.json();
-    assert_eq!(answer["futures"][0].as_array().unwrap().len(), 1);
+    assert_eq!(answer["rollouts"][0].as_array().unwrap().len(), 1);
 }
 
 #[tokio::test]

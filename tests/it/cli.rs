@@ -93,15 +93,15 @@ fn usage_errors_exit_with_2_and_advice() {
             "train --preset papper",
             "there is no preset \"papper\"; there are: paper, static, moving",
         ),
-        ("train --set fit.steps=many", "fit.steps"),
-        ("train --set fit.steps=0", "fit.steps is 0; it must be 1 to"),
+        ("train --set sequence.steps=many", "sequence.steps"),
+        ("train --set sequence.steps=0", "sequence.steps is 0; it must be 1 to"),
         ("train --set model.context=0", "the context is 0; it must be at least 1"),
         ("train --config none.toml", "could not read none.toml: No such file"),
         (
-            "train --set fit.stepz=1",
-            "unknown field `stepz` in `fit` (--set); `foreframe train --print-config` lists all settings",
+            "train --set sequence.stepz=1",
+            "unknown field `stepz` in `sequence` (--set); `foreframe train --print-config` lists all settings",
         ),
-        ("train --set fit", "--set fit is not KEY=VALUE"),
+        ("train --set sequence", "--set sequence is not KEY=VALUE"),
         (
             "collect --set max_streamz=1",
             "unknown field `max_streamz` (--set); `foreframe config` lists all settings",
@@ -240,7 +240,7 @@ fn predict_reports_invalid_frames_and_actions() {
         ),
         (
             json!({"states": state, "actions": vec![[0.0]; enough]}),
-            "future_actions[0] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
+            "plan[0] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
         ),
     ] {
         let (code, text) = predict(&actions);
@@ -447,7 +447,7 @@ fn the_next_step_of_a_small_collection_works() {
         assert!(next.contains(&format!("--preset {preset} ")), "{next}");
         succeed(
             dir.path(),
-            &format!("{next} --set fit.steps=1 --set model.features=4 --set model.hidden=4"),
+            &format!("{next} --set sequence.steps=1 --set model.features=4 --set model.hidden=4"),
         );
     }
     let printed = succeed(dir.path(), "collect --trials 2 --frame-size 8 --out tiny");
@@ -465,13 +465,13 @@ fn every_command_finds_what_is_in_the_data_directory() {
         "collect --data-dir d --trials 40 --frame-size 8 --threads 1",
     );
     assert!(dir.path().join("d/datasets/static-observer/meta/info.json").is_file());
-    let small = "--set data.windows=40 --set fit.steps=2 --set model.features=4 --set model.hidden=4";
+    let small = "--set data.windows=40 --set sequence.steps=2 --set model.features=4 --set model.hidden=4";
     succeed(dir.path(), &format!("train --data-dir d {small}"));
     let published = succeed(dir.path(), "publish runs/paper --name mine --data-dir d");
     assert_eq!(published, "published mine@1; it is the active version\n");
     succeed(
         dir.path(),
-        "evaluate --model mine --data-dir d --resamples 100 --windows 5 --record --out r",
+        "evaluate --model mine --data-dir d --resamples 100 --windows 5 --save-scores --out r",
     );
     let described = succeed(dir.path(), "inspect mine@1 --data-dir d");
     assert!(
@@ -554,7 +554,7 @@ fn the_stream_example_says_that_no_server_answers() {
 fn collect_train_and_evaluate_share_default_directories() {
     let dir = tempfile::tempdir().unwrap();
     succeed(dir.path(), "collect --trials 40 --frame-size 8");
-    let small = "--set data.windows=40 --set pretrain.steps=1 --set fit.steps=2 --set model.features=4 \
+    let small = "--set data.windows=40 --set pretrain.steps=1 --set sequence.steps=2 --set model.features=4 \
                  --set model.hidden=4";
     fs::create_dir(dir.path().join("thesis")).unwrap();
     fs::write(dir.path().join("thesis/one.tex"), "precious").unwrap();

@@ -129,7 +129,7 @@ fn validation_scores_are_of_the_validation_split_alone() {
     let dataset = moving_squares(40, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let validation = EvaluateConfig {
-        purpose: ScoredSplit::Validation,
+        split: ScoredSplit::Validation,
         ..config()
     };
     let report = evaluate(&model, &dataset, &validation).unwrap();

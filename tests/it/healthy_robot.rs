@@ -95,7 +95,7 @@ impl ServerWithRobot {
             frames: (first..=seq).map(image).collect(),
             actions: vec![Action::try_from(numbered_frame(seq).action.unwrap()).unwrap()],
             state: RobotState::try_from(numbered_frame(seq).state.unwrap()).ok(),
-            future_actions: None,
+            plan: None,
             steps: None,
         };
         let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0).frames;

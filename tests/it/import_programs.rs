@@ -83,7 +83,7 @@ fn server(dir: &Path) -> RunningServer {
     fs::create_dir(&recordings).unwrap();
     large_video(&recordings.join("large.mp4"));
     let recordings = format!("import_dir={}", recordings.display());
-    RunningServer::start(dir, &["--set", &recordings, "--set", "job_memory_mb=3000"])
+    RunningServer::start(dir, &["--set", &recordings, "--set", "job_memory_mib=3000"])
 }
 
 /// The name of the recording as a job's process gives it to ffmpeg.

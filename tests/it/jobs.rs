@@ -376,7 +376,7 @@ async fn an_invalid_job_is_refused_at_submission() {
             "preset: there is no preset \"papr\"; there are: paper, static, moving",
         ),
         (
-            train(json!({"settings": {"fit": {"stepz": 1}}})),
+            train(json!({"settings": {"sequence": {"stepz": 1}}})),
             422,
             "unknown field `stepz`",
         ),

@@ -21,7 +21,7 @@ fn train() -> Value {
         "model": {"features": 8, "hidden": 8},
         "data": {"windows": 8, "validation_windows": 4},
         "pretrain": {"steps": 2, "batch_size": 4},
-        "fit": {"steps": 200, "batch_size": 4},
+        "sequence": {"steps": 200, "batch_size": 4},
         "run": {"validate_every_steps": 50, "checkpoint_every_steps": 2},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})

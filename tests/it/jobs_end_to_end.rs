@@ -17,7 +17,7 @@ fn train(name: &str, steps: usize) -> Value {
         "model": {"features": 8, "hidden": 8},
         "data": {"windows": 8, "validation_windows": 4},
         "pretrain": {"steps": 3, "batch_size": 4},
-        "fit": {"steps": steps, "batch_size": 4},
+        "sequence": {"steps": steps, "batch_size": 4},
         "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
     });
     json!({"kind": "train", "name": name, "preset": "paper", "dataset": "seen", "settings": settings})
@@ -90,7 +90,10 @@ async fn a_collected_data_set_trains_a_served_model() {
     let curves = get(&app, "/v1/jobs/job-2/metrics").await.json();
     let points = curves["points"].as_array().unwrap();
     let stages: Vec<&str> = points.iter().map(|point| point["stage"].as_str().unwrap()).collect();
-    assert_eq!(stages, ["pretrain", "pretrain", "pretrain", "fit", "fit", "fit"]);
+    assert_eq!(
+        stages,
+        ["pretrain", "pretrain", "pretrain", "sequence", "sequence", "sequence"]
+    );
     let has_validation: Vec<bool> = points.iter().map(|point| point["validation"].is_number()).collect();
     assert_eq!(has_validation, [false, true, true, false, true, true]);
 

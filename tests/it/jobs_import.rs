@@ -79,7 +79,7 @@ async fn wrong_imports_are_refused_with_the_field() {
     fs::write(dir.path().join("secret.csv"), "file\n").unwrap();
     let config = ServerConfig {
         import_dir: Some(recordings),
-        no_jobs: true,
+        run_jobs: false,
         ..ServerConfig::default()
     };
     let app = app(&dir.path().join("data"), config);

@@ -98,7 +98,7 @@ fn train() -> Value {
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 64, "validation_windows": 8},
         "pretrain": {"steps": 40, "batch_size": 16},
-        "fit": {"steps": 120, "batch_size": 16},
+        "sequence": {"steps": 120, "batch_size": 16},
         "run": {"validate_every_steps": 10, "checkpoint_every_steps": 4},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
@@ -218,7 +218,10 @@ fn claimed_by_another_machine(whole: &Path) {
         "job_lease_ms=1000",
     ];
     copy_dataset(whole, &shared.path().join("objects"));
-    let (_server, address) = serve(of_server.path(), &[&shared_settings[..], &["--no-jobs"]].concat());
+    let (_server, address) = serve(
+        of_server.path(),
+        &[&shared_settings[..], &["--run-jobs", "false"]].concat(),
+    );
     let start_worker = |dir: &Path| start(dir, &[&["worker"], &shared_settings[..]].concat()).0;
     ask(&address, "POST /v1/jobs", &train());
     assert_eq!(ask(&address, "GET /v1/jobs/job-1", &Value::Null)["state"], "queued");

@@ -49,7 +49,7 @@ fn child_of(served: &RunningServer, attempt: u64) -> u32 {
 #[test]
 fn a_killed_job_leaves_the_server_running_and_fails_after_three_attempts() {
     let dir = tempfile::tempdir().unwrap();
-    let served = RunningServer::start(dir.path(), &["--set", "job_memory_mb=4000", "--set", "job_threads=1"]);
+    let served = RunningServer::start(dir.path(), &["--set", "job_memory_mib=4000", "--set", "job_threads=1"]);
     // No shard is complete before the kill.
     served.ask("POST", JOBS, &collect("seen", 1_000_000));
     let first = child_of(&served, 1);
@@ -155,7 +155,7 @@ async fn ended(app: &foreframe::server::App, id: &str) -> Value {
 async fn a_training_that_cannot_fit_is_refused_when_submitted() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        job_memory_mb: 4096,
+        job_memory_mib: 4096,
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);
@@ -163,14 +163,14 @@ async fn a_training_that_cannot_fit_is_refused_when_submitted() {
     assert_eq!(ended(&app, "job-1").await["state"], "succeeded");
     let mut body = json!({"kind": "train", "name": "big", "preset": "paper", "dataset": "small", "settings": {
         "data": {"windows": "all"}, "model": {"hidden": 2048, "features": 2048},
-        "pretrain": {"steps": 0, "start": "random"}, "fit": {"steps": 10, "batch_size": 4096},
+        "pretrain": {"steps": 0, "start": "random"}, "sequence": {"steps": 10, "batch_size": 4096},
     }});
     let detail = post(&app, JOBS, &body).await.detail(422);
     assert!(
         detail.starts_with("settings: the training needs at least ") && detail.contains("a job can use 4096 MiB"),
         "{detail}"
     );
-    body["settings"]["fit"]["batch_size"] = json!(2);
+    body["settings"]["sequence"]["batch_size"] = json!(2);
     body["settings"]["model"] = json!({"hidden": 16, "features": 16});
     assert_eq!(post(&app, JOBS, &body).await.status, 202);
 }

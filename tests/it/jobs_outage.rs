@@ -23,7 +23,7 @@ pub(crate) fn training(steps: u32) -> Value {
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 32, "validation_windows": 4},
         "pretrain": {"steps": 0, "start": "random"},
-        "fit": {"steps": steps, "batch_size": 8},
+        "sequence": {"steps": steps, "batch_size": 8},
         "run": {"validate_every_steps": 8, "checkpoint_every_steps": 2},
     });
     json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})

@@ -75,7 +75,7 @@ fn job_threads_of_a_server_have_lower_priority() {
 #[test]
 fn job_threads_of_a_worker_have_lower_priority() {
     let dir = tempfile::tempdir().unwrap();
-    let server = RunningServer::start(dir.path(), &["--no-jobs"]);
+    let server = RunningServer::start(dir.path(), &["--run-jobs", "false"]);
     let worker = Program::start(dir.path(), &["worker", "--set", "job_threads=2"]);
     server.ask("POST", "/v1/jobs", &collect("seen", 100_000));
     server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));

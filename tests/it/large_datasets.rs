@@ -67,7 +67,7 @@ impl Stored {
         let mut command = foreframe(self.dir.path());
         command
             .args(["inspect", "./set"])
-            .env("FOREFRAME_DATASET_MEMORY_MB", "0");
+            .env("FOREFRAME_DATASET_MEMORY_MIB", "0");
         command
     }
 }
@@ -95,8 +95,8 @@ fn frames_from_a_file_equal_those_in_memory() {
 fn only_frames_within_the_limit_are_held_in_memory() {
     // 840 frames and masks of 32×32 px: 1.64 MiB.
     let stored = Stored::squares(60, 32);
-    let held = |memory_mb| {
-        let dataset = Dataset::open_within(&stored.path(), memory_mb).unwrap();
+    let held = |memory_mib| {
+        let dataset = Dataset::open_within(&stored.path(), memory_mib).unwrap();
         let is_borrowed = matches!(dataset.pixels(0).unwrap(), Cow::Borrowed(_));
         (dataset.frame_bytes_in_memory(), is_borrowed)
     };
@@ -117,8 +117,8 @@ fn train(dataset: &Dataset, run_dir: &Path) -> PathBuf {
         "data.validation_windows=4",
         "pretrain.steps=20",
         "pretrain.batch_size=8",
-        "fit.steps=20",
-        "fit.batch_size=4",
+        "sequence.steps=20",
+        "sequence.batch_size=4",
         "run.validate_every_steps=10",
         "run.warmup_steps=5",
     ];
@@ -270,7 +270,7 @@ fn a_directory_that_cannot_be_written_is_named_with_what_to_do() {
     let error = with_causes(&Dataset::open_within(&stored.path(), 0).unwrap_err());
     assert!(
         error.starts_with("could not write the decoded frames of the data set (1 MiB) to")
-            && error.contains("dataset_memory_mb=1"),
+            && error.contains("dataset_memory_mib=1"),
         "{error}"
     );
 }

@@ -224,7 +224,7 @@ fn jobs(server: &RunningServer) {
         "model": {"features": 8, "hidden": 8},
         "data": {"windows": 8, "validation_windows": 4},
         "pretrain": {"steps": 2, "batch_size": 4},
-        "fit": {"steps": 2, "batch_size": 4},
+        "sequence": {"steps": 2, "batch_size": 4},
         "run": {"validate_every_steps": 2, "checkpoint_every_steps": 2},
     });
     post(&json!({"kind": "train", "name": "new", "preset": "paper", "dataset": "seen", "settings": settings}));

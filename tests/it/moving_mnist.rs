@@ -263,8 +263,8 @@ fn a_model_is_trained_and_scored_as_papers_do() {
         "model.flow={ channels = 8, stem_channels = 6, encoder_blocks = 1, decoder_blocks = 1, enlarged_channels = 2, \
          fine_channels = 3, scene_hidden = 8, frames_read = 10, recurrent = true }",
         "data.validation_windows=2",
-        "fit.steps=2",
-        "fit.batch_size=2",
+        "sequence.steps=2",
+        "sequence.batch_size=2",
     ];
     let preset = TrainConfig::preset("moving-mnist").unwrap().model_spec(&seen, &[]);
     assert!((35_000_000..36_000_000).contains(&preset.multiply_adds_per_frame()));
@@ -284,7 +284,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     .unwrap();
     let loaded = registry::load(&dir.path().join("run/model")).unwrap();
     let whole = EvaluateConfig {
-        purpose: ScoredSplit::WholeSet,
+        split: ScoredSplit::WholeSet,
         bootstrap_samples: 100,
         ..EvaluateConfig::default()
     };

@@ -139,7 +139,7 @@ fn a_future_does_not_depend_on_those_beside_it() {
         let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
         let windows: Vec<u32> = (0..40).map(|row| row % 2).collect();
         let (seen, told) = (frames(&spec, 2), condition(&spec, windows.len()));
-        let together = model.predict_futures(&seen, &windows, &told).unwrap();
+        let together = model.predict_rollouts(&seen, &windows, &told).unwrap();
         for row in [0, 17, 39] {
             let row_of = |tensor: &Tensor| tensor.narrow(0, row, 1).unwrap();
             let told = ConditioningTensors {
@@ -147,7 +147,7 @@ fn a_future_does_not_depend_on_those_beside_it() {
                 state: told.state.as_ref().map(row_of),
             };
             let window = seen.narrow(0, windows[row] as usize, 1).unwrap();
-            let alone = model.predict_futures(&window, &[0], &told).unwrap();
+            let alone = model.predict_rollouts(&window, &[0], &told).unwrap();
             assert!(largest_difference(&alone, &row_of(&together)) < 1e-6);
         }
     }

@@ -284,7 +284,7 @@ async fn an_address_with_all_its_connections_busy_leaves_room_for_others() {
 async fn watchers_of_a_job_leave_the_places_of_streams() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        no_jobs: true,
+        run_jobs: false,
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);

@@ -11,7 +11,7 @@ use crate::readme::{checkout, commands, run};
 use crate::recordings;
 
 /// The only difference from the document: the training takes 4 steps instead of 1,500.
-const FEWER_STEPS: &str = " --set fit.steps=4";
+const FEWER_STEPS: &str = " --set sequence.steps=4";
 /// Frames of the recording: 50 s at 20 frames/s.
 const FRAMES: u32 = 1000;
 
@@ -60,7 +60,7 @@ fn five_commands_turn_a_recording_into_a_served_model() {
         )
     };
     let frames: Vec<String> = (0..5).map(|index| STANDARD.encode(image(4 * index).unwrap())).collect();
-    let body = json!({"frames": frames, "resize": "crop", "future_actions": vec![[0.1, 0.5]; 5]});
+    let body = json!({"frames": frames, "resize": "crop", "plan": vec![[0.1, 0.5]; 5]});
     let answer = server.ask("POST", "/v1/models/mycar/predict", &body);
     assert_eq!(answer["frames"].as_array().map(Vec::len), Some(5), "{answer}");
 }

@@ -113,7 +113,7 @@ async fn dots_in_paths_are_not_resolved() {
 async fn names_in_jobs_cannot_leave_the_data_directory() {
     let config = ServerConfig {
         import_dir: Some(env!("CARGO_MANIFEST_DIR").into()),
-        no_jobs: true,
+        run_jobs: false,
         ..ServerConfig::default()
     };
     let mut setup = ServerWithRobot::open(config).await;

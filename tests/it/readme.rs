@@ -39,7 +39,7 @@ const REPLACED: [(&str, &str); 11] = [
     ("--trials 5000", "--trials 60"),
     (
         "foreframe train ",
-        "foreframe train --set data.windows=16 --set data.validation_windows=4 --set pretrain.steps=2 --set fit.steps=2 ",
+        "foreframe train --set data.windows=16 --set data.validation_windows=4 --set pretrain.steps=2 --set sequence.steps=2 ",
     ),
     (
         "foreframe evaluate ",

@@ -54,7 +54,7 @@ async fn rollouts_resize_their_frames_as_asked() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let body = |frames: &[Frame], resize: Option<&str>| {
-        let mut body = json!({"frames": files(frames), "state": [0.0], "candidates": [[[0.1, 0.0], [0.1, 0.0]]]});
+        let mut body = json!({"frames": files(frames), "state": [0.0], "plans": [[[0.1, 0.0], [0.1, 0.0]]]});
         if let Some(resize) = resize {
             body["resize"] = json!(resize);
         }
@@ -68,7 +68,7 @@ async fn rollouts_resize_their_frames_as_asked() {
     let expected = post(&app, path, &body(&resized, None)).await.json();
     let answer = post(&app, path, &body(&large_frames(), Some("crop"))).await.json();
     assert!(
-        answer["futures"].is_array() && answer["futures"] == expected["futures"],
+        answer["rollouts"].is_array() && answer["rollouts"] == expected["rollouts"],
         "{answer}"
     );
 }

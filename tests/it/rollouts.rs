@@ -20,7 +20,7 @@ use crate::service::{
 const ROLLOUTS: &str = "/v1/models/moving/rollouts";
 const PLAIN_PREDICT: &str = "/v1/models/plain/predict";
 
-fn candidates(count: usize) -> Vec<Value> {
+fn plans(count: usize) -> Vec<Value> {
     (0..count)
         .map(|index| {
             let value = index as f32 / 8.0 - 3.0;
@@ -48,17 +48,17 @@ async fn batched_rollouts_equal_single_predictions() {
     let raw: Vec<String> = (0..CONTEXT as u8)
         .map(|i| STANDARD.encode(frame(i * 10).pixels()))
         .collect();
-    let candidates = candidates(300);
-    let body = json!({"frames": raw, "format": "raw", "state": [0.5], "candidates": candidates});
+    let plans = plans(300);
+    let body = json!({"frames": raw, "format": "raw", "state": [0.5], "plans": plans});
     let answer = post(&app, ROLLOUTS, &body).await.json();
-    let futures = answer["futures"].as_array().unwrap();
-    assert_eq!((futures.len(), &answer["format"]), (300, &json!("raw")));
+    let rollouts = answer["rollouts"].as_array().unwrap();
+    assert_eq!((rollouts.len(), &answer["format"]), (300, &json!("raw")));
     for index in [0, 1, 150, 299] {
-        let body = json!({"frames": raw, "format": "raw", "state": [0.5], "future_actions": candidates[index]});
+        let body = json!({"frames": raw, "format": "raw", "state": [0.5], "plan": plans[index]});
         let alone = post(&app, "/v1/models/moving/predict", &body).await.json();
-        assert!(largest_pixel_difference(&futures[index], &alone["frames"]) <= 1);
+        assert!(largest_pixel_difference(&rollouts[index], &alone["frames"]) <= 1);
     }
-    assert!(largest_pixel_difference(&futures[0], &futures[299]) > 0);
+    assert!(largest_pixel_difference(&rollouts[0], &rollouts[299]) > 0);
 }
 
 #[tokio::test]
@@ -70,7 +70,7 @@ async fn other_requests_are_answered_during_a_large_rollout() {
     };
     let config = with_data(dir.path(), ServerConfig::default());
     let app = start(config, vec![model(dir.path(), "slow", spec)]);
-    let rollouts = json!({"frames": context(), "state": [0.5], "candidates": candidates(300)});
+    let rollouts = json!({"frames": context(), "state": [0.5], "plans": plans(300)});
     let mut rollouts = pin!(post(&app, "/v1/models/slow/rollouts", &rollouts));
     let single = json!({"frames": context(), "state": [0.5], "actions": [[0.0, 0.0]]});
     let mut answered = 0;
@@ -88,7 +88,7 @@ async fn other_requests_are_answered_during_a_large_rollout() {
 async fn rollouts_are_answered_as_png_or_gif() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
-    let body = |count| json!({"frames": context(), "state": [0.5], "candidates": candidates(count)}).to_string();
+    let body = |count| json!({"frames": context(), "state": [0.5], "plans": plans(count)}).to_string();
     let sheet = post_text(&app, ROLLOUTS, body(4), "image/png").await;
     let sheet = codec::decode(&sheet.body).unwrap();
     assert!(sheet.width() > CONTEXT as u32 * WIDTH && sheet.height() > 5 * HEIGHT);
@@ -103,41 +103,41 @@ async fn rollouts_are_answered_as_png_or_gif() {
 }
 
 #[tokio::test]
-async fn invalid_candidates_are_refused_with_the_field() {
+async fn invalid_plans_are_refused_with_the_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        max_candidates: 8,
+        max_plans: 8,
         max_rollout_bytes: 4 * 2 * (WIDTH * HEIGHT) as usize,
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);
-    let with = |candidates: Value| json!({"frames": context(), "state": [0.5], "candidates": candidates});
+    let with = |plans: Value| json!({"frames": context(), "state": [0.5], "plans": plans});
     for (body, status, detail) in [
-        (with(json!([])), 422, "candidates is empty; give at least one plan"),
+        (with(json!([])), 422, "plans is empty; give at least one plan"),
         (
             with(json!([[[0, 0]]])),
             422,
-            "candidates[0] holds 1 actions; model \"moving\" takes 2",
+            "plans[0] holds 1 actions; model \"moving\" takes 2",
         ),
         (
             with(json!([[[0, 0], [0, 0]], [[0, 0], [0]]])),
             422,
-            "candidates[1][1] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
+            "plans[1][1] holds 1 numbers; model \"moving\" takes 2: linear m/s, angular rad/s",
         ),
         (
-            with(json!(candidates(9))),
+            with(json!(plans(9))),
             413,
-            "candidates holds 9; this server takes at most 8 in a request",
+            "plans holds 9; this server takes at most 8 in a request",
         ),
         (
-            with(json!(candidates(5))),
+            with(json!(plans(5))),
             413,
             "the rollouts would be 1920 bytes of images; this server predicts at most 1536 in a request",
         ),
     ] {
         assert_eq!(post(&app, ROLLOUTS, &body).await.detail(status), detail);
     }
-    let unconditioned = post(&app, "/v1/models/plain/rollouts", &with(json!(candidates(2))))
+    let unconditioned = post(&app, "/v1/models/plain/rollouts", &with(json!(plans(2))))
         .await
         .detail(422);
     assert!(
@@ -153,7 +153,7 @@ async fn session_rollouts_equal_stateless_rollouts() {
     let server = run(app.clone()).await;
     let session = SessionHandle::open(&app, &json!({"model": "moving"})).await;
     let path = session.path("/rollouts");
-    let body = json!({"candidates": candidates(20), "format": "raw"});
+    let body = json!({"plans": plans(20), "format": "raw"});
     let mut client = Client::connect(server.address, &session.path("/stream"), Codec::Msgpack)
         .await
         .unwrap();
@@ -165,18 +165,18 @@ async fn session_rollouts_equal_stateless_rollouts() {
         );
         client.ask(&numbered_message(seq)).await;
     }
-    let futures = post(&app, &path, &body).await.json();
+    let rollouts = post(&app, &path, &body).await.json();
     let raw: Vec<String> = (0..CONTEXT as u64)
         .map(|seq| STANDARD.encode(&numbered_frame(seq).image.0))
         .collect();
     let state = numbered_frame(CONTEXT as u64 - 1).state;
-    let stateless = json!({"frames": raw, "format": "raw", "state": state, "candidates": candidates(20)});
+    let stateless = json!({"frames": raw, "format": "raw", "state": state, "plans": plans(20)});
     let stateless = post(&app, ROLLOUTS, &stateless).await.json();
-    for (found, expected) in futures["futures"]
+    for (found, expected) in rollouts["rollouts"]
         .as_array()
         .unwrap()
         .iter()
-        .zip(stateless["futures"].as_array().unwrap())
+        .zip(stateless["rollouts"].as_array().unwrap())
     {
         assert!(largest_pixel_difference(found, expected) <= 1);
     }

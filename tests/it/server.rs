@@ -60,11 +60,11 @@ async fn raw_frames_are_answered_with_raw_frames() {
 }
 
 #[tokio::test]
-async fn without_future_actions_the_last_action_repeats() {
+async fn without_a_plan_the_last_action_repeats() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());
     let ask = async |actions: Value, future: Value, state: Value| {
-        let mut body = json!({"frames": context(), "actions": actions, "future_actions": future});
+        let mut body = json!({"frames": context(), "actions": actions, "plan": future});
         body.as_object_mut().unwrap().extend(state.as_object().unwrap().clone());
         post(&app, MOVING, &body).await.json()["frames"].clone()
     };
@@ -137,7 +137,7 @@ async fn mismatched_inputs_are_refused_with_the_field() {
         (
             MOVING,
             moving(json!({"actions": []})),
-            "future_actions is missing; model \"moving\" takes linear m/s, angular rad/s",
+            "plan is missing; model \"moving\" takes linear m/s, angular rad/s",
         ),
         (
             MOVING,
@@ -146,8 +146,8 @@ async fn mismatched_inputs_are_refused_with_the_field() {
         ),
         (
             MOVING,
-            moving(json!({"future_actions": [[1.0, 2.0]]})),
-            "future_actions holds 1 actions; model \"moving\" takes 2",
+            moving(json!({"plan": [[1.0, 2.0]]})),
+            "plan holds 1 actions; model \"moving\" takes 2",
         ),
         (
             MOVING,

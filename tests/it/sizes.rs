@@ -51,8 +51,8 @@ fn trains_and_predicts(preset: &str, [width, height, context, horizon]: [usize; 
         "data.windows=8".to_owned(),
         "data.validation_windows=2".to_owned(),
         "pretrain.steps=0".to_owned(),
-        "fit.steps=2".to_owned(),
-        "fit.batch_size=2".to_owned(),
+        "sequence.steps=2".to_owned(),
+        "sequence.batch_size=2".to_owned(),
     ];
     let small: &[&str] = match preset {
         "static-flow" => &[

@@ -88,7 +88,7 @@ fn report(line: &str) -> JobReport {
         progress: "{\"done\":1}".to_owned(),
         lines: vec![(2.0, line.to_owned())],
         losses: vec![LossRow {
-            stage: "fit".to_owned(),
+            stage: "sequence".to_owned(),
             step: 4,
             train: Some(0.5),
             validation: None,

@@ -155,7 +155,7 @@ fn a_server_survives_a_database_that_goes_away() {
     postgres.start();
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
-    let server = RunningServer::start(dir.path(), &["--no-jobs", "--database-url", &url]);
+    let server = RunningServer::start(dir.path(), &["--run-jobs", "false", "--database-url", &url]);
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("before"))["id"], "job-1");
 
     postgres.stop();
@@ -189,7 +189,7 @@ fn a_database_that_only_reads_for_a_while_refuses_writes_until_later() {
     postgres.start();
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
-    let server = RunningServer::start(dir.path(), &["--no-jobs", "--database-url", &url]);
+    let server = RunningServer::start(dir.path(), &["--run-jobs", "false", "--database-url", &url]);
     let create = |name: &str| server.ask("POST", "/v1/jobs", &collect(name));
     let read_only = |value: &str| {
         let setting = format!("ALTER SYSTEM SET default_transaction_read_only = {value}");

@@ -101,7 +101,8 @@ fn a_clock_that_is_an_hour_wrong_changes_no_lease_and_no_key() {
             "key_refresh_ms=100",
         ];
         let key = text(&created.stdout);
-        let server = RunningServer::start(dir.path(), &[&["--no-jobs"], &settings[..]].concat()).with_key(key.trim());
+        let server =
+            RunningServer::start(dir.path(), &[&["--run-jobs", "false"], &settings[..]].concat()).with_key(key.trim());
         assert_eq!(status(&server.get("/v1/jobs")), "200");
         let collect = json!({"kind": "collect", "name": "a", "scenario": "static-observer", "trials": 400});
         assert_eq!(server.ask("POST", "/v1/jobs", &collect)["id"], "job-1");

@@ -26,7 +26,7 @@ async fn enqueue(store: &Store) -> Result<EnqueueResult, StoreError> {
     store.enqueue(new, 1_000_000, 0.0).await
 }
 
-/// A mounted file system of a few megabytes.
+/// A mounted file system of a few size_mib.
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {

@@ -81,7 +81,7 @@ impl Recording {
             frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
             actions: Action::try_from(self.actions[seq].clone()).into_iter().collect(),
             state: RobotState::try_from(self.states[seq].clone()).ok(),
-            future_actions: None,
+            plan: None,
             steps: None,
         };
         serving::predict(model, &[&input]).unwrap().remove(0).frames
@@ -163,7 +163,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
         };
-        let together = model.network.predict_futures(&features, &windows, &condition).unwrap();
+        let together = model.network.predict_rollouts(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
             let row = |tensor: &Option<Tensor>| tensor.as_ref().map(|tensor| tensor.narrow(0, future, 1).unwrap());
             let condition = foreframe_core::nn::ConditioningTensors {

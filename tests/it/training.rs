@@ -24,8 +24,8 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         "name=square",
         "data.windows=40",
         "data.validation_windows=4",
-        "fit.steps=12",
-        "fit.batch_size=4",
+        "sequence.steps=12",
+        "sequence.batch_size=4",
         "model.flow={ channels = 8, stem_channels = 6, enlarged_channels = 3, fine_channels = 5, scene_hidden = 8 }",
         "run.validate_every_steps=5",
         "run.checkpoint_every_steps=4",
@@ -36,8 +36,8 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         "model.flow.recurrent=true",
         "data.mirror=movers",
         "data.reverse=true",
-        "fit.short_share=0.5",
-        "fit.short_horizon=2",
+        "sequence.short_share=0.5",
+        "sequence.short_horizon=2",
         "run.optimizer=muon",
     ];
     let dataset = squares(20);
@@ -56,7 +56,7 @@ fn a_resumed_flow_training_ends_with_the_same_bits() {
         let changes = [
             "data.mirror=off",
             "data.reverse=false",
-            "fit.short_share=0",
+            "sequence.short_share=0",
             "run.optimizer=adam",
         ];
         for without in changes {
@@ -82,13 +82,13 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
         ),
         (
             "paper",
-            "fit.short_share=0.5",
-            "fit.short_share is for the flow network only; it must be 0 where model.architecture is dense",
+            "sequence.short_share=0.5",
+            "sequence.short_share is for the flow network only; it must be 0 where model.architecture is dense",
         ),
         (
             "static-flow",
-            "fit={ short_share = 0.5, short_horizon = 6 }",
-            "fit.short_horizon is 6; it must be 1 to model.horizon, 5",
+            "sequence={ short_share = 0.5, short_horizon = 6 }",
+            "sequence.short_horizon is 6; it must be 1 to model.horizon, 5",
         ),
         (
             "moving-flow",
@@ -130,8 +130,8 @@ fn small_config(extra: &[&str]) -> TrainConfig {
         "data.validation_windows=4",
         "pretrain.steps=30",
         "pretrain.batch_size=8",
-        "fit.steps=30",
-        "fit.batch_size=4",
+        "sequence.steps=30",
+        "sequence.batch_size=4",
         "run.validate_every_steps=10",
         "run.checkpoint_every_steps=7",
         "run.warmup_steps=5",
@@ -213,7 +213,7 @@ fn training_lowers_the_loss_and_publishes_a_model() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
         "pretrain.steps=300",
-        "fit.steps=300",
+        "sequence.steps=300",
         "pretrain.start=random",
         "pretrain.learning_rate=1e-2",
         "model.features=16",
@@ -272,11 +272,11 @@ fn first_loss(config: &TrainConfig, dataset: &Dataset, start: Option<&StoredWeig
 #[test]
 fn a_training_can_start_from_a_model() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
-    train(&small_config(&["fit.steps=200"]), &dataset, dir.path()).unwrap();
+    train(&small_config(&["sequence.steps=200"]), &dataset, dir.path()).unwrap();
     let start = registry::load_weights(&dir.path().join("model")).unwrap();
-    let layers = ["fit.steps=2", "seed=7"].map(|setting| SettingsLayer::assignment(setting).unwrap());
+    let layers = ["sequence.steps=2", "seed=7"].map(|setting| SettingsLayer::assignment(setting).unwrap());
     let config = TrainConfig::of_model(&start.manifest, layers).unwrap();
-    assert_eq!((config.pretrain.steps, config.fit.steps), (0, 2));
+    assert_eq!((config.pretrain.steps, config.sequence.steps), (0, 2));
     let (tuned, new) = (
         first_loss(&config, &dataset, Some(&start)).unwrap(),
         first_loss(&config, &dataset, None).unwrap(),
@@ -290,8 +290,11 @@ fn a_fine_tuned_model_names_its_origin_and_can_be_tuned_again() {
     train(&small_config(&[]), &dataset, &dir.path().join("first")).unwrap();
     let mut start = registry::load_weights(&dir.path().join("first/model")).unwrap();
     for name in ["second", "third"] {
-        let config =
-            TrainConfig::of_model(&start.manifest, [SettingsLayer::assignment("fit.steps=3").unwrap()]).unwrap();
+        let config = TrainConfig::of_model(
+            &start.manifest,
+            [SettingsLayer::assignment("sequence.steps=3").unwrap()],
+        )
+        .unwrap();
         let run_dir = dir.path().join(name);
         let training = Training {
             config: &config,
@@ -311,7 +314,7 @@ fn a_fine_tuned_model_names_its_origin_and_can_be_tuned_again() {
 #[test]
 fn weights_for_other_units_are_refused() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
-    train(&small_config(&["fit.steps=2"]), &dataset, dir.path()).unwrap();
+    train(&small_config(&["sequence.steps=2"]), &dataset, dir.path()).unwrap();
     let mut start = registry::load_weights(&dir.path().join("model")).unwrap();
     start.manifest.spec.actions[0].unit = "km/h".to_owned();
     let message = first_loss(&small_config(&[]), &dataset, Some(&start))
@@ -402,11 +405,11 @@ fn a_finished_run_is_not_trained_again() {
 fn a_diverging_run_keeps_its_last_good_checkpoint() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     let config = small_config(&[
-        "fit.learning_rate=1",
-        "fit.codec=fine-tuned",
+        "sequence.learning_rate=1",
+        "sequence.codec=fine-tuned",
         "run.clip_norm=1e6",
         "run.warmup_steps=0",
-        "fit.steps=500",
+        "sequence.steps=500",
     ]);
     let error = train(&config, &dataset, dir.path()).unwrap_err();
     let TrainError::Diverged {
@@ -418,7 +421,7 @@ fn a_diverging_run_keeps_its_last_good_checkpoint() {
     else {
         panic!("{error}")
     };
-    assert_eq!(stage.to_string(), "fit");
+    assert_eq!(stage.to_string(), "sequence");
     assert!(checkpoint_step < step && step - checkpoint_step <= 7, "{error}");
     assert!(dir.path().join("checkpoint.safetensors").is_file());
     assert!(!dir.path().join("model").exists());
@@ -442,6 +445,27 @@ fn a_run_with_other_settings_or_data_is_not_resumed() {
         .unwrap_err()
         .to_string();
     assert!(error.contains("holds a run with another data set"), "{error}");
+}
+
+#[test]
+fn a_run_or_model_with_the_old_settings_is_refused_with_their_new_name() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
+    let config = dir.path().join("config.toml");
+    let text = std::fs::read_to_string(&config).unwrap();
+    std::fs::write(&config, text.replace("[sequence]", "[fit]")).unwrap();
+    let error = train(&small_config(&[]), &dataset, dir.path()).unwrap_err();
+    assert!(
+        error.to_string().starts_with("`fit` is now called `sequence`"),
+        "{error}"
+    );
+
+    let mut manifest = registry::manifest::read(std::path::Path::new("models/paper")).unwrap();
+    let settings = manifest.training.as_object_mut().unwrap();
+    let sequence = settings.remove("sequence").unwrap();
+    settings.insert("fit".to_owned(), sequence);
+    let error = TrainConfig::of_model(&manifest, []).unwrap_err();
+    assert_eq!(error.to_string(), "`fit` is now called `sequence` (model paper)");
 }
 
 #[test]
@@ -525,7 +549,11 @@ fn actions_that_never_change_are_refused_unless_allowed() {
          learns nothing from them: use a preset for a standing camera, or model.conditioning=none, or allow it with \
          data.constant_actions=true"
     );
-    let allowed = small_config(&["model.conditioning=action", "data.constant_actions=true", "fit.steps=2"]);
+    let allowed = small_config(&[
+        "model.conditioning=action",
+        "data.constant_actions=true",
+        "sequence.steps=2",
+    ]);
     train(&allowed, &standing(None), dir.path()).unwrap();
 }
 

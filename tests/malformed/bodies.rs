@@ -67,8 +67,8 @@ fn import(name: &str, state: &str) -> Answer {
         let session = answer.json();
         let text = |field: &str| session[field].as_str().unwrap().to_owned();
         let path = |rest| format!("/v1/sessions/{}{rest}?token={}", text("id"), text("token"));
-        let candidates = json!({"candidates": [[[0.5, 0.0], [0.0, 0.5]]], "format": "raw"}).to_string();
-        let ahead = SERVICE.json(name, &path("/rollouts"), candidates.into());
+        let plans = json!({"plans": [[[0.5, 0.0], [0.0, 0.5]]], "format": "raw"}).to_string();
+        let ahead = SERVICE.json(name, &path("/rollouts"), plans.into());
         let expected = if session["have"] == session["need"] { 200 } else { 409 };
         assert_eq!(ahead.status, expected, "{name}");
         SERVICE.delete(&path(""));
@@ -126,8 +126,8 @@ fn request_memory_is_bounded_by_the_body_length() {
         ("/v1/models/moving/predict", filled(r#"{"frames":["#, r#""","#, long)),
         ("/v1/models/moving/predict", filled(r#"{"state":["#, "0,", long)),
         ("/v1/models/moving/predict", filled(r#"{"colour":["#, "0,", long)),
-        ("/v1/models/moving/rollouts", filled(r#"{"candidates":["#, "[],", long)),
-        ("/v1/models/moving/rollouts", filled(r#"{"candidates":[["#, "[],", long)),
+        ("/v1/models/moving/rollouts", filled(r#"{"plans":["#, "[],", long)),
+        ("/v1/models/moving/rollouts", filled(r#"{"plans":[["#, "[],", long)),
         (
             "/v1/sessions",
             filled(r#"{"state":{"snapshot":{"features":["#, "[],", long),

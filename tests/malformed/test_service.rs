@@ -30,7 +30,7 @@ pub(crate) static SERVICE: LazyLock<TestService> = LazyLock::new(|| {
     let dir = tempfile::tempdir().unwrap();
     let runtime = Runtime::new().unwrap();
     let config = ServerConfig {
-        no_jobs: true,
+        run_jobs: false,
         max_queued_jobs: 10_000,
         session_grace_ms: 1000,
         max_sessions: 100_000,
@@ -84,12 +84,5 @@ fn names_a_place(detail: &str) -> bool {
 }
 
 const FIELDS: [&str; 8] = [
-    "frames",
-    "actions",
-    "state",
-    "states",
-    "candidates",
-    "action",
-    "plan",
-    "episode",
+    "frames", "actions", "state", "states", "plans", "action", "plan", "episode",
 ];

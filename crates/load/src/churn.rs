@@ -42,9 +42,9 @@ pub(crate) struct ChurnArgs {
     /// Concurrent clients, each with a kept-alive connection
     #[arg(long, default_value_t = 8)]
     workers: usize,
-    /// Bound: growth of the server's memory in MB after the warm-up
+    /// Bound: growth of the server's memory in MiB after the warm-up
     #[arg(long, default_value_t = 10.0)]
-    growth_mb: f64,
+    growth_mib: f64,
 }
 
 /// The repeated work.
@@ -83,7 +83,7 @@ pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
     let before = server.process.usage();
     println!("after the warm-up: {}", list(&before));
     // The server returns memory of its start with a delay: after the first part it may use less than after the warm-up.
-    let mut least_mb = before.rss_mb;
+    let mut least_mib = before.rss_mib;
     for (task, count, _, name) in &tasks {
         let (since, part) = (Instant::now(), count / PARTS);
         for done in 1..=PARTS {
@@ -91,7 +91,7 @@ pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
             let usage = server.process.usage();
             println!("after {} {name}: {}", done * part, list(&usage));
             if done == 1 {
-                least_mb = least_mb.min(usage.rss_mb);
+                least_mib = least_mib.min(usage.rss_mib);
             }
         }
         println!("{:.0} {name}/s", (PARTS * part) as f64 / since.elapsed().as_secs_f64());
@@ -102,9 +102,9 @@ pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
     );
     let after = settled(&server, &before).await;
     println!("at the end: {}", list(&after));
-    let growth_mb = after.rss_mb - least_mb;
-    let what = format!("memory grew by {growth_mb:.1} MB; limit {} MB", args.growth_mb);
-    bounds.check(growth_mb <= args.growth_mb, what);
+    let growth_mib = after.rss_mib - least_mib;
+    let what = format!("memory grew by {growth_mib:.1} MiB; limit {} MiB", args.growth_mib);
+    bounds.check(growth_mib <= args.growth_mib, what);
     bounds.check(after.descriptors <= before.descriptors, "no file descriptor leaked");
     bounds.check(after.threads <= before.threads, "no thread leaked");
     server.check(bounds);
@@ -112,8 +112,8 @@ pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
 
 fn list(usage: &Usage) -> String {
     format!(
-        "{:.1} MB, {} file descriptors, {} threads",
-        usage.rss_mb, usage.descriptors, usage.threads
+        "{:.1} MiB, {} file descriptors, {} threads",
+        usage.rss_mib, usage.descriptors, usage.threads
     )
 }
 

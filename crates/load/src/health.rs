@@ -99,7 +99,7 @@ pub(crate) fn collect() -> Value {
 
 /// A training of the paper's model with too many steps to end during the measurement.
 fn train() -> Value {
-    let settings = json!({"data": {"windows": 200, "validation_windows": 32}, "fit": {"steps": 1_000_000}});
+    let settings = json!({"data": {"windows": 200, "validation_windows": 32}, "sequence": {"steps": 1_000_000}});
     json!({"kind": "train", "name": "endless", "preset": "paper", "dataset": "seen", "settings": settings})
 }
 

@@ -74,10 +74,10 @@ enum Scenario {
 /// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.
 const SHORT_FORMS: [&str; 7] = [
     "stream --sessions 4 --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
-    "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mb 40 --sessions 32",
-    "saturate --over streams --skip-late --late-p99-ms 1000 --peak-s 1 --seconds 3 --growth-mb 40 --sessions 32",
-    "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mb 40",
-    "churn --sessions 300 --requests 3000 --growth-mb 40",
+    "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mib 40 --sessions 32",
+    "saturate --over streams --skip-late --late-p99-ms 1000 --peak-s 1 --seconds 3 --growth-mib 40 --sessions 32",
+    "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mib 40",
+    "churn --sessions 300 --requests 3000 --growth-mib 40",
     "previews --rounds 1 --seconds 2 --noise-ms 1000",
     "health --seconds 3 --livez-p99-ms 1000 --p99-ms 1000",
 ];

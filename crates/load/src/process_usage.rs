@@ -19,8 +19,8 @@ pub(crate) struct Process(pub(crate) String);
 /// number is bounded, and they are opened on demand.
 #[derive(Clone, Copy)]
 pub(crate) struct Usage {
-    pub(crate) rss_mb: f64,
-    pub(crate) peak_rss_mb: f64,
+    pub(crate) rss_mib: f64,
+    pub(crate) peak_rss_mib: f64,
     pub(crate) descriptors: usize,
     pub(crate) threads: usize,
 }
@@ -39,8 +39,8 @@ impl Process {
             number.and_then(|number| number.parse::<f64>().ok()).unwrap()
         };
         Usage {
-            rss_mb: field("VmRSS:") / 1024.0,
-            peak_rss_mb: field("VmHWM:") / 1024.0,
+            rss_mib: field("VmRSS:") / 1024.0,
+            peak_rss_mib: field("VmHWM:") / 1024.0,
             descriptors: self.count("fd", |entry| {
                 // A descriptor that was closed in the meantime does not count.
                 fs::read_link(entry).is_ok_and(|target| !target.to_string_lossy().contains(DATABASE))

@@ -33,9 +33,9 @@ pub(crate) struct SaturateArgs {
     /// Bound: goodput as a share of the peak
     #[arg(long, default_value_t = 0.9)]
     goodput_share: f64,
-    /// Bound: growth of memory in MB from the first to the last fifth of the time
+    /// Bound: growth of memory in MiB from the first to the last fifth of the time
     #[arg(long, default_value_t = 10.0)]
-    growth_mb: f64,
+    growth_mib: f64,
     /// Give no prediction for overtaken frames (`on_late: skip`), and check the latency instead of the goodput
     #[arg(long)]
     skip_late: bool,
@@ -97,19 +97,19 @@ impl SaturateArgs {
             .map(|part| part.iter().copied().fold(0.0, f64::max))
             .collect();
         let list: Vec<String> = most.iter().map(|mb| format!("{mb:.0}")).collect();
-        println!("the server's memory by fifths of the time: {} MB", list.join(", "));
+        println!("the server's memory by fifths of the time: {} MiB", list.join(", "));
         let growth = most.last().unwrap_or(&0.0) - most.first().unwrap_or(&0.0);
-        let what = format!("memory grew by {growth:.1} MB; limit {} MB", self.growth_mb);
-        bounds.check(growth <= self.growth_mb, what);
+        let what = format!("memory grew by {growth:.1} MiB; limit {} MiB", self.growth_mib);
+        bounds.check(growth <= self.growth_mib, what);
         server.check(bounds);
     }
 }
 
-/// Samples the memory in MB for this long.
+/// Samples the memory in MiB for this long.
 async fn watch_memory(process: Process, time: Duration) -> Vec<f64> {
     let mut memory = Vec::new();
     for _ in 0..(time.as_secs_f64() / SAMPLE_PERIOD.as_secs_f64()) as usize {
-        memory.push(process.usage().rss_mb);
+        memory.push(process.usage().rss_mib);
         tokio::time::sleep(SAMPLE_PERIOD).await;
     }
     memory

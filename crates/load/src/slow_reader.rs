@@ -46,15 +46,15 @@ pub(crate) struct SlowReaderArgs {
     /// Allowance for noise in ms, used if it is larger than the differences between the measurements without that client
     #[arg(long, default_value_t = 0.2)]
     noise_ms: f64,
-    /// Bound: increase of the server's memory in MB with that client
+    /// Bound: increase of the server's memory in MiB with that client
     #[arg(long, default_value_t = 20.0)]
-    growth_mb: f64,
+    growth_mib: f64,
 }
 
 /// One measurement.
 struct Round {
     p99_ms: f64,
-    rss_mb: f64,
+    rss_mib: f64,
     unanswered: u64,
 }
 
@@ -89,13 +89,13 @@ pub(crate) async fn run(args: &SlowReaderArgs, bounds: &mut Bounds) {
     bounds.check(after_ms <= limit_ms, what);
     let lost: u64 = alone.iter().chain(&beside).map(|round| round.unanswered).sum();
     bounds.check(lost == 0, "every frame of the other sessions was predicted");
-    let rss_mb = |rounds: &[Round]| rounds.iter().map(|round| round.rss_mb).fold(0.0, f64::max);
-    let growth_mb = rss_mb(&beside) - alone.first().map_or(0.0, |round| round.rss_mb);
+    let rss_mib = |rounds: &[Round]| rounds.iter().map(|round| round.rss_mib).fold(0.0, f64::max);
+    let growth_mib = rss_mib(&beside) - alone.first().map_or(0.0, |round| round.rss_mib);
     let what = format!(
-        "the server's memory grew by {growth_mb:.1} MB; limit {} MB",
-        args.growth_mb
+        "the server's memory grew by {growth_mib:.1} MiB; limit {} MiB",
+        args.growth_mib
     );
-    bounds.check(growth_mb <= args.growth_mb, what);
+    bounds.check(growth_mib <= args.growth_mib, what);
     server.check(bounds);
 }
 
@@ -110,7 +110,7 @@ async fn round(args: &SlowReaderArgs, server: &Server, workload: &Arc<Workload>)
     let result = load.run(server, workload).await;
     Round {
         p99_ms: result.since_schedule().at_ms(0.99),
-        rss_mb: Process::usage(&server.process).rss_mb,
+        rss_mib: Process::usage(&server.process).rss_mib,
         unanswered: result.counts.sent - result.counts.buffering - result.counts.answers.len() as u64,
     }
 }

@@ -63,8 +63,8 @@ pub(crate) async fn run(args: &StreamArgs, bounds: &mut Bounds) {
         bounds.check(all_predicted(&result), "every frame was predicted");
     }
     println!(
-        "peak memory of the server: {:.0} MB",
-        server.process.usage().peak_rss_mb
+        "peak memory of the server: {:.0} MiB",
+        server.process.usage().peak_rss_mib
     );
     server.check(bounds);
 }

@@ -108,7 +108,7 @@ impl Workload {
     fn conditioning(&self) -> Value {
         let mut conditioning = json!({});
         if let Some(count) = self.spec.action_inputs() {
-            conditioning["future_actions"] = json!(vec![vec![EXAMPLE_VALUE; count]; self.spec.horizon]);
+            conditioning["plan"] = json!(vec![vec![EXAMPLE_VALUE; count]; self.spec.horizon]);
         }
         if let Some(count) = self.spec.state_inputs() {
             conditioning["state"] = json!(vec![EXAMPLE_VALUE; count]);

@@ -48,7 +48,7 @@ use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
 
-/// Scores the model on the splits that [`EvaluateConfig::purpose`] names: the validation split, the three test sets
+/// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Errors: model and data set that
 /// don't fit together, settings out of range, nothing held out, `TrainedOn`, `Cancelled`, those of the network.
 pub fn run(
@@ -66,11 +66,11 @@ pub fn run(
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
-    if config.purpose == ScoredSplit::WholeSet {
+    if config.split == ScoredSplit::WholeSet {
         compatible::check_untrained(loaded, dataset)?;
     }
-    let splits = config.purpose.divide(dataset, split_seed);
-    let tests = config.purpose.splits();
+    let splits = config.split.divide(dataset, split_seed);
+    let tests = config.split.splits();
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {
             dataset: dataset.info().name.clone(),
@@ -113,7 +113,7 @@ fn fitted_baselines(
     config: &EvaluateConfig,
 ) -> Result<Baselines, EvaluationError> {
     let shape = window_shape(loaded.spec());
-    let mut baselines = match config.purpose {
+    let mut baselines = match config.split {
         ScoredSplit::WholeSet => {
             let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
             Baselines::fit(dataset, &own, shape, config.nearest_windows)?.without(Method::NearestWindow)

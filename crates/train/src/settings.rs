@@ -51,6 +51,16 @@ pub enum SettingsError {
         /// The command that lists all settings.
         listing: &'static str,
     },
+    /// The setting has another name now.
+    #[error("`{old}` is now called `{new}` ({origin})")]
+    Renamed {
+        /// Its old name.
+        old: &'static str,
+        /// Its name.
+        new: &'static str,
+        /// Where it was given.
+        origin: String,
+    },
     /// The value is of the wrong kind.
     #[error("{key} is {found} ({origin}); it must be {expected}")]
     Type {
@@ -90,7 +100,7 @@ impl SettingsLayer {
     /// The origin of a value that nobody gave.
     pub const DEFAULT: &'static str = "default";
 
-    /// One value, for example of the flag `--bind`. Dots in the key separate tables, as in `fit.steps`.
+    /// One value, for example of the flag `--bind`. Dots in the key separate tables, as in `sequence.steps`.
     #[must_use]
     pub fn value(origin: impl Into<String>, key: &str, value: impl Into<Value>) -> Self {
         Self {
@@ -155,6 +165,15 @@ impl SettingsLayer {
     pub fn with(mut self, other: Self) -> Self {
         self.values.extend(other.values);
         self
+    }
+
+    /// Errors: `Renamed` if the top level has the old name of a setting.
+    pub fn refuse_renamed(&self, old: &'static str, new: &'static str) -> Result<(), SettingsError> {
+        if !self.values.contains_key(old) {
+            return Ok(());
+        }
+        let origin = self.origin.clone();
+        Err(SettingsError::Renamed { old, new, origin })
     }
 
     /// The names of the top level, sorted.
@@ -291,17 +310,17 @@ mod tests {
     use super::*;
 
     fn merged(layers: &[&str]) -> Result<LayeredSettings, SettingsError> {
-        let defaults = SettingsLayer::toml("default", "size = 1\n[fit]\nrate = 1e-3\nname = \"a\"\n")?;
+        let defaults = SettingsLayer::toml("default", "size = 1\n[sequence]\nrate = 1e-3\nname = \"a\"\n")?;
         let layers: Result<Vec<_>, _> = layers.iter().map(|text| SettingsLayer::assignment(text)).collect();
         LayeredSettings::merge(defaults, layers?, "the program")
     }
 
     #[test]
     fn a_value_is_toml_or_else_a_string() {
-        let settings = merged(&["fit.rate=2e-3", "fit.name=runs/x y", "size = 7"]).unwrap();
-        assert_eq!(settings.value("fit.rate"), Some(toml::Value::Float(2e-3)));
+        let settings = merged(&["sequence.rate=2e-3", "sequence.name=runs/x y", "size = 7"]).unwrap();
+        assert_eq!(settings.value("sequence.rate"), Some(toml::Value::Float(2e-3)));
         assert_eq!(
-            settings.value("fit.name"),
+            settings.value("sequence.name"),
             Some(toml::Value::String("runs/x y".to_owned()))
         );
         assert_eq!(settings.value("size"), Some(toml::Value::Integer(7)));
@@ -309,9 +328,9 @@ mod tests {
 
     #[test]
     fn every_value_remembers_its_origin() {
-        let settings = merged(&["fit.rate=2"]).unwrap();
+        let settings = merged(&["sequence.rate=2"]).unwrap();
         assert_eq!(
-            (settings.origin("fit.rate"), settings.origin("fit.name")),
+            (settings.origin("sequence.rate"), settings.origin("sequence.name")),
             ("--set".to_owned(), "default".to_owned())
         );
     }
@@ -320,8 +339,8 @@ mod tests {
     fn an_unknown_key_is_refused_with_its_table_and_origin() {
         let message = |text| merged(&[text]).unwrap_err().to_string();
         assert_eq!(
-            message("fit.rat=1"),
-            "unknown field `rat` in `fit` (--set); `the program` lists all settings"
+            message("sequence.rat=1"),
+            "unknown field `rat` in `sequence` (--set); `the program` lists all settings"
         );
         assert_eq!(
             message("fits.rate=1"),
@@ -331,7 +350,7 @@ mod tests {
 
     #[test]
     fn an_assignment_without_key_or_value_is_refused() {
-        for text in ["size", "=1", "fit steps=3", "fit.=3", ""] {
+        for text in ["size", "=1", "sequence steps=3", "sequence.=3", ""] {
             assert!(
                 matches!(SettingsLayer::assignment(text), Err(SettingsError::Assignment(_))),
                 "{text}"
@@ -341,7 +360,7 @@ mod tests {
 
     #[test]
     fn a_damaged_text_is_refused_with_its_line() {
-        let error = SettingsLayer::toml("mine.toml", "seed = 5\n[fit\n")
+        let error = SettingsLayer::toml("mine.toml", "seed = 5\n[sequence\n")
             .unwrap_err()
             .to_string();
         assert!(error.starts_with("mine.toml is not valid TOML in line 2: "), "{error}");

@@ -1,5 +1,5 @@
-//! Training. [`run`] has two stages: `pretrain` trains the dense codec on single frames, `fit` trains the recurrent network
-//! on windows. Both use the loop in `stage`. With `checkpoint`, a training can be stopped at any step and resumed; the
+//! Training. [`run`] has two stages: `pretrain` trains the dense codec on single frames, `sequence` trains the recurrent
+//! network on windows. Both use the loop in `stage`. With `checkpoint`, a training can be stopped at any step and resumed; the
 //! result has the same bits as an uninterrupted training.
 
 mod augment;
@@ -7,13 +7,13 @@ mod batches;
 mod checkpoint;
 pub mod config;
 mod error;
-mod fit;
 pub mod observer;
 pub mod optimizer;
 mod preset;
 mod pretrain;
 mod principal_components;
 mod random_codec;
+mod sequence;
 mod stage;
 mod start;
 mod state;
@@ -137,13 +137,13 @@ pub fn run(
                 step: state.step,
             });
         }
-        state.start_stage(TrainingStage::Fit, &config.run)?;
+        state.start_stage(TrainingStage::Sequence, &config.run)?;
         runner.save(&state, observer)?;
     }
-    let sequence = fit::SequenceObjective::new(&plan, config);
-    if runner.run(&sequence, &mut state, observer)? == StageEnd::Interrupted {
+    let objective = sequence::SequenceObjective::new(&plan, config);
+    if runner.run(&objective, &mut state, observer)? == StageEnd::Interrupted {
         return Ok(TrainingOutcome::Interrupted {
-            stage: TrainingStage::Fit,
+            stage: TrainingStage::Sequence,
             step: state.step,
         });
     }
@@ -230,7 +230,7 @@ impl<'a> TrainingPlan<'a> {
         spec.validate()?;
         let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
         Ok(Self {
-            source: FrameSource::new(dataset, spec.preprocess, config.fit.target, augmentation),
+            source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation),
             spec,
             train,
             validation,

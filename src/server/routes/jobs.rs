@@ -114,7 +114,7 @@ struct LossCurves {
 /// A point of the loss curves.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct CurvePoint {
-    /// `pretrain` or `fit`.
+    /// `pretrain` or `sequence`.
     stage: String,
     /// Optimizer steps in that stage.
     step: i64,

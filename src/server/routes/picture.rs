@@ -64,18 +64,18 @@ pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, Pictur
 
 /// The context, if it is known, and a row for each rollout; small and without labels if there are many.
 /// Errors: `Size` if there are too many.
-pub(super) fn rollout_sheet(seen: &[Frame], futures: &[impl AsRef<[Frame]>]) -> Result<Frame, FrameError> {
+pub(super) fn rollout_sheet(seen: &[Frame], rollouts: &[impl AsRef<[Frame]>]) -> Result<Frame, FrameError> {
     let inputs = MontageRow::in_time("inputs", seen, 1 - seen.len() as i64);
-    let rows = futures
+    let rows = rollouts
         .iter()
         .enumerate()
-        .map(|(index, frames)| MontageRow::in_time(&format!("candidate {index}"), frames.as_ref(), 1));
+        .map(|(index, frames)| MontageRow::in_time(&format!("plan {index}"), frames.as_ref(), 1));
     let mut rows: Vec<MontageRow> = Some(inputs)
         .filter(|_| !seen.is_empty())
         .into_iter()
         .chain(rows)
         .collect();
-    let large = montage("", &rows, &style(futures));
+    let large = montage("", &rows, &style(rollouts));
     if !matches!(large, Err(FrameError::Size { .. })) {
         return large;
     }
@@ -89,25 +89,25 @@ pub(super) fn rollout_sheet(seen: &[Frame], futures: &[impl AsRef<[Frame]>]) -> 
 /// All rollouts side by side, from the last context frame on if it is known. Errors: `Size` if there are too many.
 pub(super) fn rollout_animation(
     seen: &[Frame],
-    futures: &[impl AsRef<[Frame]>],
+    rollouts: &[impl AsRef<[Frame]>],
     period_s: f64,
 ) -> Result<Vec<u8>, FrameError> {
-    let columns = (futures.len() as f64).sqrt().ceil().max(1.0) as usize;
-    let steps = futures.iter().map(|frames| frames.as_ref().len()).max().unwrap_or(0);
+    let columns = (rollouts.len() as f64).sqrt().ceil().max(1.0) as usize;
+    let steps = rollouts.iter().map(|frames| frames.as_ref().len()).max().unwrap_or(0);
     let grid = |cells: Vec<(String, Frame)>| {
         let rows = cells.chunks(columns).map(|cells| MontageRow {
             label: String::new(),
             cells: cells.to_vec(),
         });
         let rows: Vec<MontageRow> = rows.collect();
-        montage("", &rows, &style(futures)).or_else(|_| montage("", &rows, &SMALL))
+        montage("", &rows, &style(rollouts)).or_else(|_| montage("", &rows, &SMALL))
     };
     let named = |(index, frame): (usize, &Frame)| (index.to_string(), frame.clone());
     let first = seen
         .last()
-        .map(|last| futures.iter().map(|_| last).enumerate().map(named).collect());
+        .map(|last| rollouts.iter().map(|_| last).enumerate().map(named).collect());
     let later = (0..steps).map(|step| {
-        futures
+        rollouts
             .iter()
             .filter_map(|future| future.as_ref().get(step))
             .enumerate()
@@ -129,8 +129,8 @@ const SMALL: Style = Style {
     grid_lines: 0,
 };
 
-fn style(futures: &[impl AsRef<[Frame]>]) -> Style {
-    let width = futures.iter().flat_map(AsRef::as_ref).next().map_or(1, Frame::width);
+fn style(rollouts: &[impl AsRef<[Frame]>]) -> Style {
+    let width = rollouts.iter().flat_map(AsRef::as_ref).next().map_or(1, Frame::width);
     Style {
         grid_lines: 0,
         ..Style::for_frames_of(width)
@@ -179,14 +179,14 @@ mod tests {
 
     #[test]
     fn many_rollouts_are_drawn_small_and_too_many_refused() {
-        let futures = |count| vec![vec![Frame::new(64, 64, vec![9; 4096]).unwrap(); 2]; count];
+        let rollouts = |count| vec![vec![Frame::new(64, 64, vec![9; 4096]).unwrap(); 2]; count];
         let (few, many) = (
-            rollout_sheet(&[], &futures(2)).unwrap(),
-            rollout_sheet(&[], &futures(40)).unwrap(),
+            rollout_sheet(&[], &rollouts(2)).unwrap(),
+            rollout_sheet(&[], &rollouts(40)).unwrap(),
         );
         assert!(few.width() > 2 * 192 && many.width() < 2 * 192);
         assert!(matches!(
-            rollout_sheet(&[], &futures(400)),
+            rollout_sheet(&[], &rollouts(400)),
             Err(FrameError::Size { .. })
         ));
     }

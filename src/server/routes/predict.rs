@@ -39,7 +39,7 @@ struct PredictRequest {
     /// How an image of another size is resized; without it, another size is an error.
     #[serde(default)]
     resize: Option<Resize>,
-    /// The action at each frame, oldest first. Without `future_actions`, the last one is repeated.
+    /// The action at each frame, oldest first. Without `plan`, the last one is repeated.
     #[serde(default)]
     actions: Vec<Vec<f32>>,
     /// The robot's state at the last frame.
@@ -50,7 +50,7 @@ struct PredictRequest {
     states: Option<Vec<Vec<f32>>>,
     /// The future actions, as many as `steps`. The first acts from the last frame on.
     #[serde(default)]
-    future_actions: Option<Vec<Vec<f32>>>,
+    plan: Option<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
     #[serde(default)]
     steps: Option<usize>,
@@ -109,8 +109,8 @@ pub(super) enum PredictError {
     TooMany(#[from] TooManyError),
     #[error("the rollouts would be {found} bytes of images; this server predicts at most {limit} in a request")]
     TooLarge { found: u64, limit: usize },
-    #[error("candidates is empty; give at least one plan")]
-    NoCandidates,
+    #[error("plans is empty; give at least one plan")]
+    NoPlans,
     #[error("the session has {have} of the {need} frames that a prediction takes; send more frames")]
     Buffering { have: usize, need: usize },
     #[error("steps is {found}; this server predicts 1 to {limit}")]
@@ -194,10 +194,7 @@ impl PredictRequest {
         let input = PredictionInput {
             state: last_state(self.state, self.states, frames.len())?,
             actions: actions("actions", self.actions)?,
-            future_actions: self
-                .future_actions
-                .map(|values| actions("future_actions", values))
-                .transpose()?,
+            plan: self.plan.map(|values| actions("plan", values)).transpose()?,
             steps: self.steps,
             frames,
         };
@@ -331,7 +328,7 @@ impl From<PredictError> for ApiError {
             | PredictError::Value { .. }
             | PredictError::BothStates
             | PredictError::StateCount { .. }
-            | PredictError::NoCandidates
+            | PredictError::NoPlans
             | PredictError::Input(_) => Self::Unprocessable(error.to_string()),
         }
     }

@@ -91,7 +91,7 @@ fn simulate(manifest: &Manifest) -> Result<(PredictionInput, Vec<Frame>), SimErr
         frames: frames[LEAD_IN_FRAMES..=now].to_vec(),
         actions: Vec::new(),
         state: Some(states[now].clone()),
-        future_actions: Some(actions[now..now + horizon].to_vec()),
+        plan: Some(actions[now..now + horizon].to_vec()),
         steps: None,
     };
     Ok((input, frames.split_off(now + 1)))

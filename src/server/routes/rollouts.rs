@@ -1,4 +1,4 @@
-//! Rollouts: predicted futures of one context under many plans.
+//! Rollouts: the frames predicted from one context, for each of many plans.
 
 use std::sync::Arc;
 
@@ -49,7 +49,7 @@ struct RolloutRequest {
     #[serde(default)]
     states: Option<Vec<Vec<f32>>>,
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
-    candidates: Vec<Vec<Vec<f32>>>,
+    plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
     #[serde(default)]
     steps: Option<usize>,
@@ -66,7 +66,7 @@ struct SessionRolloutRequest {
     #[serde(default)]
     state: Option<Vec<f32>>,
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
-    candidates: Vec<Vec<Vec<f32>>>,
+    plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
     #[serde(default)]
     steps: Option<usize>,
@@ -79,11 +79,11 @@ struct RolloutResponse {
     model: String,
     /// The model's version.
     version: u32,
-    /// For each candidate, in order: t+1, t+2, ….
-    futures: Vec<Vec<ImageBytes>>,
+    /// For each plan, in order: t+1, t+2, ….
+    rollouts: Vec<Vec<ImageBytes>>,
     /// How they are encoded.
     format: ImageFormat,
-    /// For each candidate, the mean squared error to expect of each frame up to the model's horizon, intensities 0…1; absent if
+    /// For each plan, the mean squared error to expect of each frame up to the model's horizon, intensities 0…1; absent if
     /// the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     expected_mse: Vec<Vec<f32>>,
@@ -109,7 +109,7 @@ impl WithFrames for RolloutRequest {
     }
 }
 
-/// Predicts one future for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
+/// Predicts a rollout for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
 /// `image/gif` an animation with all of them side by side.
 #[utoipa::path(
     post, path = "/v1/models/{model}/rollouts", tag = "models", request_body = RolloutRequest,
@@ -141,7 +141,7 @@ async fn model_rollouts(
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
-/// Predicts one future for each of many plans from the session's last frame. The session does not change.
+/// Predicts a rollout for each of many plans from the session's last frame. The session does not change.
 #[utoipa::path(
     post, path = "/v1/sessions/{id}/rollouts", tag = "sessions", request_body = SessionRolloutRequest,
     params(
@@ -175,7 +175,7 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let plans = (request.candidates, request.steps);
+    let plans = (request.plans, request.steps);
     let task = state.rollout_task(conditioning(plans, robot_state, &model.manifest, app.config())?);
     let prediction = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &[], prediction);
@@ -193,7 +193,7 @@ impl RolloutRequest {
         let (format, resize) = (self.format, self.resize);
         let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, frames.len())?;
-        let conditioning = conditioning((self.candidates, self.steps), state, manifest, config)?;
+        let conditioning = conditioning((self.plans, self.steps), state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
         let task = Task::rollout(frames, conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
@@ -202,31 +202,31 @@ impl RolloutRequest {
 
 /// The conditioning input of each plan.
 fn conditioning(
-    (candidates, steps): (Vec<Vec<Vec<f32>>>, Option<usize>),
+    (plans, steps): (Vec<Vec<Vec<f32>>>, Option<usize>),
     state: Option<RobotState>,
     manifest: &Manifest,
     config: &ServerConfig,
 ) -> Result<Vec<ConditioningInput>, PredictError> {
     let spec = &manifest.spec;
-    check_count("candidates", candidates.len(), config.max_candidates)?;
-    if candidates.is_empty() {
-        return Err(PredictError::NoCandidates);
+    check_count("plans", plans.len(), config.max_plans)?;
+    if plans.is_empty() {
+        return Err(PredictError::NoPlans);
     }
     predict::check_steps(steps, manifest, config)?;
-    let found = candidates.len() as u64 * steps.unwrap_or(spec.horizon) as u64 * spec.pixels() as u64;
+    let found = plans.len() as u64 * steps.unwrap_or(spec.horizon) as u64 * spec.pixels() as u64;
     if found > config.max_rollout_bytes as u64 {
         return Err(PredictError::TooLarge {
             found,
             limit: config.max_rollout_bytes,
         });
     }
-    let candidates = candidates
+    let plans = plans
         .into_iter()
         .enumerate()
-        .map(|(index, values)| predict::actions(&format!("candidates[{index}]"), values))
+        .map(|(index, values)| predict::actions(&format!("plans[{index}]"), values))
         .collect::<Result<_, _>>()?;
-    Ok(ConditioningInput::candidates(
-        candidates,
+    Ok(ConditioningInput::of_plans(
+        plans,
         (state, steps),
         &manifest.name,
         spec,
@@ -248,12 +248,12 @@ fn answer(
         ..
     } = prediction;
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &futures(&rollouts)))?),
+        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &rollout_frames(&rollouts)))?),
         ResponseFormat::Gif => {
             let period_s = manifest.spec.frame_period_s;
             Ok(picture::gif(picture::rollout_animation(
                 seen,
-                &futures(&rollouts),
+                &rollout_frames(&rollouts),
                 period_s,
             ))?)
         }
@@ -267,7 +267,7 @@ fn answer(
                 expected_mse: calibrated().map(Rollout::expected_mse).collect(),
                 mse_band_90: calibrated().map(Rollout::mse_bands).collect(),
                 novelty: rollouts.first().and_then(|rollout| rollout.novelty),
-                futures: rollouts
+                rollouts: rollouts
                     .into_iter()
                     .map(|rollout| images::encode_owned(rollout.frames, format))
                     .collect::<Result<_, _>>()?,
@@ -282,6 +282,6 @@ fn answer(
 }
 
 /// The frames of each rollout.
-fn futures(rollouts: &[Rollout]) -> Vec<&[Frame]> {
+fn rollout_frames(rollouts: &[Rollout]) -> Vec<&[Frame]> {
     rollouts.iter().map(|rollout| rollout.frames.as_slice()).collect()
 }

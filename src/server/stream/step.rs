@@ -51,7 +51,7 @@ impl FrameStep {
         let state = state.map_err(|source| StepError::Value { field: "state", source })?;
         let given = RawConditioning {
             past: past.as_slice(),
-            future: plan.as_deref(),
+            plan: plan.as_deref(),
             state: state.as_ref(),
             steps: message.steps,
         };

@@ -6,24 +6,24 @@
 //! comes from the `scene`, a learned function of the camera's pose that remembers what the surroundings look like. In the
 //! `recurrent` form, each step continues from the one before it.
 //!
-//! Sizes beside those of [`crate::nn`]: M items (N futures of K steps each, step after step), C channels on the grid of a
+//! Sizes beside those of [`crate::nn`]: M items (N rollouts of K steps each, step after step), C channels on the grid of a
 //! quarter of the frame's sides.
 //!
 //! Reading order: `rays`, `room_geometry` and `wheel_dynamics` (geometry) → `state_channels` → `encoder_views` and
-//! `future_rows` (what the network reads) → `scene` and `motion` → `layers` (its tensors) → `network` → `direct` and
+//! `rollout_rows` (what the network reads) → `scene` and `motion` → `layers` (its tensors) → `network` → `direct` and
 //! `recurrent` (its two forms) → `predict` → `beyond_horizon`.
 
 mod beyond_horizon;
 mod blocks;
 mod direct;
 mod encoder_views;
-mod future_rows;
 mod layers;
 mod motion;
 mod network;
 mod predict;
 mod rays;
 mod recurrent;
+mod rollout_rows;
 mod room_geometry;
 mod scene;
 mod state_channels;

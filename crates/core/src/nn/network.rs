@@ -129,9 +129,9 @@ impl Network {
         }
     }
 
-    /// Codes `[N, horizon, code_len]` of N futures of B windows with `codes` [B, context, `code_len`]: future n follows the
+    /// Codes `[N, horizon, code_len]` of N rollouts of B windows with `codes` [B, context, `code_len`]: rollout n follows the
     /// window `windows[n]` under the conditioning's row n. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
-    pub fn predict_futures(
+    pub fn predict_rollouts(
         &self,
         codes: &Tensor,
         windows: &[u32],
@@ -139,13 +139,13 @@ impl Network {
     ) -> Result<Tensor, NnError> {
         self.check_windows(codes)?;
         match &self.variant {
-            Variant::Dense(dense) => dense.predict_futures(codes, windows, conditioning),
+            Variant::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
             Variant::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
         }
     }
 
-    /// As [`Model::predict_futures`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
-    /// horizon the frames are those of [`Model::predict_futures`] with the last action held. Beyond it, which no training saw,
+    /// As [`Model::predict_rollouts`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
+    /// horizon the frames are those of [`Model::predict_rollouts`] with the last action held. Beyond it, which no training saw,
     /// the dense network goes on step by step; the flow network starts again from the frames that it predicted.
     /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
     pub fn predict_steps(
@@ -156,11 +156,11 @@ impl Network {
         steps: usize,
     ) -> Result<Tensor, NnError> {
         if steps == self.spec.horizon {
-            return self.predict_futures(codes, windows, conditioning);
+            return self.predict_rollouts(codes, windows, conditioning);
         }
         self.check_windows(codes)?;
         match &self.variant {
-            Variant::Dense(dense) => dense.with_horizon(steps).predict_futures(codes, windows, conditioning),
+            Variant::Dense(dense) => dense.with_horizon(steps).predict_rollouts(codes, windows, conditioning),
             Variant::Flow(flow) => predict_beyond_horizon(flow, &self.spec, (codes, windows, conditioning), steps),
         }
     }
@@ -236,7 +236,7 @@ impl Network {
     }
 }
 
-/// One future for each window.
+/// One rollout for each window.
 fn each_once(windows: usize) -> Vec<u32> {
     (0..windows as u32).collect()
 }
@@ -275,7 +275,7 @@ mod tests {
         }
     }
 
-    fn futures(spec: &ModelSpec, steps: usize) -> Tensor {
+    fn rollouts(spec: &ModelSpec, steps: usize) -> Tensor {
         let model = Network::detached(spec.clone(), &Parameters::initialize(spec, Seed(3)).unwrap()).unwrap();
         let frames: Vec<f32> = (0..3 * 64).map(|at| ((at * 7) % 64) as f32 / 64.0).collect();
         let codes = model
@@ -301,7 +301,7 @@ mod tests {
         };
         for architecture in [Architecture::Dense(dense), Architecture::Flow(FlowSpec::default())] {
             let spec = spec(architecture);
-            let (trained, longer) = (futures(&spec, 2), futures(&spec, 7));
+            let (trained, longer) = (rollouts(&spec, 2), rollouts(&spec, 7));
             assert_eq!(longer.dims(), [1, 7, spec.code_len()]);
             let values = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
             for (longer, trained) in values(longer.narrow(1, 0, 2).unwrap()).iter().zip(values(trained)) {

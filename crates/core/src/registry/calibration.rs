@@ -11,7 +11,7 @@ use crate::frame::Frame;
 use crate::frame::preprocess::scale;
 use crate::nn::ModelSpec;
 
-/// Numbers from which the error of a predicted frame is estimated, see [`PredictedFuture::error_inputs`].
+/// Numbers from which the error of a predicted frame is estimated, see [`RolloutInContext::error_inputs`].
 pub const ERROR_INPUTS: usize = 8;
 /// Added to mean squared differences before their logarithm.
 const FLOOR: f64 = 1e-6;
@@ -213,9 +213,9 @@ impl NoveltyScale {
     }
 }
 
-/// A predicted future and what it follows, for the estimate of its errors.
+/// A rollout and the frames that it follows, for the estimate of its errors.
 #[derive(Clone, Copy, Debug)]
-pub struct PredictedFuture<'a> {
+pub struct RolloutInContext<'a> {
     /// The model's.
     pub spec: &'a ModelSpec,
     /// The last two frames seen.
@@ -230,7 +230,7 @@ pub struct PredictedFuture<'a> {
     pub actions: &'a [f32],
 }
 
-impl PredictedFuture<'_> {
+impl RolloutInContext<'_> {
     /// What is known of each predicted frame before its error is known: logarithms of the mean squared difference of its code
     /// to the last frame's and to the frame's before it, of that between the last two frames seen, and of its edges; edges and
     /// still share of the context; its distance from the training data; the size of the actions up to it.

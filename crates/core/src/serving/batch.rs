@@ -19,7 +19,7 @@ pub struct Candidate {
 
 /// Positions in the queue, in rising order. No position is in both lists.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct BatchPlan {
+pub struct BatchChoice {
     /// Tasks whose answer nobody needs any more.
     pub discard: Vec<usize>,
     /// Tasks to compute now, together.
@@ -29,23 +29,23 @@ pub struct BatchPlan {
 /// The oldest live task chooses the model. Later tasks of the same model join in order while the rows stay within the
 /// limit, at most one task of a session. The oldest task is always included, even if it alone exceeds the limit.
 #[must_use]
-pub fn plan(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchPlan {
-    let mut plan = BatchPlan::default();
+pub fn choose(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchChoice {
+    let mut choice = BatchChoice::default();
     let (mut model, mut rows, mut sessions) = (None, 0, Vec::new());
     for (position, candidate) in waiting.iter().enumerate() {
         if candidate.abandoned || candidate.deadline <= now {
-            plan.discard.push(position);
+            choice.discard.push(position);
             continue;
         }
-        let fits = plan.batch.is_empty() || rows + candidate.rows <= row_limit;
+        let fits = choice.batch.is_empty() || rows + candidate.rows <= row_limit;
         let is_later_step = candidate.session.is_some_and(|session| sessions.contains(&session));
         sessions.extend(candidate.session);
         if fits && !is_later_step && *model.get_or_insert(candidate.model) == candidate.model {
-            plan.batch.push(position);
+            choice.batch.push(position);
             rows += candidate.rows;
         }
     }
-    plan
+    choice
 }
 
 #[cfg(test)]
@@ -106,9 +106,9 @@ mod tests {
             .collect()
     }
 
-    fn planned(kinds: &[TaskKind], limit: usize) -> BatchPlan {
+    fn chosen(kinds: &[TaskKind], limit: usize) -> BatchChoice {
         let now = Instant::now();
-        plan(&candidates(kinds, now), now, limit)
+        choose(&candidates(kinds, now), now, limit)
     }
 
     #[test]
@@ -117,14 +117,14 @@ mod tests {
             abandoned: true,
             ..of(0)
         };
-        let plan = planned(&[abandoned, of(1), of(0), of(1)], 8);
-        assert_eq!((plan.discard, plan.batch), (vec![0], vec![1, 3]));
+        let choice = chosen(&[abandoned, of(1), of(0), of(1)], 8);
+        assert_eq!((choice.discard, choice.batch), (vec![0], vec![1, 3]));
     }
 
     #[test]
     fn a_task_past_its_deadline_is_not_computed() {
-        let plan = planned(&[TaskKind { late: true, ..of(0) }], 8);
-        assert_eq!((plan.discard, plan.batch), (vec![0], vec![]));
+        let choice = chosen(&[TaskKind { late: true, ..of(0) }], 8);
+        assert_eq!((choice.discard, choice.batch), (vec![0], vec![]));
     }
 
     #[test]
@@ -133,14 +133,14 @@ mod tests {
             session: Some(session),
             ..of(0)
         };
-        assert_eq!(planned(&[step(1), step(1), step(2)], 8).batch, [0, 2]);
+        assert_eq!(chosen(&[step(1), step(1), step(2)], 8).batch, [0, 2]);
     }
 
     #[test]
     fn a_large_task_runs_alone_and_small_tasks_pass_it() {
         let rows = |rows| TaskKind { rows, ..of(0) };
-        assert_eq!(planned(&[rows(100), of(0)], 8).batch, [0]);
-        assert_eq!(planned(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
+        assert_eq!(chosen(&[rows(100), of(0)], 8).batch, [0]);
+        assert_eq!(chosen(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
     }
 
     proptest! {
@@ -148,22 +148,22 @@ mod tests {
         fn a_batch_holds_the_oldest_task_and_others_of_its_model(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now);
-            let plan = plan(&waiting, now, limit);
-            let rows: usize = plan.batch.iter().map(|&i| waiting[i].rows).sum();
-            prop_assert!(rows <= limit || plan.batch.len() == 1);
-            prop_assert!(plan.batch.is_sorted());
-            prop_assert!(plan.batch.iter().all(|&i| waiting[i].model == waiting[plan.batch[0]].model));
+            let choice = choose(&waiting, now, limit);
+            let rows: usize = choice.batch.iter().map(|&i| waiting[i].rows).sum();
+            prop_assert!(rows <= limit || choice.batch.len() == 1);
+            prop_assert!(choice.batch.is_sorted());
+            prop_assert!(choice.batch.iter().all(|&i| waiting[i].model == waiting[choice.batch[0]].model));
             let wanted = |c: &Candidate| !c.abandoned && c.deadline > now;
-            prop_assert_eq!(plan.batch.first().copied(), waiting.iter().position(wanted));
-            prop_assert!(plan.discard.iter().all(|&i| !wanted(&waiting[i])));
-            prop_assert_eq!(plan.discard.len(), waiting.iter().filter(|c| !wanted(c)).count());
+            prop_assert_eq!(choice.batch.first().copied(), waiting.iter().position(wanted));
+            prop_assert!(choice.discard.iter().all(|&i| !wanted(&waiting[i])));
+            prop_assert_eq!(choice.discard.len(), waiting.iter().filter(|c| !wanted(c)).count());
         }
 
         #[test]
         fn a_batch_holds_only_the_oldest_step_of_a_session(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now);
-            for &position in &plan(&waiting, now, limit).batch {
+            for &position in &choose(&waiting, now, limit).batch {
                 let earlier = waiting[..position].iter().filter(|c| !c.abandoned && c.deadline > now);
                 let session = waiting[position].session;
                 prop_assert!(session.is_none() || earlier.clone().all(|c| c.session != session));

@@ -13,7 +13,7 @@ use crate::frame::Frame;
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec};
 use crate::registry::Model;
-use crate::registry::calibration::{ContextStatistics, PredictedFuture};
+use crate::registry::calibration::{ContextStatistics, RolloutInContext};
 use crate::types::{Action, RobotState};
 
 /// How many frames are decoded together at most. This bounds the memory that many rollouts need.
@@ -149,8 +149,8 @@ impl Windows<'_> {
         with_values(&self.features, |seen| {
             with_values(&codes, |codes| {
                 let codes = codes.chunks_exact(steps * spec.code_len());
-                let futures = rows.iter().zip(codes).zip(frames);
-                futures
+                let rollouts = rows.iter().zip(codes).zip(frames);
+                rollouts
                     .map(|((row, codes), frames)| self.rollout(*row, seen, codes, frames))
                     .collect()
             })
@@ -181,7 +181,7 @@ impl Windows<'_> {
             &seen[place * spec.code_len()..(place + 1) * spec.code_len()]
         };
         let actions: Vec<f32> = input.actions.iter().flat_map(Action::as_slice).copied().collect();
-        let future = PredictedFuture {
+        let rollout = RolloutInContext {
             spec,
             context,
             seen: [code(1), code(2)],
@@ -190,7 +190,7 @@ impl Windows<'_> {
             actions: &actions,
         };
         Rollout {
-            errors: future.expected_errors(calibration),
+            errors: rollout.expected_errors(calibration),
             novelty: Some(calibration.novelty.novelty(context)),
             frames,
         }

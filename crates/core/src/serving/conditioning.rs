@@ -20,7 +20,7 @@ pub struct RawConditioning<'a> {
     /// The past actions; the last one acts from the last frame on.
     pub past: &'a [Action],
     /// The plan; without one, the last past action is held.
-    pub future: Option<&'a [Action]>,
+    pub plan: Option<&'a [Action]>,
     /// The robot's state at the last frame.
     pub state: Option<&'a RobotState>,
     /// Frames to predict; the model's horizon if absent.
@@ -30,20 +30,20 @@ pub struct RawConditioning<'a> {
 /// The names of the fields in error messages.
 pub struct FieldNames {
     pub(super) past: fn(usize) -> String,
-    pub(super) future: &'static str,
+    pub(super) plan: &'static str,
     pub(super) missing: &'static str,
 }
 
 /// The fields of a request.
 pub(super) const REQUEST_FIELDS: FieldNames = FieldNames {
     past: |index| format!("actions[{index}]"),
-    future: "future_actions",
-    missing: "future_actions",
+    plan: "plan",
+    missing: "plan",
 };
 /// The fields of a stream's frame.
 pub const STEP_FIELDS: FieldNames = FieldNames {
     past: |_| "action".to_owned(),
-    future: "plan",
+    plan: "plan",
     missing: "action",
 };
 
@@ -68,10 +68,10 @@ impl ConditioningInput {
         for (index, action) in raw.past.iter().enumerate() {
             check_length(|| (fields.past)(index), model, action.as_slice(), &spec.actions)?;
         }
-        let actions = match (raw.future, raw.past.last()) {
+        let actions = match (raw.plan, raw.past.last()) {
             _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
-                check_actions(fields.future, (model, steps), spec, actions)?;
+                check_actions(fields.plan, (model, steps), spec, actions)?;
                 actions.to_vec()
             }
             (None, Some(held)) => vec![held.clone(); steps],
@@ -90,10 +90,10 @@ impl ConditioningInput {
         })
     }
 
-    /// One conditioning input for each plan, all from the same state. Errors call the plans `candidates[i]`.
+    /// One conditioning input for each plan, all from the same state. Errors call the plans `plans[i]`.
     /// Errors: `Unconditioned` if the model takes no actions, and the errors of the values.
-    pub fn candidates(
-        candidates: Vec<Vec<Action>>,
+    pub fn of_plans(
+        plans: Vec<Vec<Action>>,
         (state, steps): (Option<RobotState>, Option<usize>),
         model: &str,
         spec: &ModelSpec,
@@ -106,11 +106,11 @@ impl ConditioningInput {
         let state = check_state(model, spec, state)?;
         let conditioning = |(index, actions): (usize, Vec<Action>)| {
             let wanted = (model, steps.unwrap_or(spec.horizon));
-            check_actions(&format!("candidates[{index}]"), wanted, spec, &actions)?;
+            check_actions(&format!("plans[{index}]"), wanted, spec, &actions)?;
             let state = state.clone();
             Ok(Self { actions, state, steps })
         };
-        candidates.into_iter().enumerate().map(conditioning).collect()
+        plans.into_iter().enumerate().map(conditioning).collect()
     }
 
     /// Frames to predict.
@@ -127,7 +127,7 @@ fn check_actions(
     actions: &[Action],
 ) -> Result<(), InputError> {
     if actions.len() != steps {
-        return Err(InputError::FutureActionCount {
+        return Err(InputError::PlanLength {
             field: field.to_owned(),
             model: model.to_owned(),
             found: actions.len(),

@@ -117,9 +117,9 @@ pub enum InputError {
         /// Frames given.
         frames: usize,
     },
-    /// The number of future actions is not the model's horizon.
+    /// The number of actions of a plan is not the number of frames to predict.
     #[error("{field} holds {found} actions; model \"{model}\" takes {expected}")]
-    FutureActionCount {
+    PlanLength {
         /// The field, with its index.
         field: String,
         /// The model's name.
@@ -150,7 +150,7 @@ pub enum InputError {
         channels: String,
     },
     /// Plans to compare, but the model takes no actions.
-    #[error("model \"{model}\" takes no actions, so all candidates give the same prediction; use predict instead")]
+    #[error("model \"{model}\" takes no actions, so all plans give the same prediction; use predict instead")]
     Unconditioned {
         /// The model's name.
         model: String,

@@ -14,13 +14,13 @@ use crate::types::{Action, RobotState};
 pub struct PredictionInput {
     /// The context, oldest first.
     pub frames: Vec<Frame>,
-    /// Past actions, oldest first; the last one acts from the last frame on. May be empty. Without future actions, the
+    /// Past actions, oldest first; the last one acts from the last frame on. May be empty. Without a plan, the
     /// last one is held.
     pub actions: Vec<Action>,
     /// The robot's state at the last frame.
     pub state: Option<RobotState>,
     /// The plan: the first action acts from the last frame to the first predicted one.
-    pub future_actions: Option<Vec<Action>>,
+    pub plan: Option<Vec<Action>>,
     /// Frames to predict; the model's horizon if absent. More are beyond what the model was trained for.
     pub steps: Option<usize>,
 }
@@ -48,7 +48,7 @@ impl PredictionInput {
     pub fn conditioning(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
         let raw = RawConditioning {
             past: &self.actions,
-            future: self.future_actions.as_deref(),
+            plan: self.plan.as_deref(),
             state: self.state.as_ref(),
             steps: self.steps,
         };

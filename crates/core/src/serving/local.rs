@@ -29,17 +29,13 @@ pub fn predict(loaded: &Model, inputs: &[&PredictionInput]) -> Result<Vec<Rollou
 }
 
 impl ConditioningInput {
-    /// The conditioning input of one prediction. `future_actions` holds one action for each predicted frame; the first
+    /// The conditioning input of one prediction. `plan` holds one action for each predicted frame; the first
     /// acts from the last frame to the first predicted one. A model ignores what it does not take. Errors name the field,
     /// its value and the expected value.
-    pub fn for_model(
-        loaded: &Model,
-        future_actions: Option<&[Action]>,
-        state: Option<&RobotState>,
-    ) -> Result<Self, InputError> {
+    pub fn for_model(loaded: &Model, plan: Option<&[Action]>, state: Option<&RobotState>) -> Result<Self, InputError> {
         let raw = RawConditioning {
             past: &[],
-            future: future_actions,
+            plan,
             state,
             steps: None,
         };
@@ -78,16 +74,16 @@ impl Session {
     }
 
     /// Takes the next frame and predicts the frames that follow; `None` until the context is full. `state` is the robot's
-    /// state at this frame. `future_actions` holds one action for each predicted frame; the first acts from this frame to
+    /// state at this frame. `plan` holds one action for each predicted frame; the first acts from this frame to
     /// the first predicted one. A model ignores what it does not take. Errors: `Input` if something does not fit the model,
     /// and what the computation fails with; the session is then as before.
     pub fn step(
         &mut self,
         frame: Frame,
         state: Option<&RobotState>,
-        future_actions: Option<&[Action]>,
+        plan: Option<&[Action]>,
     ) -> Result<Option<Rollout>, ServingError> {
-        let conditioning = ConditioningInput::for_model(&self.model, future_actions, state)?;
+        let conditioning = ConditioningInput::for_model(&self.model, plan, state)?;
         let spec = self.model.spec();
         check_size(
             "frame",
@@ -111,7 +107,7 @@ impl Session {
         let spec = self.model.spec();
         let steps = plans.first().map(Vec::len);
         let from = (self.state.robot_state().cloned(), steps);
-        let inputs = ConditioningInput::candidates(plans, from, &self.model.manifest.name, spec)?;
+        let inputs = ConditioningInput::of_plans(plans, from, &self.model.manifest.name, spec)?;
         if inputs.is_empty() || self.state.frame_count() < spec.context {
             return Ok(Vec::new());
         }
@@ -172,7 +168,7 @@ mod tests {
         let input = PredictionInput {
             frames,
             state: Some(state),
-            future_actions: Some(actions),
+            plan: Some(actions),
             ..PredictionInput::default()
         };
         assert_eq!(predicted.unwrap(), predict(&model, &[&input]).unwrap().remove(0));
@@ -223,7 +219,7 @@ mod tests {
                 frames: seen[start..].to_vec(),
                 actions: vec![action(f32::from(seq))],
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
-                future_actions: None,
+                plan: None,
                 steps: None,
             };
             assert_eq!(computed.rollouts, predict(model, &[&input]).unwrap());

@@ -60,7 +60,7 @@ pub struct Timing {
     pub compute_us: u64,
 }
 
-/// One predicted future.
+/// The frames predicted under one plan.
 #[derive(Clone, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub struct Rollout {

@@ -148,13 +148,13 @@ impl QueueState {
                 deadline: waiting.deadline,
             })
             .collect();
-        let plan = batch::plan(&candidates, now, limit);
-        let mut batch = Vec::with_capacity(plan.batch.len());
+        let choice = batch::choose(&candidates, now, limit);
+        let mut batch = Vec::with_capacity(choice.batch.len());
         let mut remaining = VecDeque::with_capacity(self.waiting.len());
         for (position, waiting) in self.waiting.drain(..).enumerate() {
-            if plan.batch.binary_search(&position).is_ok() {
+            if choice.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
-            } else if plan.discard.binary_search(&position).is_ok() {
+            } else if choice.discard.binary_search(&position).is_ok() {
                 let limit_ms = waiting.limit.as_millis();
                 meter::record_refusal(if waiting.reply.is_closed() {
                     "abandoned"

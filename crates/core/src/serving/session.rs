@@ -109,7 +109,7 @@ impl SessionState {
             _ => ConditioningInput::new(
                 RawConditioning {
                     past: &[],
-                    future: Some(&snapshot.actions),
+                    plan: Some(&snapshot.actions),
                     state: snapshot.state.as_ref(),
                     steps: snapshot.steps,
                 },
@@ -202,7 +202,7 @@ impl SessionState {
 
 const SNAPSHOT_FIELDS: FieldNames = FieldNames {
     past: |_| "actions".to_owned(),
-    future: "actions",
+    plan: "actions",
     missing: "actions",
 };
 

@@ -104,7 +104,7 @@ pub(super) fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingEr
         frames: vec![frame; spec.context],
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),
         state: RobotState::try_from(vec![0.0; spec.states.len()]).ok(),
-        future_actions: None,
+        plan: None,
         steps: None,
     })
 }

@@ -110,16 +110,16 @@ pub enum DatasetError {
     },
     /// The decoded frames could not be written.
     #[error(
-        "could not write the decoded frames of the data set ({megabytes} MiB) to {path}; free disk space or make the directory \
-         writable, or hold the frames in memory with the setting dataset_memory_mb={megabytes} \
-         (FOREFRAME_DATASET_MEMORY_MB={megabytes})",
+        "could not write the decoded frames of the data set ({size_mib} MiB) to {path}; free disk space or make the directory \
+         writable, or hold the frames in memory with the setting dataset_memory_mib={size_mib} \
+         (FOREFRAME_DATASET_MEMORY_MIB={size_mib})",
         path = path.display()
     )]
     FrameFile {
         /// The file.
         path: PathBuf,
         /// Its size in MiB.
-        megabytes: u64,
+        size_mib: u64,
         /// The system's error.
         source: std::io::Error,
     },

@@ -33,10 +33,10 @@ impl Dataset {
         Self::open_within(directory, u64::MAX >> 20)
     }
 
-    /// As [`Dataset::open`], but holds the frames in memory only if they need at most `memory_mb` MiB. Otherwise they are
+    /// As [`Dataset::open`], but holds the frames in memory only if they need at most `memory_mib` MiB. Otherwise they are
     /// decoded into a file in the directory `.cache` of the data set, unless an earlier call did so, and are read from there
     /// when they are used. Errors: as [`Dataset::open`], and `FrameFile`.
-    pub fn open_within(directory: &Path, memory_mb: u64) -> Result<Self, DatasetError> {
+    pub fn open_within(directory: &Path, memory_mib: u64) -> Result<Self, DatasetError> {
         let metadata = DatasetMetadata::read(directory)?;
         let info = metadata.info_in(directory)?;
         let path = directory.join(EPISODES);
@@ -47,7 +47,7 @@ impl Dataset {
             info: &info,
             shards: &metadata.shards,
         };
-        let (frames, numbers) = if info.decoded_bytes() <= memory_mb << 20 {
+        let (frames, numbers) = if info.decoded_bytes() <= memory_mib << 20 {
             let mut held = HeldFrames::zeroed(&info);
             let numbers = shards.read(held.targets(&info, &metadata.shards))?;
             (FrameStore::Memory(held), numbers)

@@ -83,12 +83,12 @@ mod tests {
         assert_eq!(fetched().await, None);
         write(shared.path(), "pretrain", 4);
         assert_eq!(fetched().await, Some(("pretrain".to_owned(), 4)));
-        write(dir.path(), "fit", 2);
-        assert_eq!(fetched().await, Some(("fit".to_owned(), 2)));
-        write(shared.path(), "fit", 3);
-        assert_eq!(fetched().await, Some(("fit".to_owned(), 3)));
+        write(dir.path(), "sequence", 2);
+        assert_eq!(fetched().await, Some(("sequence".to_owned(), 2)));
+        write(shared.path(), "sequence", 3);
+        assert_eq!(fetched().await, Some(("sequence".to_owned(), 3)));
         std::fs::write(shared.path().join(RUN).join(CHECKPOINT_FILE), "damaged").unwrap();
-        assert_eq!(fetched().await, Some(("fit".to_owned(), 3)));
+        assert_eq!(fetched().await, Some(("sequence".to_owned(), 3)));
     }
 
     #[test]

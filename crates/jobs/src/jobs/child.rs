@@ -220,7 +220,7 @@ pub fn run() -> Result<(), String> {
         return Err("run-job is started by the server, which sends it the job".to_owned());
     }
     let order: JobOrder = serde_json::from_str(&line).map_err(|error| error.to_string())?;
-    limit(order.memory.limit_mb);
+    limit(order.memory.limit_mib);
     let cancelled = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&cancelled);
     std::thread::spawn(move || {
@@ -276,14 +276,14 @@ fn write_line(out: &mut dyn std::io::Write, message: &ChildMessage) -> std::io::
 }
 
 /// Limits this process's memory, and ends it with its parent. Only on Linux.
-fn limit(memory_mb: u64) {
+fn limit(memory_mib: u64) {
     #[cfg(target_os = "linux")]
     {
         use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal, setrlimit};
         if let Err(error) = set_parent_process_death_signal(Some(Signal::KILL)) {
             tracing::warn!(%error, "a job's process can outlive the server");
         }
-        let bytes = (memory_mb > 0).then_some(memory_mb << 20);
+        let bytes = (memory_mib > 0).then_some(memory_mib << 20);
         let data = Rlimit {
             current: bytes,
             maximum: bytes,
@@ -293,5 +293,5 @@ fn limit(memory_mb: u64) {
         }
     }
     #[cfg(not(target_os = "linux"))]
-    let _ = memory_mb;
+    let _ = memory_mib;
 }

@@ -23,38 +23,38 @@ const PRINCIPAL_COPIES: u64 = 4;
 
 /// Bytes that a training keeps of each frame besides its pixels: its time, its window, and its places in the order of draws.
 const FRAME_BYTES: u64 = 8 + 16 + 16;
-/// The default of `dataset_memory_mb` where the memory of the machine is unknown.
-const DEFAULT_DATASET_MB: u64 = 1024;
+/// The default of `dataset_memory_mib` where the memory of the machine is unknown.
+const DEFAULT_DATASET_MIB: u64 = 1024;
 
 /// The memory of one job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobMemory {
     /// What it can use, in MiB; 0 for no limit.
-    pub limit_mb: u64,
+    pub limit_mib: u64,
     /// What the frames of a data set can use, in MiB; those of a larger data set stay in a file.
-    pub dataset_mb: u64,
+    pub dataset_mib: u64,
 }
 
 impl JobMemory {
     /// What the frames of a data set can use in a job, in MiB: never more than a third of the job's limit.
     #[must_use]
-    pub fn held_mb(self) -> u64 {
-        match self.limit_mb {
-            0 => self.dataset_mb,
-            limit => self.dataset_mb.min(limit / 3),
+    pub fn held_mib(self) -> u64 {
+        match self.limit_mib {
+            0 => self.dataset_mib,
+            limit => self.dataset_mib.min(limit / 3),
         }
     }
 
     /// Errors: `Invalid` if a training certainly needs more memory than a job can use.
     pub(super) fn check(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
-        let (allowed, needed) = (self.limit_mb, training_mb(config, dataset, self.held_mb()));
+        let (allowed, needed) = (self.limit_mib, training_mib(config, dataset, self.held_mib()));
         if allowed == 0 || needed <= allowed {
             return Ok(());
         }
         Err(JobError::Invalid {
             field: "settings",
             reason: format!(
-                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mb); \
+                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mib); \
                  use a smaller model or batch"
             ),
         })
@@ -64,24 +64,24 @@ impl JobMemory {
 impl Default for JobMemory {
     fn default() -> Self {
         Self {
-            limit_mb: 0,
-            dataset_mb: default_dataset_mb(),
+            limit_mib: 0,
+            dataset_mib: default_dataset_mib(),
         }
     }
 }
 
 /// A quarter of the memory that this process can use, in MiB.
 #[must_use]
-pub fn default_dataset_mb() -> u64 {
-    match default_limit_mb() {
-        0 => DEFAULT_DATASET_MB,
+pub fn default_dataset_mib() -> u64 {
+    match default_limit_mib() {
+        0 => DEFAULT_DATASET_MIB,
         limit => limit / 3,
     }
 }
 
 /// Three quarters of the memory that this process can use, in MiB; 0 if that is unknown.
 #[must_use]
-pub fn default_limit_mb() -> u64 {
+pub fn default_limit_mib() -> u64 {
     let limits = [machine_bytes(), cgroup_bytes()];
     limits
         .into_iter()
@@ -115,10 +115,10 @@ fn cgroup_bytes() -> Option<u64> {
 /// Values that the flow network keeps for each pixel of a window's frames until the gradients are computed.
 const FLOW_PIXEL_VALUES: u64 = 60;
 
-/// The least memory that a training on a data set needs, in MiB, if it holds at most `held_mb` MiB of frames. It leaves out
+/// The least memory that a training on a data set needs, in MiB, if it holds at most `held_mib` MiB of frames. It leaves out
 /// what is hard to know, so a training that passes this check can still reach its limit.
 #[must_use]
-fn training_mb(config: &TrainConfig, dataset: &DatasetInfo, held_mb: u64) -> u64 {
+fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> u64 {
     let count = |value: usize| value as u64;
     let (features, hidden) = (count(config.model.features), count(config.model.hidden));
     let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
@@ -133,20 +133,20 @@ fn training_mb(config: &TrainConfig, dataset: &DatasetInfo, held_mb: u64) -> u64
     };
     let weights = VALUE * WEIGHT_COPIES * (codec + network);
     let window = count(config.model.context + config.model.horizon);
-    let fit_frames = count(config.fit.batch_size) * window;
-    let fit_values = match config.model.architecture {
+    let sequence_frames = count(config.sequence.batch_size) * window;
+    let sequence_values = match config.model.architecture {
         ArchitectureKind::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
         ArchitectureKind::Flow => FLOW_PIXEL_VALUES * pixels,
     };
-    let fit = VALUE * fit_frames * fit_values;
+    let sequence = VALUE * sequence_frames * sequence_values;
     let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
     let principal = match config.pretrain.start {
         CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,
         CodecStart::Random => 0,
     };
-    let work = [fit, pretrain, principal].into_iter().max().unwrap_or(0);
+    let work = [sequence, pretrain, principal].into_iter().max().unwrap_or(0);
     let decoded = dataset.decoded_bytes();
-    let held = if decoded <= held_mb * MIB { decoded } else { 0 };
+    let held = if decoded <= held_mib * MIB { decoded } else { 0 };
     let channels = count(dataset.action_channels.len() + dataset.state_channels.len());
     let numbers = frames * (FRAME_BYTES + VALUE * channels);
     (held + numbers + weights + work).div_ceil(MIB)
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn the_default_limit_is_below_the_memory_of_the_machine() {
         if let Some(bytes) = machine_bytes() {
-            assert!((1..bytes / MIB).contains(&default_limit_mb()));
+            assert!((1..bytes / MIB).contains(&default_limit_mib()));
         }
     }
 
@@ -175,7 +175,7 @@ mod tests {
     #[test]
     fn frames_in_a_file_need_no_memory() {
         let config = TrainConfig::layered("paper", None, &[]).unwrap();
-        let needed = |count| training_mb(&config, &frames(count), 1024);
+        let needed = |count| training_mib(&config, &frames(count), 1024);
         let (small, held, large) = (needed(10_000), needed(262_144), needed(300_000));
         assert!((small + 900..small + 1024).contains(&held), "{small} {held}");
         assert!(
@@ -186,20 +186,23 @@ mod tests {
 
     #[test]
     fn a_job_holds_at_most_a_third_of_its_limit() {
-        let held = |limit_mb| JobMemory {
-            limit_mb,
-            dataset_mb: 1000,
+        let held = |limit_mib| JobMemory {
+            limit_mib,
+            dataset_mib: 1000,
         };
-        assert_eq!([0, 600, 9000].map(|limit| held(limit).held_mb()), [1000, 200, 1000]);
+        assert_eq!([0, 600, 9000].map(|limit| held(limit).held_mib()), [1000, 200, 1000]);
     }
 
     #[test]
     fn a_huge_training_needs_more_than_a_usual_one() {
         let dataset = frames(1000);
         let usual = TrainConfig::layered("paper", None, &[]).unwrap();
-        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[fit]\nbatch_size = 4096\n";
+        let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[sequence]\nbatch_size = 4096\n";
         let huge = TrainConfig::layered("paper", Some(huge), &[]).unwrap();
-        let (usual, huge) = (training_mb(&usual, &dataset, 1024), training_mb(&huge, &dataset, 1024));
+        let (usual, huge) = (
+            training_mib(&usual, &dataset, 1024),
+            training_mib(&huge, &dataset, 1024),
+        );
         assert!(usual < 2048 && huge > 4096, "{usual} {huge}");
     }
 }

@@ -181,7 +181,7 @@ impl Pipeline {
         };
         let mut reporter = TrainingReporter {
             report,
-            steps: [config.pretrain.steps, config.fit.steps],
+            steps: [config.pretrain.steps, config.sequence.steps],
             train_loss: None,
         };
         let mut sync = CheckpointSync::default();
@@ -198,7 +198,7 @@ impl Pipeline {
         match retry.repeat(|| retry_while_busy(&mut train, is_busy, cancelled))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
-                let steps = (config.pretrain.steps + config.fit.steps) as u64;
+                let steps = (config.pretrain.steps + config.sequence.steps) as u64;
                 report.progress(steps, steps, "calibrating");
                 retry.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
                 report.progress(steps, steps, "publishing");
@@ -296,7 +296,7 @@ impl Pipeline {
 
     fn dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
         let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
-        Dataset::open_within(&fetched, self.memory.held_mb()).map_err(|error| failed(&error))
+        Dataset::open_within(&fetched, self.memory.held_mib()).map_err(|error| failed(&error))
     }
 
     /// Copies a finished data set to the object store, if there is a shared one.

@@ -181,24 +181,24 @@ mod tests {
     fn a_resumed_attempt_measures_no_earlier_work() {
         let mut buffer = ReportBuffer::default();
         buffer.progress((0, 0), "reading the data set", 0.0);
-        buffer.progress((500, 1000), "fit", 10.0);
+        buffer.progress((500, 1000), "sequence", 10.0);
         assert_eq!(buffer.stored().progress.rate_per_s, None);
-        buffer.progress((501, 1000), "fit", 10.001);
+        buffer.progress((501, 1000), "sequence", 10.001);
         assert_eq!(buffer.stored().progress.rate_per_s, None);
-        buffer.progress((520, 1000), "fit", 20.0);
+        buffer.progress((520, 1000), "sequence", 20.0);
         assert_eq!(buffer.stored().progress.rate_per_s, Some(2.0));
     }
 
     #[test]
     fn a_repeated_report_is_no_progress() {
         let mut buffer = ReportBuffer::default();
-        buffer.progress((1, 9), "fit", 1.0);
+        buffer.progress((1, 9), "sequence", 1.0);
         buffer.checkpoint(1);
         let reported = buffer.changes();
-        buffer.progress((1, 9), "fit", 2.0);
+        buffer.progress((1, 9), "sequence", 2.0);
         buffer.checkpoint(1);
         assert_eq!(buffer.changes(), reported);
-        buffer.progress((2, 9), "fit", 3.0);
+        buffer.progress((2, 9), "sequence", 3.0);
         buffer.line("a line".to_owned(), 4.0);
         assert_eq!(buffer.changes(), reported + 2);
     }

@@ -8,7 +8,7 @@ use super::{Store, StoreError};
 /// A point of a training's loss curves.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LossRow {
-    /// `pretrain` or `fit`.
+    /// `pretrain` or `sequence`.
     pub stage: String,
     /// Steps done in that stage.
     pub step: i64,

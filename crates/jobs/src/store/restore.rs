@@ -46,9 +46,9 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
     Ok(index)
 }
 
-/// What a restore has begun: the content of its marker.
+/// What an unfinished restore copies: the content of its marker.
 #[derive(Default, Serialize, Deserialize)]
-struct BegunRestore {
+struct UnfinishedRestore {
     /// Where the database is restored.
     database: Option<PathBuf>,
     /// The files that are copied, by their names in the backup.
@@ -92,8 +92,8 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
     let text = none_if_missing(std::fs::read(&marker)).map_err(BackupError::io("read", &marker))?;
     // An empty marker: no file was copied yet. An older version's marker holds a sentence: its files are not known, and those
     // that this backup does not replace stay.
-    let begun: BegunRestore = serde_json::from_slice(&text.unwrap_or_default()).unwrap_or_default();
-    let is_own = |path: &Path| is_begun && (path.starts_with(data_dir) || begun.database.as_deref() == Some(path));
+    let unfinished: UnfinishedRestore = serde_json::from_slice(&text.unwrap_or_default()).unwrap_or_default();
+    let is_own = |path: &Path| is_begun && (path.starts_with(data_dir) || unfinished.database.as_deref() == Some(path));
     if let Some(path) = database.filter(|path| path.exists() && !is_own(path)) {
         return Err(is_taken(path));
     }
@@ -109,11 +109,11 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
     }
     // A database elsewhere can be in use by now.
     let may_be_deleted = |path: &PathBuf| path.starts_with(data_dir) || database == Some(path);
-    let path_of = |name: &String| restored_path(data_dir, begun.database.as_deref(), name).filter(may_be_deleted);
-    let stale: Vec<PathBuf> = begun.files.iter().filter_map(path_of).collect();
-    let now = BegunRestore {
+    let path_of = |name: &String| restored_path(data_dir, unfinished.database.as_deref(), name).filter(may_be_deleted);
+    let stale: Vec<PathBuf> = unfinished.files.iter().filter_map(path_of).collect();
+    let now = UnfinishedRestore {
         database: database.map(Path::to_owned),
-        files: begun
+        files: unfinished
             .files
             .union(&index.files.keys().cloned().collect())
             .cloned()

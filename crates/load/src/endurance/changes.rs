@@ -66,7 +66,7 @@ fn train() -> Value {
         "model": {"features": 16, "hidden": 16},
         "data": {"windows": 64, "validation_windows": 8},
         "pretrain": {"steps": 10, "batch_size": 16, "start": "random"},
-        "fit": {"steps": 40, "batch_size": 16},
+        "sequence": {"steps": 40, "batch_size": 16},
         "run": {"validate_every_steps": 20, "checkpoint_every_steps": 4},
     });
     json!({"kind": "train", "name": MODEL, "preset": "paper", "dataset": BASE, "settings": settings})

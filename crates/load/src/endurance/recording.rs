@@ -79,8 +79,8 @@ fn predict(session: &mut Session, message: &FrameMessage) -> Option<Vec<Frame>> 
     let frame = Frame::new(spec.frame_width_px, spec.frame_height_px, message.image.0.clone()).unwrap();
     let action = message.action.clone().map(|action| Action::try_from(action).unwrap());
     let state = message.state.clone().map(|state| RobotState::try_from(state).unwrap());
-    let future = action.map(|action| vec![action; spec.horizon]);
-    let predicted = session.step(frame, state.as_ref(), future.as_deref()).unwrap();
+    let plan = action.map(|action| vec![action; spec.horizon]);
+    let predicted = session.step(frame, state.as_ref(), plan.as_deref()).unwrap();
     predicted.map(|rollout| rollout.frames)
 }
 

@@ -23,7 +23,7 @@ const PICTURE_PERIOD: Duration = Duration::from_millis(250);
 pub(super) const BASE: &str = "seen";
 /// Different episodes that are shown, in turn.
 const EPISODES: u64 = 10;
-/// Plans of a rollout request. All are the same, so all futures are the same prediction.
+/// Plans of a rollout request. All are the same, so all rollouts are the same prediction.
 const PLANS: usize = 16;
 
 /// The prediction that the library makes of the workload's request.
@@ -45,7 +45,7 @@ pub(super) fn expected(workload: &Workload, model: &Model) -> Vec<Frame> {
         state: spec
             .state_inputs()
             .map(|count| RobotState::try_from(values(count)).unwrap()),
-        future_actions: action.map(|action| vec![action; spec.horizon]),
+        plan: action.map(|action| vec![action; spec.horizon]),
         ..PredictionInput::default()
     };
     predict(model, &[&input]).unwrap().remove(0).frames
@@ -71,12 +71,12 @@ pub(super) async fn predictions(run: Arc<EnduranceRun>, expected: Arc<Vec<Frame>
     times
 }
 
-/// Sends rollout requests and checks every future.
+/// Sends rollout requests and checks every rollout.
 pub(super) async fn rollouts(run: Arc<EnduranceRun>, expected: Arc<Vec<Frame>>) {
     let mut client = RunClient::new(&run, "rollouts");
     let mut body = run.workload.context_body();
-    body["candidates"] = json!(vec![body["future_actions"].clone(); PLANS]);
-    body.as_object_mut().unwrap().remove("future_actions");
+    body["plans"] = json!(vec![body["plan"].clone(); PLANS]);
+    body.as_object_mut().unwrap().remove("plan");
     let request = Request::json(&format!("/v1/models/{}/rollouts", run.workload.model()), &body);
     while !run.is_over() {
         if let Some(answer) = client.ask(&request).await
@@ -84,9 +84,11 @@ pub(super) async fn rollouts(run: Arc<EnduranceRun>, expected: Arc<Vec<Frame>>) 
             && client.expect(&answer, &[200])
         {
             let answer = answer.json();
-            let futures = answer["futures"].as_array().cloned().unwrap_or_default();
-            let are_right = futures.iter().all(|future| are_equal_png(&images(future), &expected));
-            if futures.len() != PLANS || !are_right {
+            let rollouts = answer["rollouts"].as_array().cloned().unwrap_or_default();
+            let are_right = rollouts
+                .iter()
+                .all(|rollout| are_equal_png(&images(rollout), &expected));
+            if rollouts.len() != PLANS || !are_right {
                 run.fault("a rollout was not the library's");
             }
         }

@@ -52,7 +52,7 @@ pub const NEAREST_WINDOWS: usize = 15_000;
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
     /// Which part of the data set.
-    pub purpose: ScoredSplit,
+    pub split: ScoredSplit,
     /// Seed of the split; that of the model's training if none is given.
     pub split_seed: Option<Seed>,
     /// Frames from the start of one window to that of the next.
@@ -80,7 +80,7 @@ pub struct EvaluateConfig<'a> {
 impl Default for EvaluateConfig<'_> {
     fn default() -> Self {
         Self {
-            purpose: ScoredSplit::default(),
+            split: ScoredSplit::default(),
             split_seed: None,
             stride: 1,
             max_windows: 2000,

@@ -7,7 +7,7 @@ use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::{Frame, quality};
 use foreframe_core::registry::Model;
 use foreframe_core::registry::calibration::{
-    Calibration, ContextStatistics, ERROR_INPUTS, ExpectedError, NoveltyScale, PredictedFuture,
+    Calibration, ContextStatistics, ERROR_INPUTS, ExpectedError, NoveltyScale, RolloutInContext,
 };
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -87,7 +87,7 @@ fn forecast_batch(
                 .frame_from(frame, spec.frame_width_px, spec.frame_height_px)
         });
         let frames = frames.collect::<Result<Vec<Frame>, _>>()?;
-        let future = PredictedFuture {
+        let rollout = RolloutInContext {
             spec,
             context: &context,
             seen: [code(1), code(2)],
@@ -100,9 +100,9 @@ fn forecast_batch(
             let truth = scale(&dataset.pixels(window.first_frame + spec.context + step)?);
             errors.push(quality::mse(&spec.preprocess.inverse(frame), &truth));
         }
-        let expected = |calibration: &Calibration| future.expected_errors(calibration);
+        let expected = |calibration: &Calibration| rollout.expected_errors(calibration);
         found.push(Forecast {
-            inputs: future.error_inputs(novelty),
+            inputs: rollout.error_inputs(novelty),
             expected: loaded.manifest.calibration.as_ref().map(expected).unwrap_or_default(),
             errors,
             context,

@@ -63,13 +63,13 @@ fn headline(out: &mut String, report: &EvaluationReport) -> std::fmt::Result {
          numbers are means over t+1…t+{}; MSE is in units of 10⁻⁴.\n",
         report.model.horizon
     )?;
-    if report.stamp.purpose == ScoredSplit::Validation {
+    if report.stamp.split == ScoredSplit::Validation {
         writeln!(
             out,
             "These are validation scores, for choosing between models and settings. Publish test scores.\n"
         )?;
     }
-    if report.stamp.purpose == ScoredSplit::WholeSet {
+    if report.stamp.split == ScoredSplit::WholeSet {
         writeln!(
             out,
             "All of the data set is for testing. The mean frame and the background of the baselines are its own, and there is \

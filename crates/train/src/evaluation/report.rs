@@ -92,7 +92,7 @@ pub struct ReportStamp {
     pub twins: Vec<(String, String)>,
     /// Whether the validation split or the test sets were scored.
     #[serde(default)]
-    pub purpose: ScoredSplit,
+    pub split: ScoredSplit,
     /// The program's version and the commit it was built from.
     pub program: ProgramStamp,
     /// The command line.
@@ -131,7 +131,7 @@ impl ReportStamp {
             model,
             model_sha256,
             twins: config.twins.iter().map(|twin| named(twin)).collect(),
-            purpose: config.purpose,
+            split: config.split,
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,

@@ -23,7 +23,7 @@ pub fn figure_inputs(
     report: &EvaluationReport,
 ) -> Result<FigureInputs, EvaluationError> {
     let mut inputs = FigureInputs::default();
-    for &split in report.stamp.purpose.splits() {
+    for &split in report.stamp.split.splits() {
         let Some(scores) = report.scores(split.name()) else {
             continue;
         };
@@ -102,7 +102,7 @@ fn animate(
         context: spec.context,
         horizon: spec.horizon,
     };
-    let splits = report.stamp.purpose.divide(dataset, report.stamp.split_seed);
+    let splits = report.stamp.split.divide(dataset, report.stamp.split_seed);
     let mut windows = splits.windows(dataset, split, shape, 1)?;
     windows.retain(|window| window.episode == median.episode);
     windows.truncate(MAX_MOMENTS);

@@ -42,7 +42,7 @@ pub(super) struct RunFiles {
 
 impl RunFiles {
     /// Checks that the directory is unused, or contains a run with the same configuration and data. Writes nothing.
-    /// Errors: `NotARun`, `OtherRun`, `Io`.
+    /// Errors: `NotARun`, `OtherRun`, `RenamedSettings`, `Io`.
     pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let files = Self {
             run_dir: run_dir.to_owned(),
@@ -54,7 +54,11 @@ impl RunFiles {
                 (files.config(), &files.config_text, "configuration"),
                 (files.data(), &files.content_hash, "data set"),
             ] {
-                if fs::read_to_string(&path).map_err(io_failed("read", &path))? != *expected {
+                let found = fs::read_to_string(&path).map_err(io_failed("read", &path))?;
+                if found.lines().any(|line| line == "[fit]") {
+                    return Err(TrainError::RenamedSettings(run_dir.to_owned()));
+                }
+                if found != *expected {
                     return Err(TrainError::OtherRun {
                         run_dir: run_dir.to_owned(),
                         what,
@@ -335,7 +339,7 @@ mod tests {
     #[test]
     fn one_flipped_bit_damages_a_checkpoint() {
         let tensor = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu).unwrap();
-        let metadata = HashMap::from([state_entry(r#"{"stage":"fit","step":7}"#)]);
+        let metadata = HashMap::from([state_entry(r#"{"stage":"sequence","step":7}"#)]);
         let bytes = seal(safetensors::serialize([("a", tensor)], Some(metadata)).unwrap());
         assert_eq!(CheckpointPosition::of(&bytes).map(|reached| reached.step), Some(7));
         for index in 0..bytes.len() {

@@ -34,7 +34,7 @@ pub struct TrainConfig {
     pub pretrain: PretrainConfig,
     /// Stage 2, sequence training: the recurrent network.
     #[doc(hidden)]
-    pub fit: FitConfig,
+    pub sequence: SequenceConfig,
     /// Settings of both stages.
     #[doc(hidden)]
     pub run: RunConfig,
@@ -185,7 +185,7 @@ pub enum CodecStart {
 /// Settings of sequence training (stage 2).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct FitConfig {
+pub struct SequenceConfig {
     /// Number of updates.
     pub steps: usize,
     /// Windows per update.
@@ -211,7 +211,7 @@ pub struct FitConfig {
     #[serde(default)]
     pub short_share: f64,
     /// Frames that count in these first updates, 1 to the horizon.
-    #[serde(default = "FitConfig::default_short_horizon")]
+    #[serde(default = "SequenceConfig::default_short_horizon")]
     pub short_horizon: usize,
     /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
     #[serde(default)]
@@ -222,7 +222,7 @@ pub struct FitConfig {
     pub motion_weight: f64,
 }
 
-impl FitConfig {
+impl SequenceConfig {
     fn default_short_horizon() -> usize {
         1
     }

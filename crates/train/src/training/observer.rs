@@ -10,14 +10,14 @@ pub enum TrainingStage {
     /// Stage 1, pre-training: the dense codec alone.
     Pretrain,
     /// Stage 2, sequence training: the recurrent network.
-    Fit,
+    Sequence,
 }
 
 impl std::fmt::Display for TrainingStage {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str(match self {
             Self::Pretrain => "pretrain",
-            Self::Fit => "fit",
+            Self::Sequence => "sequence",
         })
     }
 }

@@ -64,7 +64,7 @@ impl TrainConfig {
             settings.remove(START_KEY);
         }
         // Its codec has been trained already, and it knows the first frames.
-        for known in ["/pretrain/steps", "/fit/short_share"] {
+        for known in ["/pretrain/steps", "/sequence/short_share"] {
             if let Some(value) = settings.pointer_mut(known) {
                 *value = 0.into();
             }
@@ -91,6 +91,12 @@ fn extract(
     defaults: SettingsLayer,
     layers: impl IntoIterator<Item = SettingsLayer>,
 ) -> Result<TrainConfig, TrainError> {
+    let layers: Vec<SettingsLayer> = layers.into_iter().collect();
+    for layer in std::iter::once(&defaults).chain(&layers) {
+        layer
+            .refuse_renamed("fit", "sequence")
+            .map_err(|error| config_error(&error))?;
+    }
     let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(|error| config_error(&error))?;
     values.extract(expected).map_err(|error| config_error(&error))
 }
@@ -136,19 +142,19 @@ mod tests {
 
     #[test]
     fn settings_override_the_file_which_overrides_the_preset() {
-        let file = "seed = 5\n[fit]\nsteps = 10\nlearning_rate = 0.5\n";
+        let file = "seed = 5\n[sequence]\nsteps = 10\nlearning_rate = 0.5\n";
         let settings = [
-            "fit.steps=20".to_owned(),
+            "sequence.steps=20".to_owned(),
             "data.windows=all".to_owned(),
-            "fit.codec=frozen".to_owned(),
+            "sequence.codec=frozen".to_owned(),
         ];
         let config = TrainConfig::layered("paper", Some(file), &settings).unwrap();
         assert_eq!(
-            (config.seed, config.fit.steps, config.fit.learning_rate),
+            (config.seed, config.sequence.steps, config.sequence.learning_rate),
             (Seed(5), 20, 0.5)
         );
         assert_eq!(
-            (config.data.windows, config.fit.codec),
+            (config.data.windows, config.sequence.codec),
             (WindowBudget::All(All::All), CodecTraining::Frozen)
         );
     }
@@ -165,12 +171,26 @@ mod tests {
 
     #[test]
     fn a_misspelt_field_is_refused_by_name() {
-        let error = TrainConfig::layered("paper", None, &["fit.stepz=3".to_owned()])
+        let error = TrainConfig::layered("paper", None, &["sequence.stepz=3".to_owned()])
             .unwrap_err()
             .to_string();
         assert_eq!(
             error,
-            "unknown field `stepz` in `fit` (--set); `foreframe train --print-config` lists all settings"
+            "unknown field `stepz` in `sequence` (--set); `foreframe train --print-config` lists all settings"
+        );
+    }
+
+    #[test]
+    fn the_old_name_of_sequence_training_is_refused_with_its_new_one() {
+        let message =
+            |file, settings: &[String]| TrainConfig::layered("paper", file, settings).unwrap_err().to_string();
+        assert_eq!(
+            message(Some("[fit]\nsteps = 10\n"), &[]),
+            "`fit` is now called `sequence` (settings)"
+        );
+        assert_eq!(
+            message(None, &["fit.steps=3".to_owned()]),
+            "`fit` is now called `sequence` (--set)"
         );
     }
 
@@ -179,32 +199,32 @@ mod tests {
         let message =
             |file, settings: &[String]| TrainConfig::layered("paper", file, settings).unwrap_err().to_string();
         assert_eq!(
-            message(None, &["fit.steps=many".to_owned()]),
-            "fit.steps is \"many\" (--set); it must be a whole number, 0 or more"
+            message(None, &["sequence.steps=many".to_owned()]),
+            "sequence.steps is \"many\" (--set); it must be a whole number, 0 or more"
         );
         assert_eq!(
             message(Some("[data]\nwindows = \"some\"\n"), &[]),
             "data.windows is \"some\" (settings); it must be a whole number, 1 or more, or \"all\""
         );
         assert_eq!(
-            message(Some("[fit]\ncodec = \"thawed\"\n"), &[]),
-            "fit.codec is \"thawed\" (settings); it must be frozen or fine-tuned"
+            message(Some("[sequence]\ncodec = \"thawed\"\n"), &[]),
+            "sequence.codec is \"thawed\" (settings); it must be frozen or fine-tuned"
         );
         assert_eq!(
-            message(Some("fit = 3\n"), &[]),
-            "fit is 3 (settings); it must be a table"
+            message(Some("sequence = 3\n"), &[]),
+            "sequence is 3 (settings); it must be a table"
         );
     }
 
     #[test]
     fn a_number_out_of_range_is_refused_with_its_range() {
-        let error = TrainConfig::layered("paper", None, &["fit.learning_rate=nan".to_owned()])
+        let error = TrainConfig::layered("paper", None, &["sequence.learning_rate=nan".to_owned()])
             .unwrap_err()
             .to_string();
-        assert_eq!(error, "fit.learning_rate is NaN; it must be 0 to 1");
-        let error = TrainConfig::layered("paper", None, &["fit.batch_size=0".to_owned()])
+        assert_eq!(error, "sequence.learning_rate is NaN; it must be 0 to 1");
+        let error = TrainConfig::layered("paper", None, &["sequence.batch_size=0".to_owned()])
             .unwrap_err()
             .to_string();
-        assert_eq!(error, "fit.batch_size is 0; it must be 1 to 4096");
+        assert_eq!(error, "sequence.batch_size is 0; it must be 1 to 4096");
     }
 }

@@ -63,7 +63,7 @@ impl Objective for CodecObjective<'_> {
         let batch: Vec<usize> = batch.into_iter().map(|position| self.frames[position]).collect();
         let reconstructed = self.reconstruct(parameters, &self.plan.source.inputs(&batch)?)?;
         let targets = self.plan.source.targets(&batch)?;
-        Ok(self.config.fit.loss.between(&reconstructed, &targets)?)
+        Ok(self.config.sequence.loss.between(&reconstructed, &targets)?)
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
@@ -127,7 +127,7 @@ mod tests {
     #[test]
     fn the_codec_is_fitted_to_sharp_targets() {
         let settings = [
-            "fit.target=sharp",
+            "sequence.target=sharp",
             "data.windows=all",
             "model.features=4",
             "model.hidden=4",

@@ -111,7 +111,7 @@ impl DenseNetwork {
     /// Predicts the features `[N, horizon, F]` of N rollouts from B windows with `features` `[B, context, F]`. Rollout n
     /// starts from window `windows[n]` and uses row n of `condition`. Each window is encoded once, also if it has many
     /// rollouts. Errors: `Shape`, `Missing`, `Tensor` if a window index is out of range.
-    pub(in crate::nn) fn predict_futures(
+    pub(in crate::nn) fn predict_rollouts(
         &self,
         features: &Tensor,
         windows: &[u32],

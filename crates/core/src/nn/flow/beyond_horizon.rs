@@ -1,4 +1,4 @@
-//! Futures of the flow network of any length: it predicts one horizon after another, each from the frames before it. What
+//! Rollouts of the flow network of any length: it predicts one horizon after another, each from the frames before it. What
 //! lies beyond the first horizon follows predicted frames and an estimated state, which training never saw.
 
 use candle_core::{Device, Tensor};
@@ -9,7 +9,7 @@ use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
 
-/// Frames `[N, steps, P]` of N futures: the windows' frames, the window of each future, and its conditioning with `steps`
+/// Frames `[N, steps, P]` of N rollouts: the windows' frames, the window of each rollout, and its conditioning with `steps`
 /// actions. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
 pub(in crate::nn) fn predict_beyond_horizon(
     flow: &FlowNetwork,

@@ -3,9 +3,9 @@
 use candle_core::{Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
-use super::future_rows::FutureRows;
 use super::network::{FlowNetwork, FlowPrediction};
 use super::rays::{CameraPose, Viewer, turning_places};
+use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
@@ -14,11 +14,11 @@ use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
 
 impl FlowNetwork {
-    /// All steps of the futures at once; gives the frames of the first `steps`.
+    /// All steps of the rollouts at once; gives the frames of the first `steps`.
     pub(super) fn predict_directly(
         &self,
         spec: &ModelSpec,
-        rows: &FutureRows,
+        rows: &RolloutRows,
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());
@@ -28,7 +28,7 @@ impl FlowNetwork {
         let coarse = self.encode(spec, &contexts)?;
 
         let motions = with_values(&motion, motion_rows)?;
-        let poses = rows.future_poses(spec, &motions);
+        let poses = rows.rollout_poses(spec, &motions);
         let scene = self.scene.forward(spec, rows, &motion, &poses)?;
 
         let geometry = self.places(spec, rows, &motion.flatten(0, 1)?, &poses)?;
@@ -65,7 +65,7 @@ impl FlowNetwork {
     fn places(
         &self,
         spec: &ModelSpec,
-        rows: &FutureRows,
+        rows: &RolloutRows,
         motion: &Tensor,
         poses: &[CameraPose],
     ) -> Result<ItemPlaces, NnError> {

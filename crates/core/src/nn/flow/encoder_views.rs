@@ -9,7 +9,7 @@ use crate::nn::spec::ModelSpec;
 
 /// The contexts that are encoded, each once.
 pub(super) struct EncoderViews {
-    /// The context of each future.
+    /// The context of each rollout.
     pub(super) row_of: Vec<u32>,
     /// How many frames are read of each.
     pub(super) frames_read: usize,

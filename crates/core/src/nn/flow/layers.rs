@@ -17,7 +17,7 @@ const FRAME_CHANNELS: usize = 16;
 /// Hidden units of the modulation.
 const MODULATION_HIDDEN: usize = 64;
 
-/// A layer of the network: its tensor's shape, and how often a window of one future applies it to one row.
+/// A layer of the network: its tensor's shape, and how often a window of one rollout applies it to one row.
 struct LayerSize {
     name: String,
     inputs: usize,

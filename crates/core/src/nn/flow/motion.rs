@@ -4,7 +4,7 @@
 use candle_core::{DType, Device, Tensor};
 use candle_nn::Module as _;
 
-use super::future_rows::FutureRows;
+use super::rollout_rows::RolloutRows;
 use super::state_channels::StateChannels;
 use super::wheel_dynamics;
 use crate::nn::error::NnError;
@@ -53,7 +53,7 @@ impl MotionHead {
     }
 
     /// Yaw, ahead and left since the last frame `[N, horizon, 3]`; zero for a standing camera.
-    pub(super) fn forward(&self, spec: &ModelSpec, rows: &FutureRows) -> Result<Tensor, NnError> {
+    pub(super) fn forward(&self, spec: &ModelSpec, rows: &RolloutRows) -> Result<Tensor, NnError> {
         let shape = (rows.count(), spec.horizon, 3);
         let Some([inputs, output]) = &self.layers else {
             return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);

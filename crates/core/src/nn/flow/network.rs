@@ -4,9 +4,9 @@ use candle_core::{Device, Tensor};
 use candle_nn::Module as _;
 
 use super::encoder_views::EncoderViews;
-use super::future_rows::FutureRows;
 use super::layers::mix_name;
 use super::motion::MotionHead;
+use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::ops::convolution::{ConvShape, Convolution3};
@@ -125,7 +125,7 @@ impl FlowNetwork {
     }
 
     /// Scales and shifts of each item's modulated layers `[M, …]`.
-    pub(super) fn modulate(&self, spec: &ModelSpec, rows: &FutureRows, motion: &Tensor) -> Result<Tensor, NnError> {
+    pub(super) fn modulate(&self, spec: &ModelSpec, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
         let known = rows.step_inputs(spec)?;
         let motion = motion.flatten(0, 1)?;
         let inputs = if self.motion.is_moving() {

@@ -1,18 +1,18 @@
-//! Predicts the futures of a batch with the flow network, in either of its forms.
+//! Predicts the rollouts of a batch with the flow network, in either of its forms.
 
 use candle_core::Tensor;
 
-use super::future_rows::FutureRows;
 use super::network::{FlowNetwork, FlowPrediction};
+use super::rollout_rows::RolloutRows;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
 
-/// Futures that are computed together without gradients, so that many take no more memory than few.
-const FUTURES_AT_ONCE: usize = 16;
+/// Rollouts that are computed together without gradients, so that many take no more memory than few.
+const ROLLOUTS_AT_ONCE: usize = 16;
 
 impl FlowNetwork {
-    /// N futures of B windows of frames `[B, context, P]`: future n follows window `windows[n]` under row n of the
+    /// N rollouts of B windows of frames `[B, context, P]`: rollout n follows window `windows[n]` under row n of the
     /// conditioning. Errors: `Shape`, `Missing`.
     pub(in crate::nn) fn predict(
         &self,
@@ -32,13 +32,13 @@ impl FlowNetwork {
         conditioning: &ConditioningTensors,
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {
-        let rows = FutureRows::new(spec, frames, windows, conditioning)?;
-        if rows.count() <= FUTURES_AT_ONCE || self.is_trained() {
+        let rows = RolloutRows::new(spec, frames, windows, conditioning)?;
+        if rows.count() <= ROLLOUTS_AT_ONCE || self.is_trained() {
             return self.predict_rows(spec, &rows, steps);
         }
         let (mut frames, mut scene, mut motion) = (Vec::new(), Vec::new(), Vec::new());
-        for first in (0..rows.count()).step_by(FUTURES_AT_ONCE) {
-            let part = rows.part(first..rows.count().min(first + FUTURES_AT_ONCE));
+        for first in (0..rows.count()).step_by(ROLLOUTS_AT_ONCE) {
+            let part = rows.part(first..rows.count().min(first + ROLLOUTS_AT_ONCE));
             let part = self.predict_rows(spec, &part, steps)?;
             frames.push(part.frames);
             scene.push(part.scene);
@@ -51,7 +51,7 @@ impl FlowNetwork {
         })
     }
 
-    fn predict_rows(&self, spec: &ModelSpec, rows: &FutureRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    fn predict_rows(&self, spec: &ModelSpec, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         if self.sizes.layers.recurrent {
             self.predict_recurrently(spec, rows, steps)
         } else {

@@ -5,9 +5,9 @@
 use candle_core::{DType, Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
-use super::future_rows::FutureRows;
 use super::network::{FlowNetwork, FlowPrediction};
 use super::rays::CameraPose;
+use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
@@ -19,11 +19,11 @@ use crate::nn::tensors::with_values;
 const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 impl FlowNetwork {
-    /// The futures of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
+    /// The rollouts of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
     pub(super) fn predict_recurrently(
         &self,
         spec: &ModelSpec,
-        rows: &FutureRows,
+        rows: &RolloutRows,
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {
         let (count, horizon, size) = (rows.count(), spec.horizon, spec.image_size());

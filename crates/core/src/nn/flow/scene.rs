@@ -9,8 +9,8 @@ use candle_nn::Module as _;
 
 use super::blocks::centred;
 use super::encoder_views::EncoderViews;
-use super::future_rows::FutureRows;
 use super::rays::{CameraPose, Viewer};
+use super::rollout_rows::RolloutRows;
 use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews};
 use super::state_channels::StateChannels;
 use crate::frame::warp::CameraModel;
@@ -107,7 +107,7 @@ impl Scene {
     pub(super) fn forward(
         &self,
         spec: &ModelSpec,
-        rows: &FutureRows,
+        rows: &RolloutRows,
         motion: &Tensor,
         poses: &[CameraPose],
     ) -> Result<Tensor, NnError> {

@@ -81,7 +81,7 @@ impl StateChannels {
         self.commanded.iter().any(Option::is_some)
     }
 
-    /// The speeds of a future. One that is not commanded stays as measured; one that is not measured starts as commanded.
+    /// The speeds of a rollout. One that is not commanded stays as measured; one that is not measured starts as commanded.
     /// `actions` holds them step after step, `action_count` components each.
     pub(super) fn speeds(self, state: &[f32], actions: &[f32], action_count: usize) -> CommandedSpeeds {
         let measured = self.measured.map(|channel| channel.map(|channel| state[channel]));

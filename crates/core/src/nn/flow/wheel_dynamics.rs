@@ -18,7 +18,7 @@ const DIFFERENCE: f64 = 1e-3;
 /// The forward speed in m/s and the yaw rate in rad/s.
 type Speeds = [f32; 2];
 
-/// The speeds of a future.
+/// The speeds of a rollout.
 #[derive(Clone, Debug)]
 pub(super) struct CommandedSpeeds {
     /// At the last frame.
@@ -27,19 +27,19 @@ pub(super) struct CommandedSpeeds {
     pub(super) commands: Vec<Speeds>,
 }
 
-/// Yaw, ahead and left since the last frame `[N, horizon, 3]`, in radians and metres, for N futures of `horizon` steps of
+/// Yaw, ahead and left since the last frame `[N, horizon, 3]`, in radians and metres, for N rollouts of `horizon` steps of
 /// `period_s`. `wheels` `[2]` holds the logarithms of both learned values, relative to their first ones.
-pub(super) fn integral(wheels: &Tensor, futures: Vec<CommandedSpeeds>, period_s: f64) -> Result<Tensor> {
-    wheels.contiguous()?.apply_op1(WheelIntegral { futures, period_s })
+pub(super) fn integral(wheels: &Tensor, rollouts: Vec<CommandedSpeeds>, period_s: f64) -> Result<Tensor> {
+    wheels.contiguous()?.apply_op1(WheelIntegral { rollouts, period_s })
 }
 
 struct WheelIntegral {
-    futures: Vec<CommandedSpeeds>,
+    rollouts: Vec<CommandedSpeeds>,
     period_s: f64,
 }
 
 impl WheelIntegral {
-    /// The motions of all futures, for the logarithms in `learned`.
+    /// The motions of all rollouts, for the logarithms in `learned`.
     fn motions(&self, learned: [f64; 2]) -> Vec<f32> {
         let [half_track, acceleration] = learned.map(|logarithm| logarithm.clamp(-MAX_LOGARITHM, MAX_LOGARITHM).exp());
         let (half_track, acceleration) = (HALF_TRACK_M * half_track, ACCELERATION_M_S2 * acceleration);
@@ -48,10 +48,10 @@ impl WheelIntegral {
             [ahead - turn * half_track, ahead + turn * half_track]
         };
         let mut motions = Vec::new();
-        for future in &self.futures {
-            let mut speeds = wheels(future.start);
+        for rollout in &self.rollouts {
+            let mut speeds = wheels(rollout.start);
             let mut pose = CameraPose::default();
-            for &command in &future.commands {
+            for &command in &rollout.commands {
                 let mut means = [0.0; 2];
                 for ((mean, speed), target) in means.iter_mut().zip(&mut speeds).zip(wheels(command)) {
                     *mean = mean_speed(speed, target, acceleration, self.period_s);
@@ -88,7 +88,7 @@ impl CustomOp1 for WheelIntegral {
 
     fn cpu_fwd(&self, wheels: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
         let motions = self.motions(parameters(slice(wheels, layout)?));
-        let count = self.futures.len();
+        let count = self.rollouts.len();
         let steps = motions.len() / 3 / count.max(1);
         Ok((CpuStorage::F32(motions), Shape::from((count, steps, 3))))
     }
@@ -120,7 +120,7 @@ mod tests {
 
     const PERIOD_S: f64 = 0.2;
 
-    fn future(start: Speeds, commands: &[Speeds]) -> CommandedSpeeds {
+    fn rollout(start: Speeds, commands: &[Speeds]) -> CommandedSpeeds {
         CommandedSpeeds {
             start,
             commands: commands.to_vec(),
@@ -146,7 +146,7 @@ mod tests {
             heading_rad: 0.0,
         });
         let learned = wheels(f64::from(WHEEL_BASE_M), f64::from(MAX_RIM_ACCELERATION_M_S2));
-        let motions = integral(&learned, vec![future([0.0, 0.0], &commands)], PERIOD_S).unwrap();
+        let motions = integral(&learned, vec![rollout([0.0, 0.0], &commands)], PERIOD_S).unwrap();
         let motions: Vec<f32> = motions.flatten_all().unwrap().to_vec1().unwrap();
         for (command, motion) in commands.iter().zip(motions.chunks_exact(3)) {
             base.command(command[0], command[1]);
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn without_a_change_of_speed_the_robot_drives_an_arc() {
-        let still = future([0.5, 1.0], &[[0.5, 1.0]]);
+        let still = rollout([0.5, 1.0], &[[0.5, 1.0]]);
         let motion = integral(&wheels(0.3, 2.0), vec![still], PERIOD_S).unwrap();
         let motion: Vec<f32> = motion.flatten_all().unwrap().to_vec1().unwrap();
         let (sin, cos) = 0.1f32.sin_cos();
@@ -173,12 +173,12 @@ mod tests {
 
     #[test]
     fn gradients_are_those_of_finite_differences() {
-        let futures = vec![
-            future([0.0, 0.0], &[[0.4, 0.8], [0.5, -0.6], [0.1, 0.0]]),
-            future([0.5, -1.0], &[[0.5, 1.0], [0.0, 0.0], [0.7, 0.3]]),
+        let rollouts = vec![
+            rollout([0.0, 0.0], &[[0.4, 0.8], [0.5, -0.6], [0.1, 0.0]]),
+            rollout([0.5, -1.0], &[[0.5, 1.0], [0.0, 0.0], [0.7, 0.3]]),
         ];
         assert_gradients(&[wheels(0.25, 1.3)], 1e-2, |inputs| {
-            integral(&inputs[0], futures.clone(), PERIOD_S)
+            integral(&inputs[0], rollouts.clone(), PERIOD_S)
         });
     }
 }

@@ -147,7 +147,7 @@ impl FrameFilePlace {
     fn failed(&self, source: io::Error) -> DatasetError {
         DatasetError::FrameFile {
             path: self.path.clone(),
-            megabytes: self.layout.total_bytes().div_ceil(1 << 20),
+            size_mib: self.layout.total_bytes().div_ceil(1 << 20),
             source,
         }
     }

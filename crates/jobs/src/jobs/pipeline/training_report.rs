@@ -91,7 +91,7 @@ impl TrainingReporter<'_> {
         let [pretrain, _] = self.steps;
         match stage {
             TrainingStage::Pretrain => step as u64,
-            TrainingStage::Fit => (pretrain + step) as u64,
+            TrainingStage::Sequence => (pretrain + step) as u64,
         }
     }
 

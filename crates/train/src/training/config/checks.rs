@@ -16,12 +16,12 @@ impl TrainConfig {
         if !foreframe_core::registry::is_valid_name(&self.name) {
             return Err(foreframe_core::registry::RegistryError::Name(self.name.clone()).into());
         }
-        let (run, fit, pretrain) = (&self.run, &self.fit, &self.pretrain);
+        let (run, sequence, pretrain) = (&self.run, &self.sequence, &self.pretrain);
         let counts = [
             ("pretrain.steps", pretrain.steps, 0, MAX_STEPS),
             ("pretrain.batch_size", pretrain.batch_size, 1, MAX_BATCH_SIZE),
-            ("fit.steps", fit.steps, 1, MAX_STEPS),
-            ("fit.batch_size", fit.batch_size, 1, MAX_BATCH_SIZE),
+            ("sequence.steps", sequence.steps, 1, MAX_STEPS),
+            ("sequence.batch_size", sequence.batch_size, 1, MAX_BATCH_SIZE),
             ("data.validation_windows", self.data.validation_windows, 1, MAX_STEPS),
             ("run.batch_parts", run.batch_parts, 1, 64),
             ("run.validate_every_steps", run.validate_every_steps, 1, MAX_STEPS),
@@ -37,12 +37,12 @@ impl TrainConfig {
         }
         let numbers = [
             ("pretrain.learning_rate", pretrain.learning_rate, 1.0),
-            ("fit.learning_rate", fit.learning_rate, 1.0),
-            ("fit.reconstruction_weight", fit.reconstruction_weight, 100.0),
-            ("fit.ssim_weight", fit.ssim_weight, 100.0),
-            ("fit.short_share", fit.short_share, 0.9),
-            ("fit.scene_weight", fit.scene_weight, 100.0),
-            ("fit.motion_weight", fit.motion_weight, 100.0),
+            ("sequence.learning_rate", sequence.learning_rate, 1.0),
+            ("sequence.reconstruction_weight", sequence.reconstruction_weight, 100.0),
+            ("sequence.ssim_weight", sequence.ssim_weight, 100.0),
+            ("sequence.short_share", sequence.short_share, 0.9),
+            ("sequence.scene_weight", sequence.scene_weight, 100.0),
+            ("sequence.motion_weight", sequence.motion_weight, 100.0),
             ("data.brightness", self.data.brightness, 0.9),
             ("data.crop", self.data.crop, 0.5),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
@@ -54,7 +54,7 @@ impl TrainConfig {
             }
         }
         for (field, value) in [
-            ("fit.learning_rate", fit.learning_rate),
+            ("sequence.learning_rate", sequence.learning_rate),
             ("run.clip_norm", run.clip_norm),
         ] {
             if value == 0.0 {
@@ -65,7 +65,7 @@ impl TrainConfig {
         }
         for (field, size) in [
             ("pretrain.batch_size", pretrain.batch_size),
-            ("fit.batch_size", fit.batch_size),
+            ("sequence.batch_size", sequence.batch_size),
         ] {
             if !size.is_multiple_of(run.batch_parts) {
                 return Err(TrainError::Config(format!(
@@ -84,11 +84,11 @@ impl TrainConfig {
 
     /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
     fn validate_together(&self) -> Result<(), TrainError> {
-        let (run, fit) = (&self.run, &self.fit);
+        let (run, sequence) = (&self.run, &self.sequence);
         if self.model.architecture == ArchitectureKind::Dense {
             let refused = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
-                ("fit.short_share", fit.short_share > 0.0, "0"),
+                ("sequence.short_share", sequence.short_share > 0.0, "0"),
             ];
             if let Some((field, _, needed)) = refused.iter().find(|(_, is_set, _)| *is_set) {
                 return Err(TrainError::Config(format!(
@@ -110,10 +110,10 @@ impl TrainConfig {
                 self.model.conditioning
             )));
         }
-        if fit.short_share > 0.0 && !(1..=self.model.horizon).contains(&fit.short_horizon) {
+        if sequence.short_share > 0.0 && !(1..=self.model.horizon).contains(&sequence.short_horizon) {
             return Err(TrainError::Config(format!(
-                "fit.short_horizon is {}; it must be 1 to model.horizon, {}",
-                fit.short_horizon, self.model.horizon
+                "sequence.short_horizon is {}; it must be 1 to model.horizon, {}",
+                sequence.short_horizon, self.model.horizon
             )));
         }
         Ok(())

@@ -13,6 +13,8 @@ use foreframe_core::nn::{Feedback, Network, Parameters};
 
 /// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
+/// The name of the random numbers that shuffle the windows. Another name would give other weights from the same seed.
+const SHUFFLE: &str = "fit";
 /// Validation windows per batch.
 const VALIDATION_BATCH_SIZE: usize = 64;
 
@@ -28,12 +30,12 @@ impl<'a> SequenceObjective<'a> {
         Self {
             plan,
             config,
-            shuffle: Shuffle::new(plan.train.len(), config.seed.derive("fit", 0)),
+            shuffle: Shuffle::new(plan.train.len(), config.seed.derive(SHUFFLE, 0)),
         }
     }
 
     fn is_frozen(&self) -> bool {
-        self.config.fit.codec == CodecTraining::Frozen
+        self.config.sequence.codec == CodecTraining::Frozen
     }
 
     /// Encodes frames `[B, T, P]` to features `[B, T, F]`.
@@ -46,27 +48,27 @@ impl<'a> SequenceObjective<'a> {
     /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
     /// In the frame and SSIM losses, only the first `counting` frames count.
     fn flow_loss(&self, model: &Network, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
-        let fit = &self.config.fit;
+        let sequence = &self.config.sequence;
         let Some(predicted) = model.predict_flow(&batch.inputs, &batch.condition, counting)? else {
             return Err(TrainError::Config("only the flow network has this loss".to_owned()));
         };
         let targets = batch.targets.narrow(1, 0, counting)?.contiguous()?;
-        let mut loss = fit.loss.between(&predicted.frames, &targets)?;
-        if fit.ssim_weight > 0.0 {
+        let mut loss = sequence.loss.between(&predicted.frames, &targets)?;
+        if sequence.ssim_weight > 0.0 {
             let width = self.plan.spec.frame_width_px as usize;
             let similarity = ssim_loss(&predicted.frames, &targets, width)?;
-            loss = (loss + (similarity * fit.ssim_weight)?)?;
+            loss = (loss + (similarity * sequence.ssim_weight)?)?;
         }
-        if fit.scene_weight > 0.0 {
-            let scene = fit.loss.between(&predicted.scene, &batch.targets)?;
-            loss = (loss + (scene * fit.scene_weight)?)?;
+        if sequence.scene_weight > 0.0 {
+            let scene = sequence.loss.between(&predicted.scene, &batch.targets)?;
+            loss = (loss + (scene * sequence.scene_weight)?)?;
         }
-        if fit.motion_weight > 0.0
+        if sequence.motion_weight > 0.0
             && let (Some(state), Some(future)) = (&batch.condition.state, &batch.future_states)
             && let Some(truth) = self.plan.spec.measured_motion(state, future)?
         {
             let motion = Loss::Mse.between(&predicted.motion, &truth)?;
-            loss = (loss + (motion * fit.motion_weight)?)?;
+            loss = (loss + (motion * sequence.motion_weight)?)?;
         }
         Ok(loss)
     }
@@ -81,26 +83,26 @@ impl<'a> SequenceObjective<'a> {
 
 impl Objective for SequenceObjective<'_> {
     fn stage(&self) -> TrainingStage {
-        TrainingStage::Fit
+        TrainingStage::Sequence
     }
 
     fn steps(&self) -> usize {
-        self.config.fit.steps
+        self.config.sequence.steps
     }
 
     fn learning_rate(&self) -> f64 {
-        self.config.fit.learning_rate
+        self.config.sequence.learning_rate
     }
 
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
-        let fit = &self.config.fit;
-        let drawn = self.shuffle.batch(step, fit.batch_size).into_iter().enumerate();
+        let sequence = &self.config.sequence;
+        let drawn = self.shuffle.batch(step, sequence.batch_size).into_iter().enumerate();
         let windows = drawn.map(|(place, position)| DrawnWindow {
             window: &self.plan.train[position],
             change: self.plan.source.augmentation().draw(step, place),
         });
         let windows = part.of(windows.collect());
-        let is_teacher_forced = fit.feedback == TrainingFeedback::TeacherForcing;
+        let is_teacher_forced = sequence.feedback == TrainingFeedback::TeacherForcing;
         let batch = self
             .plan
             .source
@@ -108,7 +110,7 @@ impl Objective for SequenceObjective<'_> {
         let frozen: &[&str] = if self.is_frozen() { &[CODEC_PREFIX] } else { &[] };
         let model = Network::with_frozen(self.plan.spec.clone(), parameters, frozen)?;
         if self.plan.spec.flow().is_some() {
-            let counting = fit.frames_that_count(step, self.plan.spec.horizon);
+            let counting = sequence.frames_that_count(step, self.plan.spec.horizon);
             return self.flow_loss(&model, &batch, counting);
         }
         let inputs = self.features(&model, &batch.inputs)?;
@@ -121,16 +123,18 @@ impl Objective for SequenceObjective<'_> {
             .as_ref()
             .map_or(Feedback::Prediction, Feedback::TeacherForcing);
         let predicted = model.predict(&inputs, &batch.condition, feedback)?;
-        let loss = fit.loss.between(&Self::frames(&model, &predicted)?, &batch.targets)?;
-        if fit.reconstruction_weight == 0.0 {
+        let loss = sequence
+            .loss
+            .between(&Self::frames(&model, &predicted)?, &batch.targets)?;
+        if sequence.reconstruction_weight == 0.0 {
             return Ok(loss);
         }
         let Some(reconstructed) = model.reconstruct(&inputs)? else {
             return Ok(loss);
         };
         let reconstructed = Self::frames(&model, &reconstructed)?;
-        let reconstruction = fit.loss.between(&reconstructed, &batch.input_targets)?;
-        Ok((loss + (reconstruction * fit.reconstruction_weight)?)?)
+        let reconstruction = sequence.loss.between(&reconstructed, &batch.input_targets)?;
+        Ok((loss + (reconstruction * sequence.reconstruction_weight)?)?)
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {

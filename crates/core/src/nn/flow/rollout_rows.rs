@@ -1,4 +1,4 @@
-//! The futures of a batch: the window that each follows, with its actions and its state.
+//! The rollouts of a batch: the window that each follows, with its actions and its state.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -13,11 +13,11 @@ use crate::nn::error::NnError;
 use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
 
-/// The futures to predict: windows, actions and states in their own units.
-pub(super) struct FutureRows {
+/// The rollouts to predict: windows, actions and states in their own units.
+pub(super) struct RolloutRows {
     /// Frames of all windows `[B, context, P]`.
     frames: Arc<Vec<f32>>,
-    /// The window of each future.
+    /// The window of each rollout.
     windows: Vec<u32>,
     /// `[N, horizon, A]`; empty without conditioning.
     actions: Vec<f32>,
@@ -27,7 +27,7 @@ pub(super) struct FutureRows {
     state_count: usize,
 }
 
-impl FutureRows {
+impl RolloutRows {
     /// Errors: `Shape`, `Missing` where the conditioning does not fit; `Tensor` if a window does not exist.
     pub(super) fn new(
         spec: &ModelSpec,
@@ -50,12 +50,12 @@ impl FutureRows {
         })
     }
 
-    /// Number of futures, N.
+    /// Number of rollouts, N.
     pub(super) fn count(&self) -> usize {
         self.windows.len()
     }
 
-    /// Some of the futures.
+    /// Some of the rollouts.
     pub(super) fn part(&self, range: Range<usize>) -> Self {
         let all = self.count();
         let cut = |values: &[f32]| {
@@ -71,12 +71,12 @@ impl FutureRows {
         }
     }
 
-    /// The state of a future, empty where the model takes none.
+    /// The state of a rollout, empty where the model takes none.
     pub(super) fn state(&self, row: usize) -> &[f32] {
         &self.states[row * self.state_count..(row + 1) * self.state_count]
     }
 
-    /// The actions of a future, step after step; empty where the model takes none.
+    /// The actions of a rollout, step after step; empty where the model takes none.
     pub(super) fn actions(&self, row: usize) -> &[f32] {
         let each = self.actions.len() / self.count();
         &self.actions[row * each..(row + 1) * each]
@@ -87,25 +87,25 @@ impl FutureRows {
         self.action_count
     }
 
-    /// Where the state says that the camera stands at the last frame of a future's context.
+    /// Where the state says that the camera stands at the last frame of a rollout's context.
     pub(super) fn pose(&self, spec: &ModelSpec, row: usize) -> CameraPose {
         StateChannels::of(spec).pose_in(self.state(row))
     }
 
-    /// Where the camera will stand at each step of each future.
-    pub(super) fn future_poses(&self, spec: &ModelSpec, motions: &[[f32; 3]]) -> Vec<CameraPose> {
+    /// Where the camera will stand at each step of each rollout.
+    pub(super) fn rollout_poses(&self, spec: &ModelSpec, motions: &[[f32; 3]]) -> Vec<CameraPose> {
         let pose = |(item, &motion): (usize, &[f32; 3])| self.pose(spec, item / spec.horizon).moved(motion);
         motions.iter().enumerate().map(pose).collect()
     }
 
-    /// State and all actions of each future, scaled, `[N, S + horizon · A]`.
+    /// State and all actions of each rollout, scaled, `[N, S + horizon · A]`.
     pub(super) fn scaled(&self, spec: &ModelSpec) -> Result<Tensor, NnError> {
         let rows: Vec<f32> = (0..self.count()).flat_map(|row| self.scaled_row(spec, row)).collect();
         let width = self.state_count + spec.horizon * self.action_count;
         Ok(Tensor::from_vec(rows, (self.count(), width), &Device::Cpu)?)
     }
 
-    /// The scaled state of each future.
+    /// The scaled state of each rollout.
     pub(super) fn scaled_states(&self, spec: &ModelSpec) -> Vec<Vec<f32>> {
         (0..self.count())
             .map(|row| spec.scaled_state(self.state(row)))
@@ -142,7 +142,7 @@ impl FutureRows {
         Ok(Tensor::from_vec(values, (self.count() * horizon, width), &Device::Cpu)?)
     }
 
-    /// The contexts that the futures follow, with the last `frames_read` frames of each. Futures of one window and state
+    /// The contexts that the rollouts follow, with the last `frames_read` frames of each. Rollouts of one window and state
     /// share one.
     pub(super) fn contexts(&self, spec: &ModelSpec, frames_read: usize) -> EncoderViews {
         let size = spec.image_size();
