@@ -13,6 +13,7 @@ use crate::nn_fixtures::{condition, largest_difference, values};
 const CAMERA: CameraModel = CameraModel {
     horizontal_fov_rad: 1.0,
     tilt_down_rad: 0.2,
+    height_m: None,
 };
 
 fn channel(name: &str, unit: &str) -> ChannelScale {

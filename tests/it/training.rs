@@ -566,6 +566,7 @@ fn an_impossible_camera_model_is_refused() {
         camera: Some(CameraModel {
             horizontal_fov_rad: 4.0,
             tilt_down_rad: 0.0,
+            height_m: None,
         }),
         ..DatasetInfo::default()
     };

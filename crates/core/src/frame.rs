@@ -1,10 +1,12 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
-//! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels.
+//! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels,
+//! [`depth`] holds distances in bytes.
 
 use jpeg::JpegDamage;
 
 mod catmull_rom;
 pub mod codec;
+pub mod depth;
 pub mod jpeg;
 pub mod preprocess;
 pub mod quality;
@@ -65,6 +67,12 @@ pub enum FrameError {
         horizontal_fov_rad: f32,
         /// Tilt in radians.
         tilt_down_rad: f32,
+    },
+    /// No camera is at that height.
+    #[error("the camera is at a height of {height_m} m; it must be a finite number above 0")]
+    CameraHeight {
+        /// Height above the floor in metres.
+        height_m: f32,
     },
 }
 

@@ -10,7 +10,7 @@
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `ops`
 //! (operations with their gradients) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and meaning of a model) → `tensor_source`,
-//! `conditioning` (actions and state) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
+//! `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
 mod conditioning;
@@ -18,6 +18,7 @@ pub mod costs;
 pub mod dense;
 pub mod error;
 pub mod flow;
+mod geometry;
 #[cfg(test)]
 pub mod gradient_check;
 mod init;

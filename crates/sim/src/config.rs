@@ -36,6 +36,7 @@ impl CameraConfig {
         CameraModel {
             horizontal_fov_rad: self.horizontal_fov_rad as f32,
             tilt_down_rad: self.tilt_down_rad as f32,
+            height_m: None,
         }
     }
 }

@@ -20,6 +20,9 @@ pub struct CameraModel {
     pub horizontal_fov_rad: f32,
     /// How far the camera looks down from the horizontal, in radians: above −π/2, below π/2.
     pub tilt_down_rad: f32,
+    /// Height of the pinhole above the floor, in metres, above 0; none where it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub height_m: Option<f32>,
 }
 
 /// A camera model as it is read, before its ranges are checked.
@@ -28,39 +31,52 @@ pub struct CameraModel {
 struct UncheckedCameraModel {
     horizontal_fov_rad: f32,
     tilt_down_rad: f32,
+    #[serde(default)]
+    height_m: Option<f32>,
 }
 
 impl TryFrom<UncheckedCameraModel> for CameraModel {
     type Error = FrameError;
 
     fn try_from(unchecked: UncheckedCameraModel) -> Result<Self, FrameError> {
-        Self::new(unchecked.horizontal_fov_rad, unchecked.tilt_down_rad)
+        let model = Self {
+            horizontal_fov_rad: unchecked.horizontal_fov_rad,
+            tilt_down_rad: unchecked.tilt_down_rad,
+            height_m: unchecked.height_m,
+        };
+        model.validate()?;
+        Ok(model)
     }
 }
 
 impl CameraModel {
-    /// A camera of that field of view and tilt, in radians. Errors: `Camera` if one is out of range.
+    /// A camera of that field of view and tilt, in radians, at an unknown height. Errors: `Camera` if one is out of range.
     pub fn new(horizontal_fov_rad: f32, tilt_down_rad: f32) -> Result<Self, FrameError> {
         let model = Self {
             horizontal_fov_rad,
             tilt_down_rad,
+            height_m: None,
         };
         model.validate()?;
         Ok(model)
     }
 
-    /// Errors: `Camera` if the field of view or the tilt is out of range.
+    /// Errors: `Camera` if the field of view or the tilt is out of range, `CameraHeight` if the height is.
     pub fn validate(&self) -> Result<(), FrameError> {
         use std::f32::consts::{FRAC_PI_2, PI};
         // NaN fails both comparisons.
         let fov_is_valid = self.horizontal_fov_rad > 0.0 && self.horizontal_fov_rad < PI;
-        if fov_is_valid && self.tilt_down_rad.abs() < FRAC_PI_2 {
-            return Ok(());
+        let tilt_is_valid = self.tilt_down_rad.abs() < FRAC_PI_2;
+        if !(fov_is_valid && tilt_is_valid) {
+            return Err(FrameError::Camera {
+                horizontal_fov_rad: self.horizontal_fov_rad,
+                tilt_down_rad: self.tilt_down_rad,
+            });
         }
-        Err(FrameError::Camera {
-            horizontal_fov_rad: self.horizontal_fov_rad,
-            tilt_down_rad: self.tilt_down_rad,
-        })
+        match self.height_m {
+            Some(height_m) if !(height_m.is_finite() && height_m > 0.0) => Err(FrameError::CameraHeight { height_m }),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -139,6 +155,7 @@ mod tests {
     const CAMERA: CameraModel = CameraModel {
         horizontal_fov_rad: 1.0,
         tilt_down_rad: 0.2,
+        height_m: None,
     };
 
     #[test]
@@ -174,6 +191,20 @@ mod tests {
     fn what_was_behind_the_camera_is_outside() {
         let grid = rotation_grid(CAMERA, 8, 6, std::f32::consts::PI);
         assert!(inside(8, 6, &grid).iter().all(|&inside| !inside));
+    }
+
+    #[test]
+    fn a_camera_keeps_its_height_in_json() {
+        let text = r#"{"horizontal_fov_rad":1.0,"tilt_down_rad":0.2,"height_m":0.3}"#;
+        let camera: CameraModel = serde_json::from_str(text).unwrap();
+        assert_eq!(camera.height_m, Some(0.3));
+        assert_eq!(serde_json::to_string(&camera).unwrap(), text);
+        assert!(!serde_json::to_string(&CAMERA).unwrap().contains("height_m"));
+        let error = serde_json::from_str::<CameraModel>(&text.replace("0.3", "-1")).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the camera is at a height of -1 m; it must be a finite number above 0"
+        );
     }
 
     #[test]

@@ -9,8 +9,7 @@
 //! Sizes beside those of [`crate::nn`]: M items (N rollouts of K steps each, step after step), C channels on the grid of a
 //! quarter of the frame's sides.
 //!
-//! Reading order: `rays`, `room_geometry` and `wheel_dynamics` (geometry) → `state_channels` → `encoder_views` and
-//! `rollout_rows` (what the network reads) → `scene` and `motion` → `layers` (its tensors) → `network` → `direct` and
+//! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion` → `layers` (its tensors) → `network` → `direct` and
 //! `recurrent` (its two forms) → `predict` → `beyond_horizon`.
 
 mod beyond_horizon;
@@ -21,13 +20,10 @@ mod layers;
 mod motion;
 mod network;
 mod predict;
-mod rays;
 mod recurrent;
 mod rollout_rows;
 mod room_geometry;
 mod scene;
-mod state_channels;
-mod wheel_dynamics;
 
 pub(super) use beyond_horizon::predict_beyond_horizon;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};

@@ -4,9 +4,9 @@
 use candle_core::{Device, Tensor};
 
 use super::network::FlowNetwork;
-use super::state_channels::StateChannels;
 use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
+use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::spec::ModelSpec;
 
 /// Frames `[N, steps, P]` of N rollouts: the windows' frames, the window of each rollout, and its conditioning with `steps`

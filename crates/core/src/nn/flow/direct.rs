@@ -4,9 +4,9 @@ use candle_core::{Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
 use super::network::{FlowNetwork, FlowPrediction};
-use super::rays::{CameraPose, Viewer, turning_places};
 use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
+use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};

@@ -1,9 +1,9 @@
 //! The contexts that the encoder reads, in the view of their last frames.
 
 use super::blocks::{centred, write_blocks};
-use super::rays::{CameraPose, Viewer};
-use super::state_channels::StateChannels;
 use crate::frame::warp::CameraModel;
+use crate::nn::geometry::camera::{CameraPose, Viewer};
+use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::sampling::own_places;
 use crate::nn::spec::ModelSpec;
 

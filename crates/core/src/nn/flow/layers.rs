@@ -6,7 +6,7 @@ use super::blocks::MOVED_CHANNELS;
 use super::encoder_views::EncoderViews;
 use super::motion::{MOTION_HIDDEN, WHEELS};
 use super::scene::SceneKind;
-use super::state_channels::StateChannels;
+use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::convolution::TAPS;
 use crate::nn::ops::sampling::ImageSize;

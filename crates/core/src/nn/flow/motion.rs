@@ -5,9 +5,9 @@ use candle_core::{DType, Device, Tensor};
 use candle_nn::Module as _;
 
 use super::rollout_rows::RolloutRows;
-use super::state_channels::StateChannels;
-use super::wheel_dynamics;
 use crate::nn::error::NnError;
+use crate::nn::geometry::state_channels::StateChannels;
+use crate::nn::geometry::wheel_dynamics;
 use crate::nn::ops::linear::{Activation, Linear};
 use crate::nn::ops::modulation::silu;
 use crate::nn::spec::{FlowSpec, ModelSpec};

@@ -6,9 +6,9 @@ use candle_core::{DType, Device, Tensor};
 
 use super::blocks::{MOVED_CHANNELS, fold_pixels, sampled_blocks};
 use super::network::{FlowNetwork, FlowPrediction};
-use super::rays::CameraPose;
 use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
+use crate::nn::geometry::camera::CameraPose;
 use crate::nn::ops::compose::{Composition, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};

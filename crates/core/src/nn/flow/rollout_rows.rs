@@ -6,10 +6,10 @@ use std::sync::Arc;
 use candle_core::{Device, Tensor};
 
 use super::encoder_views::EncoderViews;
-use super::rays::CameraPose;
-use super::state_channels::StateChannels;
 use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
+use crate::nn::geometry::camera::CameraPose;
+use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
 

@@ -6,7 +6,7 @@
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
 
-use super::rays::{CameraPose, Viewer, rotated};
+use crate::nn::geometry::camera::{CameraPose, Viewer, rotated};
 use crate::nn::tensors::{slice, with_values};
 use crate::vectorized::vectorized;
 
@@ -284,6 +284,7 @@ mod tests {
         let camera = CameraModel {
             horizontal_fov_rad: 1.0,
             tilt_down_rad: 0.2,
+            height_m: None,
         };
         Viewer::new(camera, ImageSize { height: 4, width: 6 })
     }

@@ -9,12 +9,12 @@ use candle_nn::Module as _;
 
 use super::blocks::centred;
 use super::encoder_views::EncoderViews;
-use super::rays::{CameraPose, Viewer};
 use super::rollout_rows::RolloutRows;
 use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews};
-use super::state_channels::StateChannels;
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
+use crate::nn::geometry::camera::{CameraPose, Viewer};
+use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::linear::{Activation, Linear};
 use crate::nn::ops::modulation::silu;

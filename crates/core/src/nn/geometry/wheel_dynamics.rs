@@ -3,7 +3,7 @@
 
 use candle_core::{CpuStorage, CustomOp1, Device, Layout, Result, Shape, Tensor};
 
-use super::rays::CameraPose;
+use super::camera::CameraPose;
 use crate::nn::tensors::{slice, with_values};
 
 /// Half the distance between the wheels before anything is learned, in metres.
@@ -20,16 +20,16 @@ type Speeds = [f32; 2];
 
 /// The speeds of a rollout.
 #[derive(Clone, Debug)]
-pub(super) struct CommandedSpeeds {
+pub(in crate::nn) struct CommandedSpeeds {
     /// At the last frame.
-    pub(super) start: Speeds,
+    pub(in crate::nn) start: Speeds,
     /// Commanded in each step.
-    pub(super) commands: Vec<Speeds>,
+    pub(in crate::nn) commands: Vec<Speeds>,
 }
 
 /// Yaw, ahead and left since the last frame `[N, horizon, 3]`, in radians and metres, for N rollouts of `horizon` steps of
 /// `period_s`. `wheels` `[2]` holds the logarithms of both learned values, relative to their first ones.
-pub(super) fn integral(wheels: &Tensor, rollouts: Vec<CommandedSpeeds>, period_s: f64) -> Result<Tensor> {
+pub(in crate::nn) fn integral(wheels: &Tensor, rollouts: Vec<CommandedSpeeds>, period_s: f64) -> Result<Tensor> {
     wheels.contiguous()?.apply_op1(WheelIntegral { rollouts, period_s })
 }
 

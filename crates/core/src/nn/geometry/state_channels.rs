@@ -2,16 +2,16 @@
 
 use candle_core::{Device, Tensor};
 
-use super::rays::CameraPose;
+use super::camera::CameraPose;
 use super::wheel_dynamics::CommandedSpeeds;
 use crate::nn::error::NnError;
 use crate::nn::spec::{ChannelScale, ModelSpec};
 
 /// Which channels say how the robot moves and where it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct StateChannels {
+pub(in crate::nn) struct StateChannels {
     /// x, y, cosine and sine of the heading.
-    pub(super) pose: Option<[usize; 4]>,
+    pub(in crate::nn) pose: Option<[usize; 4]>,
     /// Forward speed and yaw rate in the state.
     measured: [Option<usize>; 2],
     /// Forward speed and yaw rate in the action.
@@ -20,7 +20,7 @@ pub(super) struct StateChannels {
 
 impl StateChannels {
     /// The channels of a model, by name for the pose, by unit for the speeds.
-    pub(super) fn of(spec: &ModelSpec) -> Self {
+    pub(in crate::nn) fn of(spec: &ModelSpec) -> Self {
         let by_unit = |channels: &[ChannelScale]| {
             ["m/s", "rad/s"].map(|unit| channels.iter().position(|channel| channel.unit == unit))
         };
@@ -47,7 +47,7 @@ impl StateChannels {
     }
 
     /// The pose in a state; the origin where states hold none.
-    pub(super) fn pose_in(self, state: &[f32]) -> CameraPose {
+    pub(in crate::nn) fn pose_in(self, state: &[f32]) -> CameraPose {
         self.pose
             .map_or_else(CameraPose::default, |[x, y, cos, sin]| CameraPose {
                 x: state[x],
@@ -57,12 +57,12 @@ impl StateChannels {
     }
 
     /// The yaw rate in a state, in radians a second.
-    pub(super) fn yaw_rate_in(self, state: &[f32]) -> Option<f32> {
+    pub(in crate::nn) fn yaw_rate_in(self, state: &[f32]) -> Option<f32> {
         self.measured[1].map(|channel| state[channel])
     }
 
     /// Moves a state on: its pose by the motion, its speeds to those of the last action. Other channels stay.
-    pub(super) fn advance(self, state: &mut [f32], motion: [f32; 3], action: &[f32]) {
+    pub(in crate::nn) fn advance(self, state: &mut [f32], motion: [f32; 3], action: &[f32]) {
         if let Some([x, y, cos, sin]) = self.pose {
             let pose = self.pose_in(state).moved(motion);
             state[x] = pose.x;
@@ -77,13 +77,13 @@ impl StateChannels {
     }
 
     /// Whether the actions command speeds.
-    pub(super) fn commands_speeds(self) -> bool {
+    pub(in crate::nn) fn commands_speeds(self) -> bool {
         self.commanded.iter().any(Option::is_some)
     }
 
     /// The speeds of a rollout. One that is not commanded stays as measured; one that is not measured starts as commanded.
     /// `actions` holds them step after step, `action_count` components each.
-    pub(super) fn speeds(self, state: &[f32], actions: &[f32], action_count: usize) -> CommandedSpeeds {
+    pub(in crate::nn) fn speeds(self, state: &[f32], actions: &[f32], action_count: usize) -> CommandedSpeeds {
         let measured = self.measured.map(|channel| channel.map(|channel| state[channel]));
         let commands: Vec<[f32; 2]> = actions
             .chunks_exact(action_count.max(1))

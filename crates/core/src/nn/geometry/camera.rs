@@ -17,18 +17,18 @@ const MIN_DEPTH: f32 = 1e-3;
 
 /// Where a camera stands on the floor and where it looks.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct CameraPose {
+pub(in crate::nn) struct CameraPose {
     /// Metres along the world's x.
-    pub(super) x: f32,
+    pub(in crate::nn) x: f32,
     /// Metres along the world's y.
-    pub(super) y: f32,
+    pub(in crate::nn) y: f32,
     /// Counter-clockwise from x, in radians.
-    pub(super) heading: f32,
+    pub(in crate::nn) heading: f32,
 }
 
 impl CameraPose {
     /// The pose after driving that far ahead and to the left, then turning.
-    pub(super) fn moved(self, [yaw, ahead, left]: [f32; 3]) -> Self {
+    pub(in crate::nn) fn moved(self, [yaw, ahead, left]: [f32; 3]) -> Self {
         let (sin, cos) = self.heading.sin_cos();
         Self {
             x: self.x + cos * ahead - sin * left,
@@ -38,7 +38,7 @@ impl CameraPose {
     }
 
     /// How to get from here to there: yaw in −π…π, ahead, left.
-    pub(super) fn motion_to(self, there: Self) -> [f32; 3] {
+    pub(in crate::nn) fn motion_to(self, there: Self) -> [f32; 3] {
         use std::f32::consts::{PI, TAU};
         let (sin, cos) = self.heading.sin_cos();
         let (x, y) = (there.x - self.x, there.y - self.y);
@@ -49,7 +49,7 @@ impl CameraPose {
 
 /// A camera that takes frames of some size.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Viewer {
+pub(in crate::nn) struct Viewer {
     tilt_sin: f32,
     tilt_cos: f32,
     /// Size of a pixel at depth 1.
@@ -58,7 +58,7 @@ pub(super) struct Viewer {
 }
 
 impl Viewer {
-    pub(super) fn new(camera: CameraModel, size: ImageSize) -> Self {
+    pub(in crate::nn) fn new(camera: CameraModel, size: ImageSize) -> Self {
         let (tilt_sin, tilt_cos) = camera.tilt_down_rad.sin_cos();
         Self {
             tilt_sin,
@@ -69,7 +69,7 @@ impl Viewer {
     }
 
     /// The ray of each pixel in the robot's axes, row by row; 1 long along the camera's axis.
-    pub(super) fn rays(self) -> Vec<[f32; 3]> {
+    pub(in crate::nn) fn rays(self) -> Vec<[f32; 3]> {
         let ImageSize { height, width } = self.size;
         let pixels = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
         pixels
@@ -96,7 +96,7 @@ impl Viewer {
 
     /// The place of a point in the robot's axes.
     #[inline(always)]
-    pub(super) fn project(self, point: [f32; 3]) -> [f32; 2] {
+    pub(in crate::nn) fn project(self, point: [f32; 3]) -> [f32; 2] {
         let [depth, down] = self.depth_and_down(point);
         let scale = 1.0 / (depth.max(MIN_DEPTH) * self.pixel);
         [
@@ -106,7 +106,7 @@ impl Viewer {
     }
 
     /// Where each pixel was before the camera turned by `yaw`, `[P, 2]`.
-    pub(super) fn turned(self, rays: &[[f32; 3]], yaw: f32) -> Vec<f32> {
+    pub(in crate::nn) fn turned(self, rays: &[[f32; 3]], yaw: f32) -> Vec<f32> {
         let mut places = vec![0.0; 2 * rays.len()];
         self.write_turned(rays, yaw, &mut places);
         places
@@ -128,12 +128,12 @@ impl Viewer {
 
 /// A direction turned counter-clockwise about the vertical.
 #[inline(always)]
-pub(super) fn rotated([ahead, left, up]: [f32; 3], sin: f32, cos: f32) -> [f32; 3] {
+pub(in crate::nn) fn rotated([ahead, left, up]: [f32; 3], sin: f32, cos: f32) -> [f32; 3] {
     [cos * ahead - sin * left, sin * ahead + cos * left, up]
 }
 
 /// Where each pixel was before the camera turned by `yaw` `[M]`, in radians: `[M, P, 2]`. Gradients go to the yaw.
-pub(super) fn turning_places(viewer: Viewer, rays: &[[f32; 3]], yaw: &Tensor) -> Result<Tensor> {
+pub(in crate::nn) fn turning_places(viewer: Viewer, rays: &[[f32; 3]], yaw: &Tensor) -> Result<Tensor> {
     let yaw = yaw.contiguous()?;
     let operation = Turning {
         viewer,
@@ -220,6 +220,7 @@ mod tests {
     const CAMERA: CameraModel = CameraModel {
         horizontal_fov_rad: 1.0,
         tilt_down_rad: 0.2,
+        height_m: None,
     };
     const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
 

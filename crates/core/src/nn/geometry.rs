@@ -1,0 +1,8 @@
+//! How a camera that drives sees, and how a robot's commands move it: shared by the networks that move pixels.
+//!
+//! `camera` (rays, poses and where a turning camera saw a pixel) → `wheel_dynamics` (the way of a base that follows its
+//! commands) → `state_channels` (what a robot's channels say of pose and speed).
+
+pub(super) mod camera;
+pub(super) mod state_channels;
+pub(super) mod wheel_dynamics;
