@@ -116,9 +116,7 @@ async fn jobs_in(store: &Store, state: &str) -> BTreeSet<String> {
         ..Default::default()
     };
     let jobs = store.jobs(page).await.unwrap();
-    jobs.iter()
-        .map(|job| foreframe_jobs::store::job_id(job.number))
-        .collect()
+    jobs.iter().map(|job| job.id.to_string()).collect()
 }
 
 /// Queues jobs, and cancels them if `cancelled`.

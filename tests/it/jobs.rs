@@ -11,6 +11,7 @@ use foreframe::server::{App, AppParts, ServerConfig};
 use foreframe_core::nn::Conditioning;
 use foreframe_core::serving::{Predictor, PredictorConfig};
 use foreframe_jobs::jobs::{JobError, JobExecutor, JobFailure, JobLimits, JobReporter, JobResult, JobSpec, Jobs};
+use foreframe_jobs::store::JobId;
 use foreframe_jobs::versions::Versions;
 use futures_util::future::BoxFuture;
 use serde_json::{Value, json};
@@ -230,7 +231,7 @@ async fn a_runner_that_lost_its_lease_writes_nothing() {
     poll_until(async || (log().await[1]["line"] == "attempt 1").then_some(())).await;
     // Another process claims the job; by its clock the lease has expired.
     let (row, other_lease) = app.store().claim_at("another", 1e12, 2e12).await.unwrap().unwrap();
-    assert_eq!((row.number, other_lease.token), (1, 2));
+    assert_eq!((row.id, other_lease.token), (JobId::new(1), 2));
     post(&app, JOBS, &collect("b")).await;
     // The runner starts the next job after it has noticed that it lost the lease.
     wait_for_state(&app, "job-2", "running").await;

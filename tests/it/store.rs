@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use crate::skip::skip_without;
 use foreframe_jobs::store::{
-    Author, EnqueueResult, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob,
+    Author, EnqueueResult, JobId, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob,
     PublishedVersion, Store, StoreConfig,
 };
 use sqlx::{AssertSqlSafe, Connection as _, Executor as _, PgConnection};
@@ -102,7 +102,10 @@ fn report(line: &str) -> JobReport {
 async fn a_job_is_enqueued_claimed_reported_and_ended() {
     for (_dir, store) in stores("way").await {
         let row = enqueued(&store).await;
-        assert_eq!((row.number, row.state.as_str(), row.queued_s), (1, "queued", 1.0));
+        assert_eq!(
+            (row.id, row.state.as_str(), row.queued_s),
+            (JobId::new(1), "queued", 1.0)
+        );
         let (row, lease) = store.claim_at("me", 2.0, 10.0).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.started_s, row.token),
@@ -113,7 +116,7 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
             assert_eq!(store.renew_at(lease, 20.0, report(line)).await.unwrap(), Some(false));
         }
         for _ in 0..2 {
-            assert!(store.ask_to_cancel(1, &Author::CommandLine).await.unwrap());
+            assert!(store.ask_to_cancel(JobId::new(1), &Author::CommandLine).await.unwrap());
         }
         let entries = store.audit(None, 10).await.unwrap();
         assert_eq!(entries.iter().filter(|entry| entry.action == "job.cancel").count(), 1);
@@ -122,7 +125,7 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
             Some(true)
         );
         assert!(store.end(lease, outcome("cancelled"), report("five")).await.unwrap());
-        let row = store.job(1).await.unwrap().unwrap();
+        let row = store.job(JobId::new(1)).await.unwrap().unwrap();
         assert_eq!(
             (row.state.as_str(), row.cancelling, row.ended_s),
             ("cancelled", false, Some(9.0))
@@ -131,11 +134,11 @@ async fn a_job_is_enqueued_claimed_reported_and_ended() {
             (row.progress.as_str(), row.outcome.as_deref()),
             ("{\"done\":1}", Some("{}"))
         );
-        let lines = store.job_log(1, 3, 10).await.unwrap();
+        let lines = store.job_log(JobId::new(1), 3, 10).await.unwrap();
         let lines: Vec<_> = lines.iter().map(|row| (row.seq, row.line.as_str())).collect();
         assert_eq!(lines, [(4, "four"), (5, "five")]);
-        assert_eq!(store.job_log(1, 0, 10).await.unwrap()[0].line, "three");
-        assert_eq!(store.job_losses(1).await.unwrap(), report("").losses);
+        assert_eq!(store.job_log(JobId::new(1), 0, 10).await.unwrap()[0].line, "three");
+        assert_eq!(store.job_losses(JobId::new(1)).await.unwrap(), report("").losses);
         assert!(
             !store
                 .end(lease, outcome("succeeded"), JobReport::default())
@@ -167,7 +170,7 @@ async fn an_expired_lease_cannot_write() {
                 .unwrap()
         );
         assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
-        assert_eq!(store.job_log(1, 0, 10).await.unwrap(), []);
+        assert_eq!(store.job_log(JobId::new(1), 0, 10).await.unwrap(), []);
         assert_eq!(
             store.renew_at(fresh, 40.0, JobReport::default()).await.unwrap(),
             Some(false)
@@ -187,22 +190,33 @@ async fn the_queue_limit_keys_and_names_are_enforced() {
             EnqueueResult::New(_)
         ));
         assert!(
-            matches!(enqueue(job(Some("data set b"), Some("k"))).await, EnqueueResult::Same(row) if row.number == 1)
+            matches!(enqueue(job(Some("data set b"), Some("k"))).await, EnqueueResult::Same(row) if row.id == JobId::new(1))
         );
         assert_eq!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::Taken);
         assert!(matches!(enqueue(job(None, None)).await, EnqueueResult::New(_)));
         assert_eq!(enqueue(job(None, None)).await, EnqueueResult::Full);
         assert!(
-            store.cancel_queued(1, 1.0, &Author::CommandLine).await.unwrap()
-                && !store.cancel_queued(1, 1.0, &Author::CommandLine).await.unwrap()
+            store
+                .cancel_queued(JobId::new(1), 1.0, &Author::CommandLine)
+                .await
+                .unwrap()
+                && !store
+                    .cancel_queued(JobId::new(1), 1.0, &Author::CommandLine)
+                    .await
+                    .unwrap()
         );
-        assert!(matches!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::New(row) if row.number == 3));
+        assert!(
+            matches!(enqueue(job(Some("data set a"), None)).await, EnqueueResult::New(row) if row.id == JobId::new(3))
+        );
         assert_eq!(
-            store.requeue(1, 2, &Author::CommandLine).await.unwrap(),
+            store.requeue(JobId::new(1), 2, &Author::CommandLine).await.unwrap(),
             Some(EnqueueResult::Taken)
         );
-        assert_eq!(store.requeue(2, 2, &Author::CommandLine).await.unwrap(), None);
-        assert_eq!(store.job_of_key("k").await.unwrap().unwrap().number, 1);
+        assert_eq!(
+            store.requeue(JobId::new(2), 2, &Author::CommandLine).await.unwrap(),
+            None
+        );
+        assert_eq!(store.job_of_key("k").await.unwrap().unwrap().id, JobId::new(1));
     }
 }
 
@@ -221,24 +235,24 @@ async fn concurrent_claims_never_get_the_same_job() {
         let runners = (0..6).map(|runner| {
             let store = store.clone();
             tokio::spawn(async move {
-                let mut numbers = Vec::new();
-                while numbers.len() < 20 {
+                let mut claimed = Vec::new();
+                while claimed.len() < 20 {
                     match store.claim_at(&runner.to_string(), 0.0, 10.0).await.unwrap() {
-                        Some((row, _)) => numbers.push(row.number),
+                        Some((row, _)) => claimed.push(row.id),
                         // A claim skips jobs that others are claiming.
                         None if store.jobs(queued()).await.unwrap().is_empty() => break,
                         None => tokio::task::yield_now().await,
                     }
                 }
-                numbers
+                claimed
             })
         });
-        let mut numbers = Vec::new();
+        let mut claimed = Vec::new();
         for runner in runners.collect::<Vec<_>>() {
-            numbers.extend(runner.await.unwrap());
+            claimed.extend(runner.await.unwrap());
         }
-        numbers.sort_unstable();
-        assert_eq!(numbers, (1..=20).collect::<Vec<i64>>());
+        claimed.sort_unstable();
+        assert_eq!(claimed, (1..=20).map(JobId::new).collect::<Vec<_>>());
     }
 }
 
@@ -258,21 +272,20 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
         }
         for number in 1..=3 {
             store
-                .cancel_queued(number, number as f64, &Author::CommandLine)
+                .cancel_queued(JobId::new(number), number as f64, &Author::CommandLine)
                 .await
                 .unwrap();
         }
-        let numbers = async |page: JobPage| -> Vec<i64> {
-            store.jobs(page).await.unwrap().iter().map(|row| row.number).collect()
-        };
-        assert_eq!(numbers(queued()).await, [5, 4]);
+        let ids =
+            async |page: JobPage| -> Vec<JobId> { store.jobs(page).await.unwrap().iter().map(|row| row.id).collect() };
+        assert_eq!(ids(queued()).await, [5, 4].map(JobId::new));
         let page = JobPage {
             kind: Some("collect".to_owned()),
-            before: Some(4),
+            before: Some(JobId::new(4)),
             limit: 2,
             state: None,
         };
-        assert_eq!(numbers(page).await, [3, 2]);
+        assert_eq!(ids(page).await, [3, 2].map(JobId::new));
         assert_eq!(
             store
                 .forget_ended(1)
@@ -280,18 +293,18 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
                 .unwrap()
                 .into_iter()
                 .collect::<BTreeSet<_>>(),
-            [1, 2].into()
+            [1, 2].map(JobId::new).into()
         );
         assert_eq!(
-            numbers(JobPage {
+            ids(JobPage {
                 limit: 9,
                 ..JobPage::default()
             })
             .await,
-            [5, 4, 3]
+            [5, 4, 3].map(JobId::new)
         );
         enqueued(&store).await;
-        assert_eq!(store.job(6).await.unwrap().unwrap().number, 6);
+        assert_eq!(store.job(JobId::new(6)).await.unwrap().unwrap().id, JobId::new(6));
     }
 }
 
@@ -398,7 +411,7 @@ async fn a_new_store_can_be_opened_concurrently() {
             stores.push(task.await.unwrap());
         }
         enqueued(&stores[0]).await;
-        assert!(stores[5].job(1).await.unwrap().is_some());
+        assert!(stores[5].job(JobId::new(1)).await.unwrap().is_some());
         stores[3].ping().await.unwrap();
     }
 }

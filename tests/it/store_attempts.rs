@@ -1,6 +1,6 @@
 //! How the store counts attempts without progress.
 
-use foreframe_jobs::store::{JobOutcome, JobReport, NewJob, Store, StoreConfig};
+use foreframe_jobs::store::{JobId, JobOutcome, JobReport, NewJob, Store, StoreConfig};
 
 async fn store(dir: &std::path::Path) -> Store {
     let config = StoreConfig {
@@ -58,7 +58,7 @@ async fn attempts_without_progress_are_counted_until_one_saves_more() {
     let (row, lease) = store.claim_at("me", 6.0, 0.0).await.unwrap().unwrap();
     assert_eq!(row.stalled_attempts, 1);
     store.end(lease, released(true), saved(8)).await.unwrap();
-    assert_eq!(store.job(1).await.unwrap().unwrap().stalled_attempts, 0);
+    assert_eq!(store.job(JobId::new(1)).await.unwrap().unwrap().stalled_attempts, 0);
 }
 
 #[tokio::test]
@@ -71,7 +71,7 @@ async fn an_attempt_that_stops_with_its_server_is_not_counted() {
         let (row, lease) = store.claim_at("me", 2.0, 0.0).await.unwrap().unwrap();
         assert_eq!(row.stalled_attempts, 0);
         store.end(lease, released(false), saved(0)).await.unwrap();
-        assert_eq!(store.job(1).await.unwrap().unwrap().stalled_attempts, 0);
+        assert_eq!(store.job(JobId::new(1)).await.unwrap().unwrap().stalled_attempts, 0);
     }
 }
 

@@ -21,7 +21,7 @@ mod shared;
 pub mod spec;
 pub mod state;
 
-use crate::store::{StoreError, unix_s};
+use crate::store::{JobId, JobIdError, StoreError, unix_s};
 use crate::versions::VersionError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_data::dataset::DatasetError;
@@ -48,7 +48,7 @@ pub enum JobError {
     #[error("job {id} is {state}; only a {} job can {event}", event.allowed_states())]
     IllegalTransition {
         /// The job.
-        id: String,
+        id: JobId,
         /// Its state.
         state: JobState,
         /// The requested transition.
@@ -114,7 +114,7 @@ pub enum JobError {
         /// Its name.
         name: String,
         /// The job's id.
-        job: String,
+        job: JobId,
     },
     /// The server is stopping.
     #[error("the server is stopping and accepts no more jobs")]
@@ -123,7 +123,7 @@ pub enum JobError {
     #[error("the store's record of job {id} cannot be read: {reason}")]
     Record {
         /// The job.
-        id: String,
+        id: JobId,
         /// What is wrong with it.
         reason: String,
     },
@@ -164,6 +164,13 @@ impl HasErrorKind for JobError {
 impl From<DatasetError> for JobError {
     fn from(error: DatasetError) -> Self {
         Self::Dataset(Box::new(error))
+    }
+}
+
+/// No job has that id: it is not even an id.
+impl From<JobIdError> for JobError {
+    fn from(JobIdError(id): JobIdError) -> Self {
+        Self::Unknown { id }
     }
 }
 

@@ -5,6 +5,7 @@
 pub mod audit;
 pub mod backup;
 mod database;
+mod job_id;
 pub mod jobs;
 pub mod keys;
 mod lease;
@@ -25,7 +26,8 @@ use tracing::warn;
 
 pub use self::audit::Author;
 use self::database::Database;
-pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, NewJob, job_id};
+pub use self::job_id::{JobId, JobIdError};
+pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, NewJob};
 pub use self::keys::{KeyRow, KeyScope};
 pub use self::lease::Lease;
 pub use self::models::{ModelMetrics, PublishedVersion, VersionRow};

@@ -13,13 +13,14 @@ use tokio::sync::{OwnedSemaphorePermit, watch};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::jobs::LogLine;
+use super::jobs::{LogLine, job_id};
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::http::task_limit::stop_requested;
 use crate::server::state::App;
 use foreframe_jobs::jobs::{Job, JobError};
+use foreframe_jobs::store::JobId;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(events))
@@ -62,7 +63,8 @@ async fn events(
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
-    app.jobs().get(&id).await?;
+    let id = job_id(&id)?;
+    app.jobs().get(id).await?;
     let last_seen = headers
         .get("last-event-id")
         .and_then(|seen| seen.to_str().ok()?.parse().ok());
@@ -88,7 +90,7 @@ async fn events(
 struct JobEventStream {
     app: App,
     caller: Caller,
-    id: String,
+    id: JobId,
     /// The job as last sent.
     job: Option<Job>,
     /// The number of the last line sent.
@@ -121,8 +123,8 @@ impl JobEventStream {
     }
 
     async fn poll(&mut self) -> Result<(), JobError> {
-        let job = self.app.jobs().get(&self.id).await?;
-        let lines = self.app.jobs().log(&self.id, self.after, LINES).await?;
+        let job = self.app.jobs().get(self.id).await?;
+        let lines = self.app.jobs().log(self.id, self.after, LINES).await?;
         self.is_over = job.state.is_final() && lines.len() < LINES;
         for line in lines.into_iter().map(LogLine::from) {
             self.after = line.seq;

@@ -14,7 +14,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use foreframe_jobs::jobs::pipeline::report_key;
 use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
-use foreframe_jobs::store::{Author, LogRow, LossRow};
+use foreframe_jobs::store::{Author, JobId, LogRow, LossRow};
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
@@ -187,7 +187,7 @@ async fn list(State(app): State<App>, Query(query): Query<ListQuery>) -> Result<
     let mut jobs = app.jobs().list(filter).await?;
     let has_more = jobs.len() > limit;
     jobs.truncate(limit);
-    let next = jobs.last().filter(|_| has_more).map(|job| job.id.clone());
+    let next = jobs.last().filter(|_| has_more).map(|job| job.id.to_string());
     Ok(axum::Json(JobList { jobs, next }))
 }
 
@@ -198,7 +198,7 @@ async fn list(State(app): State<App>, Query(query): Query<ListQuery>) -> Result<
     responses((status = 200, body = Job), (status = 404, description = "No such job", body = Problem))
 )]
 async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiError> {
-    Ok(axum::Json(app.jobs().get(&id).await?))
+    Ok(axum::Json(app.jobs().get(job_id(&id)?).await?))
 }
 
 /// Cancels a job. A job that waits ends at once; a job that runs ends at its next checkpoint.
@@ -216,7 +216,7 @@ async fn cancel(
     Extension(author): Extension<Author>,
     Path(id): Path<String>,
 ) -> Result<Response, ApiError> {
-    Ok(accepted(app.jobs().cancel(&id, &author).await?))
+    Ok(accepted(app.jobs().cancel(job_id(&id)?, &author).await?))
 }
 
 /// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
@@ -235,7 +235,7 @@ async fn resume(
     Extension(author): Extension<Author>,
     Path(id): Path<String>,
 ) -> Result<Response, ApiError> {
-    Ok(accepted(app.jobs().resume(&id, &author).await?))
+    Ok(accepted(app.jobs().resume(job_id(&id)?, &author).await?))
 }
 
 /// The log of a job.
@@ -250,7 +250,7 @@ async fn logs(
     Query(query): Query<LogQuery>,
 ) -> Result<axum::Json<Log>, ApiError> {
     let limit = page(query.limit, MAX_LIMIT)?;
-    let lines = app.jobs().log(&id, query.after.unwrap_or(0), limit).await?;
+    let lines = app.jobs().log(job_id(&id)?, query.after.unwrap_or(0), limit).await?;
     Ok(axum::Json(Log {
         lines: lines.into_iter().map(LogLine::from).collect(),
     }))
@@ -263,7 +263,7 @@ async fn logs(
     responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
 )]
 async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
-    let points = app.jobs().losses(&id).await?;
+    let points = app.jobs().losses(job_id(&id)?).await?;
     Ok(axum::Json(LossCurves {
         points: points.into_iter().map(CurvePoint::from).collect(),
     }))
@@ -282,18 +282,19 @@ async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum:
     )
 )]
 async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) -> Result<impl IntoResponse, ApiError> {
-    let job = app.jobs().get(&id).await?;
+    let id = job_id(&id)?;
+    let job = app.jobs().get(id).await?;
     let files = job.result.as_ref().and_then(|result| result["files"].as_array());
     // Only a name from the job's own list becomes part of a path.
     if !files.is_some_and(|files| files.iter().any(|known| *known == file)) {
         return Err(ApiError::NotFound(format!("job {id} has no file of that name")));
     }
-    let bytes = report_file(&app, &id, &file).await?;
+    let bytes = report_file(&app, id, &file).await?;
     Ok(([(header::CONTENT_TYPE, media_type(&file))], bytes))
 }
 
 /// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.
-async fn report_file(app: &App, id: &str, file: &str) -> Result<Bytes, ApiError> {
+async fn report_file(app: &App, id: JobId, file: &str) -> Result<Bytes, ApiError> {
     let key = format!("report/{id}/{file}");
     if let Some(bytes) = app.render_cache().cached(&key) {
         return Ok(bytes);
@@ -319,6 +320,11 @@ fn media_type(file: &str) -> &'static str {
         Some("svg") => "image/svg+xml",
         _ => "application/octet-stream",
     }
+}
+
+/// The id in the path. Errors: 404 if it is no id.
+pub(super) fn job_id(text: &str) -> Result<JobId, ApiError> {
+    Ok(text.parse().map_err(JobError::from)?)
 }
 
 /// The response to an accepted job: the job, and where to find it.

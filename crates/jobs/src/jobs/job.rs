@@ -4,13 +4,14 @@ use serde::Serialize;
 
 use super::progress::StoredProgress;
 use super::{JobError, JobProgress, JobSpec, JobState, Losses};
-use crate::store::{JobPage, JobRow, job_id};
+use crate::store::{JobId, JobIdError, JobPage, JobRow};
 
 /// One job as it is now.
 #[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct Job {
     /// Its id.
-    pub id: String,
+    #[schema(value_type = String)]
+    pub id: JobId,
     /// Its state.
     pub state: JobState,
     /// What it does.
@@ -42,10 +43,7 @@ pub struct Job {
 impl Job {
     /// Errors: `Record` if the row was written by an incompatible version of the program.
     pub(super) fn of(row: &JobRow) -> Result<Self, JobError> {
-        let record = |reason: String| JobError::Record {
-            id: job_id(row.number),
-            reason,
-        };
+        let record = |reason: String| JobError::Record { id: row.id, reason };
         let state: JobState = row.state.parse().map_err(record)?;
         let stored: StoredProgress = serde_json::from_str(&row.progress).map_err(|error| record(error.to_string()))?;
         let mut progress = stored.progress;
@@ -54,7 +52,7 @@ impl Job {
         }
         let outcome = row.outcome.as_deref().map(serde_json::from_str).transpose();
         Ok(Self {
-            id: job_id(row.number),
+            id: row.id,
             state,
             spec: serde_json::from_str(&row.spec).map_err(|error| record(error.to_string()))?,
             progress,
@@ -99,12 +97,9 @@ impl JobFilter {
             });
         }
         let before = self.before.map(|id| {
-            number_of(&id).ok_or_else(|| JobError::Invalid {
+            id.parse().map_err(|error: JobIdError| JobError::Invalid {
                 field: "before",
-                reason: format!(
-                    "\"{}\" is not a job id; an example of one is job-12",
-                    id.escape_default()
-                ),
+                reason: error.to_string(),
             })
         });
         Ok(JobPage {
@@ -114,11 +109,4 @@ impl JobFilter {
             limit: self.limit as i64,
         })
     }
-}
-
-/// The number in a job's id.
-pub(super) fn number_of(id: &str) -> Option<i64> {
-    let digits = id.strip_prefix("job-")?;
-    digits.bytes().all(|byte| byte.is_ascii_digit()).then_some(())?;
-    digits.parse().ok()
 }

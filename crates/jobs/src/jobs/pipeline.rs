@@ -20,7 +20,7 @@ use super::report::JobReporter;
 use super::retry_policy::{RetryPolicy, retry_while_busy};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
-use crate::store::{ModelMetrics, PublishedVersion, Store, StoreError};
+use crate::store::{JobId, ModelMetrics, PublishedVersion, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
@@ -254,7 +254,7 @@ impl Pipeline {
         });
         let mut found = found.map_err(|error| failed(&error))?;
         let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
-        let dir = report_key(&report.id());
+        let dir = report_key(report.id());
         // An earlier attempt may have left an incomplete report.
         retry.run(async || self.store.objects().delete(&dir).await)?;
         let out = self.store.objects().data_dir().join(&dir);
@@ -316,7 +316,7 @@ impl Pipeline {
 
 /// The key of the directory of a job's report.
 #[must_use]
-pub fn report_key(id: &str) -> String {
+pub fn report_key(id: JobId) -> String {
     format!("reports/{id}")
 }
 

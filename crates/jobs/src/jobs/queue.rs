@@ -9,12 +9,11 @@ use tracing::{info, warn};
 
 use super::executor::JobExecutor;
 use super::instance::Instance;
-use super::job::number_of;
 use super::progress::StoredProgress;
 use super::runner;
 use super::shared::{JobLimits, SharedJobs};
 use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition};
-use crate::store::{Author, EnqueueResult, JobRow, LogRow, LossRow, NewJob, Store};
+use crate::store::{Author, EnqueueResult, JobId, JobRow, LogRow, LossRow, NewJob, Store};
 
 /// The maximum length of an idempotency key.
 const MAX_KEY_LENGTH: usize = 128;
@@ -127,25 +126,25 @@ impl Jobs {
     }
 
     /// One job. Errors: `Unknown`, `Record`, `Store`.
-    pub async fn get(&self, id: &str) -> Result<Job, JobError> {
+    pub async fn get(&self, id: JobId) -> Result<Job, JobError> {
         Job::of(&self.row(id).await?)
     }
 
     /// The lines of a job's log after a line number, the oldest first. Errors: `Unknown`, `Store`.
-    pub async fn log(&self, id: &str, after: i64, limit: usize) -> Result<Vec<LogRow>, JobError> {
+    pub async fn log(&self, id: JobId, after: i64, limit: usize) -> Result<Vec<LogRow>, JobError> {
         let row = self.row(id).await?;
-        Ok(self.shared.store.job_log(row.number, after, limit as i64).await?)
+        Ok(self.shared.store.job_log(row.id, after, limit as i64).await?)
     }
 
     /// The loss curves of a job. Errors: `Unknown`, `Store`.
-    pub async fn losses(&self, id: &str) -> Result<Vec<LossRow>, JobError> {
+    pub async fn losses(&self, id: JobId) -> Result<Vec<LossRow>, JobError> {
         let row = self.row(id).await?;
-        Ok(self.shared.store.job_losses(row.number).await?)
+        Ok(self.shared.store.job_losses(row.id).await?)
     }
 
     /// Cancels a job: a queued job ends at once, a running one as soon as its work has stopped.
     /// Errors: `Unknown`, `IllegalTransition` if it has ended, `Store`.
-    pub async fn cancel(&self, id: &str, by: &Author) -> Result<Job, JobError> {
+    pub async fn cancel(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
         let store = &self.shared.store;
         // Repeats if the state changes between the read and the write; that can happen only a few times.
         loop {
@@ -153,8 +152,8 @@ impl Jobs {
             let state = Job::of(&row)?.state;
             let asked = match state.after(JobTransition::Cancel) {
                 None => return Err(illegal(id, state, JobTransition::Cancel)),
-                Some(_) if state == JobState::Running => store.ask_to_cancel(row.number, by).await?,
-                Some(_) => store.cancel_queued(row.number, store.now_s().await?, by).await?,
+                Some(_) if state == JobState::Running => store.ask_to_cancel(row.id, by).await?,
+                Some(_) => store.cancel_queued(row.id, store.now_s().await?, by).await?,
             };
             if asked {
                 let job = self.get(id).await;
@@ -166,7 +165,7 @@ impl Jobs {
 
     /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
     /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
-    pub async fn resume(&self, id: &str, by: &Author) -> Result<Job, JobError> {
+    pub async fn resume(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
         if *self.shared.stop.borrow() {
             return Err(JobError::Stopping);
         }
@@ -176,7 +175,7 @@ impl Jobs {
             return Err(illegal(id, job.state, JobTransition::Resume));
         }
         let limit = self.shared.limits.queued as i64;
-        match self.shared.store.requeue(row.number, limit, by).await? {
+        match self.shared.store.requeue(row.id, limit, by).await? {
             Some(EnqueueResult::New(row)) => {
                 self.shared.wake.notify_one();
                 Job::of(&row)
@@ -207,21 +206,14 @@ impl Jobs {
         ended
     }
 
-    async fn row(&self, id: &str) -> Result<JobRow, JobError> {
-        let found = match number_of(id) {
-            Some(number) => self.shared.store.job(number).await?,
-            None => None,
-        };
-        found.ok_or_else(|| JobError::Unknown { id: id.to_owned() })
+    async fn row(&self, id: JobId) -> Result<JobRow, JobError> {
+        let found = self.shared.store.job(id).await?;
+        found.ok_or_else(|| JobError::Unknown { id: id.to_string() })
     }
 }
 
-fn illegal(id: &str, state: JobState, event: JobTransition) -> JobError {
-    JobError::IllegalTransition {
-        id: id.to_owned(),
-        state,
-        event,
-    }
+fn illegal(id: JobId, state: JobState, event: JobTransition) -> JobError {
+    JobError::IllegalTransition { id, state, event }
 }
 
 fn check_key(key: &str) -> Result<(), JobError> {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::progress::ReportBuffer;
 use super::{Losses, unix_s};
-use crate::store::{Lease, LossRow, job_id};
+use crate::store::{JobId, Lease, LossRow};
 use foreframe_core::metric_names;
 
 /// A part of a job's report.
@@ -94,8 +94,8 @@ impl JobReporter {
 
     /// The job's id.
     #[must_use]
-    pub fn id(&self) -> String {
-        job_id(self.lease.number)
+    pub fn id(&self) -> JobId {
+        self.lease.job
     }
 
     /// The lease of this attempt.

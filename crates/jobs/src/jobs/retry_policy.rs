@@ -85,7 +85,7 @@ pub(super) fn retry_while_busy<T, E>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::{Lease, StoreError};
+    use crate::store::{JobId, Lease, StoreError};
 
     fn away() -> StoreError {
         StoreError::Io {
@@ -98,7 +98,10 @@ mod tests {
     /// Does work that finds the store away `times` times.
     fn tried(times: u32, other: Option<StoreError>, cancelled: bool) -> (Result<u32, JobFailure>, u32) {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let lease = Lease { number: 1, token: 1 };
+        let lease = Lease {
+            job: JobId::new(1),
+            token: 1,
+        };
         let retry = RetryPolicy {
             runtime: runtime.handle(),
             report: &JobReporter::to_writer(lease, |_, _| Ok(())),

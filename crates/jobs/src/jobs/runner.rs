@@ -16,7 +16,7 @@ use super::progress::{ReportBuffer, StoredProgress};
 use super::report::JobReporter;
 use super::shared::SharedJobs;
 use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
-use crate::store::{JobOutcome, JobReport, JobRow, Lease, StoreError};
+use crate::store::{JobId, JobOutcome, JobReport, JobRow, Lease, StoreError};
 use foreframe_core::metric_names;
 
 /// How often a job's report is written, unless the lease needs it more often.
@@ -329,12 +329,12 @@ impl<'a> JobRun<'a> {
             measured: outcome.and_then(|outcome| outcome.measured),
             crashed: crash.is_some(),
         };
-        self.write_outcome(&id, outcome).await;
+        self.write_outcome(id, outcome).await;
         self.shared.ended.notify_one();
     }
 
     /// Writes the outcome. While the database is away, tries until it is back: nothing else can be claimed meanwhile.
-    async fn write_outcome(&self, id: &str, outcome: JobOutcome) {
+    async fn write_outcome(&self, id: JobId, outcome: JobOutcome) {
         let (report, stop) = (self.take_report(), self.shared.stop.subscribe());
         let mut attempt = 0;
         loop {

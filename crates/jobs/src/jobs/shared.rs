@@ -7,7 +7,7 @@ use tokio::sync::{Notify, watch};
 use tracing::warn;
 
 use super::executor::JobExecutor;
-use crate::store::{Store, job_id};
+use crate::store::Store;
 
 /// The limits of jobs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,7 +48,7 @@ impl SharedJobs {
             Ok(forgotten) => forgotten,
             Err(error) => return warn!(%error, "could not delete old jobs"),
         };
-        for id in forgotten.into_iter().map(job_id) {
+        for id in forgotten {
             for dir in ["runs", "reports"] {
                 if let Err(error) = self.store.objects().delete(&format!("{dir}/{id}")).await {
                     warn!(job.id = %id, %error, "could not delete the files of an old job");

@@ -16,6 +16,7 @@ use sqlx::{
     Type,
 };
 
+use super::job_id::JobId;
 use super::{StoreError, wal};
 use foreframe_core::files::open_lock;
 
@@ -60,7 +61,8 @@ macro_rules! value_from {
 }
 value_from!(Text: &str => |text: &str| Some(text.to_owned()), String => Some, Option<String> => |text| text,
     Option<&str> => |text: Option<&str>| text.map(str::to_owned));
-value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::from(int)));
+value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::from(int)),
+    JobId => |id: JobId| Some(id.number()));
 value_from!(Real: f64 => Some, Option<f64> => |real| real);
 
 /// A row of a result.

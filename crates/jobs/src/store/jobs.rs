@@ -5,6 +5,7 @@
 
 use super::audit::Author;
 use super::database::{DatabaseRow, DatabaseValue, Tx};
+use super::job_id::JobId;
 use super::lease::Lease;
 use super::models::{PublishedVersion, version_id};
 use super::reports::{JobReport, write_report};
@@ -13,8 +14,8 @@ use super::{ModelMetrics, Store, StoreError};
 /// The row of a job. Structured values are JSON.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JobRow {
-    /// The job's number, from 1.
-    pub number: i64,
+    /// The job's id.
+    pub id: JobId,
     /// `collect`, `train`, …
     pub kind: String,
     /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
@@ -48,7 +49,7 @@ pub struct JobRow {
 impl JobRow {
     fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
         Ok(Self {
-            number: row.get("number")?,
+            id: id_of(row)?,
             kind: row.get("kind")?,
             state: row.get("state")?,
             spec: row.get("spec")?,
@@ -125,16 +126,14 @@ pub struct JobPage {
     pub kind: Option<String>,
     /// Only in that state.
     pub state: Option<String>,
-    /// Only below that number.
-    pub before: Option<i64>,
+    /// Only those enqueued before that job.
+    pub before: Option<JobId>,
     /// The maximum number of jobs.
     pub limit: i64,
 }
 
-/// The id of the job of that number.
-#[must_use]
-pub fn job_id(number: i64) -> String {
-    format!("job-{number}")
+fn id_of(row: &DatabaseRow) -> Result<JobId, StoreError> {
+    row.get("number").map(JobId::new)
 }
 
 /// Takes the lock for enqueueing.
@@ -208,23 +207,18 @@ impl Store {
         ];
         let row = first_job(&tx.fetch(sql, values).await?)?;
         let row = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?;
-        let change = Author::of_key(&row.submitter).change("job.create", job_id(row.number));
+        let change = Author::of_key(&row.submitter).change("job.create", row.id);
         change.commit(tx).await?;
         Ok(EnqueueResult::New(row))
     }
 
     /// Enqueues a failed or cancelled job again; `None` if it is neither. Errors: `Query`.
-    pub async fn requeue(
-        &self,
-        number: i64,
-        max_queued: i64,
-        by: &Author,
-    ) -> Result<Option<EnqueueResult>, StoreError> {
+    pub async fn requeue(&self, id: JobId, max_queued: i64, by: &Author) -> Result<Option<EnqueueResult>, StoreError> {
         let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;
         lock(&mut tx).await?;
         let sql = "SELECT makes, submitter FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
-        let rows = tx.fetch(sql, vec![number.into()]).await?;
+        let rows = tx.fetch(sql, vec![id.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let (makes, submitter): (Option<String>, String) = (row.get("makes")?, row.get("submitter")?);
         if let Some(refused) = check_capacity(&mut tx, (makes.as_deref(), &submitter), (max_queued, now_s)).await? {
@@ -232,26 +226,26 @@ impl Store {
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
              stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
-        let row = first_job(&tx.fetch(sql, vec![number.into()]).await?)?;
-        let change = by.change("job.resume", job_id(number));
+        let row = first_job(&tx.fetch(sql, vec![id.into()]).await?)?;
+        let change = by.change("job.resume", id);
         change.commit(tx).await?;
         Ok(row.map(EnqueueResult::New))
     }
 
-    /// Deletes all ended jobs except the latest `keep`; returns their numbers. Errors: `Query`.
-    pub async fn forget_ended(&self, keep: i64) -> Result<Vec<i64>, StoreError> {
+    /// Deletes all ended jobs except the latest `keep`; returns their ids. Errors: `Query`.
+    pub async fn forget_ended(&self, keep: i64) -> Result<Vec<JobId>, StoreError> {
         // Both conditions check the state, because a job can be resumed between them.
         let sql = "DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND number IN (SELECT number \
              FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') ORDER BY ended_s DESC, number DESC \
              LIMIT 1000000 OFFSET $1) RETURNING number";
         let rows = self.database.fetch(sql, vec![keep.into()]).await?;
-        rows.iter().map(|row| row.get("number")).collect()
+        rows.iter().map(id_of).collect()
     }
 
     /// One job. Errors: `Query`.
-    pub async fn job(&self, number: i64) -> Result<Option<JobRow>, StoreError> {
+    pub async fn job(&self, id: JobId) -> Result<Option<JobRow>, StoreError> {
         let sql = "SELECT * FROM jobs WHERE number = $1";
-        first_job(&self.database.fetch(sql, vec![number.into()]).await?)
+        first_job(&self.database.fetch(sql, vec![id.into()]).await?)
     }
 
     /// The job that was enqueued with that idempotency key. Errors: `Query`.
@@ -268,7 +262,7 @@ impl Store {
         let values = vec![
             page.kind.into(),
             page.state.into(),
-            page.before.into(),
+            page.before.map(JobId::number).into(),
             page.limit.into(),
         ];
         let rows = self.database.fetch(sql, values).await?;
@@ -302,17 +296,17 @@ impl Store {
              number LIMIT 1";
         let rows = tx.fetch_free(sql, vec![now_s.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
-        let number: i64 = row.get("number")?;
+        let id = id_of(row)?;
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
              claimed_checkpoint = checkpoint, stalled_attempts = CASE \
              WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4), claimed_s = $4 WHERE number = $1 RETURNING *";
-        let values = vec![number.into(), owner.into(), until_s.into(), now_s.into()];
+        let values = vec![id.into(), owner.into(), until_s.into(), now_s.into()];
         let row = first_job(&tx.fetch(sql, values).await?)?;
         tx.commit().await?;
         Ok(row.map(|row| {
             let lease = Lease {
-                number: row.number,
+                job: row.id,
                 token: row.token,
             };
             (row, lease)
@@ -339,7 +333,7 @@ impl Store {
              checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \
              WHERE number = $1 AND token = $2 AND state = 'running' RETURNING cancelling";
         let values = vec![
-            lease.number.into(),
+            lease.job.into(),
             lease.token.into(),
             until_s.into(),
             report.progress.as_str().into(),
@@ -348,7 +342,7 @@ impl Store {
         let rows = tx.fetch(sql, values).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let cancelling = row.get::<i64>("cancelling")? != 0;
-        write_report(&mut tx, lease.number, report).await?;
+        write_report(&mut tx, lease.job, report).await?;
         tx.commit().await?;
         Ok(Some(cancelling))
     }
@@ -356,7 +350,7 @@ impl Store {
     /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
     pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
         let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
-        let values = vec![lease.number.into(), lease.token.into()];
+        let values = vec![lease.job.into(), lease.token.into()];
         self.database.execute(sql, values).await.map(drop)
     }
 
@@ -370,7 +364,7 @@ impl Store {
              WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running' RETURNING submitter";
         let values = vec![
-            lease.number.into(),
+            lease.job.into(),
             lease.token.into(),
             outcome.state.into(),
             outcome.error.into(),
@@ -394,7 +388,7 @@ impl Store {
         if let Some(measured) = outcome.measured {
             super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;
         }
-        write_report(&mut tx, lease.number, report).await?;
+        write_report(&mut tx, lease.job, report).await?;
         match change {
             Some(change) => change.commit(tx).await?,
             None => tx.commit().await?,
@@ -403,21 +397,20 @@ impl Store {
     }
 
     /// Cancels a queued job. Returns whether it was queued. Errors: `Query`.
-    pub async fn cancel_queued(&self, number: i64, now_s: f64, by: &Author) -> Result<bool, StoreError> {
+    pub async fn cancel_queued(&self, id: JobId, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET state = 'cancelled', ended_s = $2 WHERE number = $1 AND state = 'queued'";
-        let change = by.change("job.cancel", job_id(number));
-        self.execute_recorded(sql, vec![number.into(), now_s.into()], change)
-            .await
+        let change = by.change("job.cancel", id);
+        self.execute_recorded(sql, vec![id.into(), now_s.into()], change).await
     }
 
     /// Asks a running job to stop, if it was not asked before. Returns whether it is running. Errors: `Query`.
-    pub async fn ask_to_cancel(&self, number: i64, by: &Author) -> Result<bool, StoreError> {
+    pub async fn ask_to_cancel(&self, id: JobId, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running' AND cancelling = 0";
-        let change = by.change("job.cancel", job_id(number));
-        if self.execute_recorded(sql, vec![number.into()], change).await? {
+        let change = by.change("job.cancel", id);
+        if self.execute_recorded(sql, vec![id.into()], change).await? {
             return Ok(true);
         }
         let sql = "SELECT 1 FROM jobs WHERE number = $1 AND state = 'running'";
-        Ok(!self.database.fetch(sql, vec![number.into()]).await?.is_empty())
+        Ok(!self.database.fetch(sql, vec![id.into()]).await?.is_empty())
     }
 }

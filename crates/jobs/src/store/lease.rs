@@ -2,11 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The right to work on a job: its number and the fencing token of the claim.
+use super::job_id::JobId;
+
+/// The right to work on a job: its id and the fencing token of the claim.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Lease {
     /// The job.
-    pub number: i64,
+    pub job: JobId,
     /// The fencing token.
     pub token: i64,
 }

@@ -55,17 +55,17 @@ impl Store {
         // Held until the commit, so that two jobs never reserve one number.
         let sql = "UPDATE counters SET value = value WHERE name = 'job' \
              AND EXISTS (SELECT 1 FROM jobs WHERE number = $1 AND token = $2 AND state = 'running')";
-        if tx.execute(sql, vec![lease.number.into(), lease.token.into()]).await? == 0 {
+        if tx.execute(sql, vec![lease.job.into(), lease.token.into()]).await? == 0 {
             return Ok(None);
         }
         let sql = "SELECT version FROM model_versions WHERE job = $1";
-        if let Some(row) = tx.fetch(sql, vec![lease.number.into()]).await?.first() {
+        if let Some(row) = tx.fetch(sql, vec![lease.job.into()]).await?.first() {
             return version_of(row).map(Some);
         }
         let sql = "INSERT INTO model_versions (model, version, job) \
              SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1, $3 \
              FROM model_versions WHERE model = $1 RETURNING version";
-        let values = vec![model.into(), shipped.into(), lease.number.into()];
+        let values = vec![model.into(), shipped.into(), lease.job.into()];
         let rows = tx.fetch(sql, values).await?;
         tx.commit().await?;
         rows.first().map(version_of).transpose()

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::database::{DatabaseRow, Tx};
+use super::job_id::JobId;
 use super::{Store, StoreError};
 
 /// A point of a training's loss curves.
@@ -46,9 +47,9 @@ pub struct JobReport {
 
 impl Store {
     /// The lines of a job's log after line number `after`, the oldest first. Errors: `Query`.
-    pub async fn job_log(&self, number: i64, after: i64, limit: i64) -> Result<Vec<LogRow>, StoreError> {
+    pub async fn job_log(&self, id: JobId, after: i64, limit: i64) -> Result<Vec<LogRow>, StoreError> {
         let sql = "SELECT * FROM job_logs WHERE job = $1 AND seq > $2 ORDER BY seq LIMIT $3";
-        let values = vec![number.into(), after.into(), limit.into()];
+        let values = vec![id.into(), after.into(), limit.into()];
         let rows = self.database.fetch(sql, values).await?;
         let line = |row: &DatabaseRow| {
             Ok(LogRow {
@@ -61,9 +62,9 @@ impl Store {
     }
 
     /// The points of a job's loss curves, in the order of the training. Errors: `Query`.
-    pub async fn job_losses(&self, number: i64) -> Result<Vec<LossRow>, StoreError> {
-        let sql = "SELECT * FROM job_losses WHERE job = $1 ORDER BY stage DESC, step";
-        let rows = self.database.fetch(sql, vec![number.into()]).await?;
+    pub async fn job_losses(&self, id: JobId) -> Result<Vec<LossRow>, StoreError> {
+        let sql = "SELECT * FROM job_losses WHERE job = $1 ORDER BY stage, step";
+        let rows = self.database.fetch(sql, vec![id.into()]).await?;
         let point = |row: &DatabaseRow| {
             Ok(LossRow {
                 stage: row.get("stage")?,
@@ -77,20 +78,20 @@ impl Store {
 }
 
 /// Writes the report in the transaction that has checked the lease.
-pub(super) async fn write_report(tx: &mut Tx, number: i64, report: JobReport) -> Result<(), StoreError> {
+pub(super) async fn write_report(tx: &mut Tx, id: JobId, report: JobReport) -> Result<(), StoreError> {
     for (time_s, line) in report.lines {
         let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
              SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";
-        tx.execute(sql, vec![number.into(), time_s.into(), line.into()]).await?;
+        tx.execute(sql, vec![id.into(), time_s.into(), line.into()]).await?;
         let sql = "DELETE FROM job_logs WHERE job = $1 AND \
              seq <= (SELECT MAX(seq) FROM job_logs WHERE job = $1) - $2";
-        tx.execute(sql, vec![number.into(), report.max_lines.into()]).await?;
+        tx.execute(sql, vec![id.into(), report.max_lines.into()]).await?;
     }
     for point in report.losses {
         let sql = "INSERT INTO job_losses (job, stage, step, train, validation) VALUES ($1, $2, $3, $4, $5) \
              ON CONFLICT (job, stage, step) DO UPDATE SET train = excluded.train, validation = excluded.validation";
         let values = vec![
-            number.into(),
+            id.into(),
             point.stage.into(),
             point.step.into(),
             point.train.into(),
