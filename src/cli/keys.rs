@@ -68,7 +68,7 @@ pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
                 scope,
                 expires,
                 rate,
-            } => create(&store, name, *scope, (*expires, *rate)).await,
+            } => create(&store, name, *scope, *expires, *rate).await,
             KeysCommand::List => list(&store).await,
             KeysCommand::Revoke { id } => revoke(&store, id).await,
         }
@@ -79,7 +79,8 @@ async fn create(
     store: &Store,
     name: &str,
     scope: KeyScope,
-    (expires_in_s, requests_per_s): (Option<f64>, Option<f64>),
+    expires_in_s: Option<f64>,
+    requests_per_s: Option<f64>,
 ) -> Result<(), CliError> {
     if name.is_empty() || name.len() > 64 || name.chars().any(char::is_control) {
         return Err(CliError::Usage(format!(

@@ -90,7 +90,7 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     };
     let name = &loaded.manifest.name;
     let selected = select(args, name, &asked)?;
-    let input = input(args, (name, &asked), &selected)?;
+    let input = input(args, name, &asked, &selected)?;
     let rollout = serving::predict(&loaded, &[&input])?.remove(0);
     let output = OutputDirectory::create(&args.out)?;
     write(&output, spec, &selected, &rollout.frames)?;
@@ -160,11 +160,7 @@ fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, 
 }
 
 /// `spec` has the frames to predict as its horizon.
-fn input(
-    args: &PredictArgs,
-    (name, spec): (&str, &ModelSpec),
-    selected: &Selected,
-) -> Result<PredictionInput, CliError> {
+fn input(args: &PredictArgs, name: &str, spec: &ModelSpec, selected: &Selected) -> Result<PredictionInput, CliError> {
     let mut input = PredictionInput {
         frames: selected.seen.clone(),
         steps: Some(spec.horizon),

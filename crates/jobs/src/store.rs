@@ -27,7 +27,7 @@ use tracing::warn;
 pub use self::audit::Author;
 use self::database::Database;
 pub use self::job_id::{JobId, JobIdError};
-pub use self::jobs::{EnqueueResult, JobOutcome, JobPage, JobRow, NewJob};
+pub use self::jobs::{EnqueueResult, JobCount, JobOutcome, JobPage, JobRow, NewJob};
 pub use self::keys::{KeyRow, KeyScope};
 pub use self::lease::Lease;
 pub use self::models::{ModelMetrics, PublishedVersion, VersionRow};

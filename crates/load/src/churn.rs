@@ -72,7 +72,7 @@ pub(crate) async fn run(args: &ChurnArgs, bounds: &mut Bounds) {
     ];
     let mut faults = Faults::new();
     let mut repeat = async |task: &Task, count| {
-        for fault in many(args.workers, server.address, (task, count), &workload).await {
+        for fault in many(args.workers, server.address, task, count, &workload).await {
             *faults.entry(fault).or_default() += 1;
         }
     };
@@ -148,12 +148,7 @@ fn kinds(workload: &Workload) -> Arc<[(Request, u16)]> {
 }
 
 /// Repeats a task `count` times with several workers, and returns the faults.
-async fn many(
-    workers: usize,
-    address: SocketAddr,
-    (task, count): (&Task, u64),
-    workload: &Arc<Workload>,
-) -> Vec<String> {
+async fn many(workers: usize, address: SocketAddr, task: &Task, count: u64, workload: &Arc<Workload>) -> Vec<String> {
     let next = Arc::new(AtomicU64::new(0));
     let mut working = JoinSet::new();
     for _ in 0..workers {

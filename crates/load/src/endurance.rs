@@ -106,7 +106,7 @@ pub(crate) async fn run(args: &EnduranceArgs, bounds: &mut Bounds) {
     println!("the hostile part begins");
     let counts = Arc::new(HostileCounts::default());
     let hostile = hostile::start(&run, &model, &counts);
-    let mut incidents = incidents(args, (&run, &mut supervisor), (load.attack, &outages)).await;
+    let mut incidents = incidents(args, &run, &mut supervisor, load.attack, &outages).await;
     sleep_until(run.end().into()).await;
     drop(hostile);
     let results = load.end(&run).await;
@@ -118,8 +118,8 @@ pub(crate) async fn run(args: &EnduranceArgs, bounds: &mut Bounds) {
     verify::versions(&run, &jobs, bounds).await;
     verify::datasets(&run, &jobs, bounds).await;
     verify::keys(&run, bounds).await;
-    summary::print(args, &run, &results, (&incidents, &counts));
-    summary::check(args, &run, &results, (&incidents, bounds));
+    summary::print(args, &run, &results, &incidents, &counts);
+    summary::check(args, &run, &results, &incidents, bounds);
     let log = supervisor.log();
     let panics = log.lines().filter(|line| line.contains("panicked")).count();
     bounds.check(panics == 0, format!("the server's log has no panic ({panics} found)"));
@@ -229,8 +229,10 @@ impl Load {
 /// Kills the server at equal intervals. Before each kill there is an outage; after the last kill there is none.
 async fn incidents(
     args: &EnduranceArgs,
-    (run, supervisor): (&Arc<EnduranceRun>, &mut Supervisor),
-    (attack, outages): (Instant, &[Outage]),
+    run: &Arc<EnduranceRun>,
+    supervisor: &mut Supervisor,
+    attack: Instant,
+    outages: &[Outage],
 ) -> Incidents {
     let time = run.end().saturating_duration_since(attack);
     let kills = MIN_KILLS.max((time.as_secs_f64() / 60.0 / args.kill_minutes) as u32);

@@ -78,7 +78,7 @@ pub fn run(
         });
     }
     let spec = loaded.spec();
-    let mut baselines = fitted_baselines(loaded, (dataset, &splits), config)?;
+    let mut baselines = fitted_baselines(loaded, dataset, &splits, config)?;
     if spec.flow().is_some() {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
@@ -109,7 +109,8 @@ pub fn run(
 /// training window to find. Errors: those of [`Splits::windows`].
 fn fitted_baselines(
     loaded: &Model,
-    (dataset, splits): (&Dataset, &Splits),
+    dataset: &Dataset,
+    splits: &Splits,
     config: &EvaluateConfig,
 ) -> Result<Baselines, EvaluationError> {
     let shape = window_shape(loaded.spec());
@@ -186,7 +187,7 @@ fn score_split(
     }
     let mut novelty = Vec::new();
     if let Some(calibration) = &loaded.manifest.calibration {
-        let (measured, found) = uncertainty::measure(loaded, calibration, (dataset, &windows), watched)?;
+        let (measured, found) = uncertainty::measure(loaded, calibration, dataset, &windows, watched)?;
         scores.uncertainty = Some(measured);
         novelty = found;
     }

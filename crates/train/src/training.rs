@@ -99,7 +99,7 @@ pub fn run(
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(TrainingOutcome::Finished { model_dir, manifest });
     }
-    let mut state = match Checkpoint::load_latest(&files, (&plan.spec, &config.run), observer)? {
+    let mut state = match Checkpoint::load_latest(&files, &plan.spec, &config.run, observer)? {
         Some(checkpoint) => checkpoint.into_state(),
         None => match initial_parameters(&plan, training, cancelled)? {
             Some(parameters) => TrainState::new(parameters, &config.run)?,
@@ -176,7 +176,7 @@ fn initial_parameters(
         CodecStart::Random => random_codec::centre(&parameters, &inputs, &targets)?,
         CodecStart::Principal => {
             let seed = config.seed.derive("principal", 0);
-            if !principal_components::set_codec(&parameters, (&inputs, &targets), seed, cancelled)? {
+            if !principal_components::set_codec(&parameters, &inputs, &targets, seed, cancelled)? {
                 return Ok(None);
             }
         }

@@ -172,7 +172,7 @@ async fn sheet(
 ) -> Result<impl IntoResponse, ApiError> {
     let title = format!("{name}, episode {episode}");
     let draw = move |frames, _| contact_sheet(&title, frames);
-    let png = picture(&app, (&name, episode, "png"), draw).await?;
+    let png = picture(&app, &name, episode, "png", draw).await?;
     Ok(([(header::CONTENT_TYPE, "image/png")], png))
 }
 
@@ -192,7 +192,7 @@ async fn animation(
     State(app): State<App>,
     Path((name, episode)): Path<(String, usize)>,
 ) -> Result<impl IntoResponse, ApiError> {
-    let gif = picture(&app, (&name, episode, "gif"), |mut frames, period_s| {
+    let gif = picture(&app, &name, episode, "gif", |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
         enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
     });
@@ -208,7 +208,9 @@ async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError>
 /// has the same content.
 async fn picture(
     app: &App,
-    (name, episode, kind): (&str, usize, &str),
+    name: &str,
+    episode: usize,
+    kind: &str,
     draw: impl FnOnce(Vec<Frame>, f64) -> Result<Vec<u8>, FrameError> + Send + 'static,
 ) -> Result<Bytes, ApiError> {
     let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;

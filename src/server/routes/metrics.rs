@@ -14,7 +14,7 @@ use utoipa_axum::routes;
 use crate::server::state::App;
 use foreframe_core::metric_names;
 use foreframe_jobs::jobs::{JobSpec, JobState};
-use foreframe_jobs::store::Store;
+use foreframe_jobs::store::{JobCount, Store};
 
 use crate::telemetry;
 
@@ -49,14 +49,12 @@ pub(in crate::server) async fn text(store: &Store) -> String {
 }
 
 /// A state without jobs gets 0, so that a job that has left it is no longer counted there.
-fn measure_jobs(counts: &[(String, String, i64)]) {
+fn measure_jobs(counts: &[JobCount]) {
     for kind in JobSpec::KINDS {
         for state in JobState::ALL.map(JobState::name) {
-            let found = counts
-                .iter()
-                .find(|(of, within, _)| (of.as_str(), within.as_str()) == (kind, state));
+            let found = counts.iter().find(|count| count.kind == kind && count.state == state);
             gauge!(metric_names::JOBS, "kind" => kind, "state" => state)
-                .set(found.map_or(0, |(.., count)| *count) as f64);
+                .set(found.map_or(0, |count| count.jobs) as f64);
         }
     }
 }

@@ -175,8 +175,13 @@ async fn session_rollouts(
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let plans = (request.plans, request.steps);
-    let task = state.rollout_task(conditioning(plans, robot_state, &model.manifest, app.config())?);
+    let task = state.rollout_task(conditioning(
+        request.plans,
+        request.steps,
+        robot_state,
+        &model.manifest,
+        app.config(),
+    )?);
     let prediction = app.predictor().compute(&model, task, Some(session.key())).await?;
     let encode = move || answer(wanted, format, &[], prediction);
     picture::threads_for(&app, wanted).run(encode).await?
@@ -193,7 +198,7 @@ impl RolloutRequest {
         let (format, resize) = (self.format, self.resize);
         let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, frames.len())?;
-        let conditioning = conditioning((self.plans, self.steps), state, manifest, config)?;
+        let conditioning = conditioning(self.plans, self.steps, state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
         let task = Task::rollout(frames, conditioning, &manifest.name, &manifest.spec)?;
         Ok((seen, task))
@@ -202,7 +207,8 @@ impl RolloutRequest {
 
 /// The conditioning input of each plan.
 fn conditioning(
-    (plans, steps): (Vec<Vec<Vec<f32>>>, Option<usize>),
+    plans: Vec<Vec<Vec<f32>>>,
+    steps: Option<usize>,
     state: Option<RobotState>,
     manifest: &Manifest,
     config: &ServerConfig,
@@ -225,12 +231,7 @@ fn conditioning(
         .enumerate()
         .map(|(index, values)| predict::actions(&format!("plans[{index}]"), values))
         .collect::<Result<_, _>>()?;
-    Ok(ConditioningInput::of_plans(
-        plans,
-        (state, steps),
-        &manifest.name,
-        spec,
-    )?)
+    Ok(ConditioningInput::of_plans(plans, state, steps, &manifest.name, spec)?)
 }
 
 fn answer(

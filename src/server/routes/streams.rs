@@ -64,7 +64,7 @@ async fn session_stream(
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
     let services = services(&app, caller, messages);
-    open(&app, services, (session.0, true), upgrade)
+    open(&app, services, session.0, true, upgrade)
 }
 
 /// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
@@ -96,7 +96,7 @@ async fn model_stream(
     );
     let (session, _) = session.map_err(|error| ApiError::Internal(error.to_string()))?;
     let services = services(&app, caller, messages);
-    open(&app, services, (Arc::new(session), false), upgrade)
+    open(&app, services, Arc::new(session), false, upgrade)
 }
 
 fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
@@ -107,7 +107,8 @@ fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
 fn open(
     app: &App,
     services: StreamServices,
-    (session, is_persistent): (Arc<Session>, bool),
+    session: Arc<Session>,
+    is_persistent: bool,
     upgrade: Upgrade,
 ) -> Result<Response, ApiError> {
     let upgrade = upgrade.map_err(|_| ApiError::UpgradeRequired)?.protocols(Codec::NAMES);

@@ -145,7 +145,7 @@ pub(super) fn check(bytes: &[u8]) -> Result<(), JpegDamage> {
                 let header = reader.segment()?;
                 let scan = scan_of(header, layout, scans).filter(|_| scans <= MAX_SCANS);
                 let scan = scan.ok_or(JpegDamage::Segment(0xda))?;
-                reader.at = scan.read(layout, &tables, (bytes, reader.at))?;
+                reader.at = scan.read(layout, &tables, bytes, reader.at)?;
             }
             0xd9 => break,
             marker @ (0x00..=0x01 | 0xd0..=0xd8) => return Err(JpegDamage::Segment(marker)),

@@ -42,7 +42,7 @@ fn conv_lstm_of(spec: &ModelSpec, hidden: &[u64]) -> Cost {
         forecaster.peepholes(hidden, positions);
         inputs = hidden;
     }
-    forecaster.convolution(1, (hidden.iter().sum(), patch), positions);
+    forecaster.convolution(1, hidden.iter().sum(), patch, positions);
     let (context, horizon) = (spec.context as u64, spec.horizon.max(1) as u64);
     Cost {
         parameters: encoder.parameters + forecaster.parameters,
@@ -61,24 +61,24 @@ pub fn cdna(spec: &ModelSpec) -> Cost {
     let [full, half, quarter, eighth] = [1, 2, 4, 8].map(|stride| positions(spec, stride));
     let conditioning_inputs = spec.conditioning_inputs() as u64;
     let mut step = LayerCosts::default();
-    step.convolution(5, (1, 32), half);
+    step.convolution(5, 1, 32, half);
     step.lstm(32, 32, half);
     step.lstm(32, 32, half);
-    step.convolution(3, (32, 32), quarter);
+    step.convolution(3, 32, 32, quarter);
     step.lstm(32, 64, quarter);
     step.lstm(64, 64, quarter);
-    step.convolution(3, (64, 64), eighth);
-    step.convolution(1, (64 + conditioning_inputs, 64), eighth);
+    step.convolution(3, 64, 64, eighth);
+    step.convolution(1, 64 + conditioning_inputs, 64, eighth);
     step.lstm(64, 128, eighth);
     // The three convolutions that enlarge are transposed: they apply their weights at every position of their input.
-    step.convolution(3, (128, 128), eighth);
+    step.convolution(3, 128, 128, eighth);
     step.lstm(128, 64, quarter);
-    step.convolution(3, (64 + 32, 64 + 32), quarter);
+    step.convolution(3, 64 + 32, 64 + 32, quarter);
     step.lstm(64 + 32, 32, half);
-    step.convolution(3, (32 + 32, 32 + 32), half);
-    step.convolution(1, (64, 1), full);
-    step.convolution(1, (64, MASKS), full);
-    step.convolution(1, (128 * eighth, KERNELS), 1);
+    step.convolution(3, 32 + 32, 32 + 32, half);
+    step.convolution(1, 64, 1, full);
+    step.convolution(1, 64, MASKS, full);
+    step.convolution(1, 128 * eighth, KERNELS, 1);
     step.products += (KERNELS + MASKS) * full;
     // Every step predicts; the last context step predicts the first frame of the horizon.
     let (steps, horizon) = ((spec.context + spec.horizon).saturating_sub(1), spec.horizon.max(1));
@@ -101,7 +101,7 @@ struct LayerCosts {
 }
 
 impl LayerCosts {
-    fn convolution(&mut self, side: u64, (inputs, outputs): (u64, u64), positions: u64) {
+    fn convolution(&mut self, side: u64, inputs: u64, outputs: u64, positions: u64) {
         let weights = side * side * inputs * outputs;
         self.parameters += weights + outputs;
         self.products += weights * positions;
@@ -109,7 +109,7 @@ impl LayerCosts {
 
     /// Four gates, each a convolution of the input and the previous output.
     fn lstm(&mut self, inputs: u64, hidden: u64, positions: u64) {
-        self.convolution(LSTM_KERNEL, (inputs + hidden, 4 * hidden), positions);
+        self.convolution(LSTM_KERNEL, inputs + hidden, 4 * hidden, positions);
     }
 
     /// Three gates get the cell state, with one weight for each channel.

@@ -71,7 +71,7 @@ impl ConditioningInput {
         let actions = match (raw.plan, raw.past.last()) {
             _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
-                check_actions(fields.plan, (model, steps), spec, actions)?;
+                check_actions(fields.plan, model, steps, spec, actions)?;
                 actions.to_vec()
             }
             (None, Some(held)) => vec![held.clone(); steps],
@@ -94,7 +94,8 @@ impl ConditioningInput {
     /// Errors: `Unconditioned` if the model takes no actions, and the errors of the values.
     pub fn of_plans(
         plans: Vec<Vec<Action>>,
-        (state, steps): (Option<RobotState>, Option<usize>),
+        state: Option<RobotState>,
+        steps: Option<usize>,
         model: &str,
         spec: &ModelSpec,
     ) -> Result<Vec<Self>, InputError> {
@@ -105,8 +106,13 @@ impl ConditioningInput {
         }
         let state = check_state(model, spec, state)?;
         let conditioning = |(index, actions): (usize, Vec<Action>)| {
-            let wanted = (model, steps.unwrap_or(spec.horizon));
-            check_actions(&format!("plans[{index}]"), wanted, spec, &actions)?;
+            check_actions(
+                &format!("plans[{index}]"),
+                model,
+                steps.unwrap_or(spec.horizon),
+                spec,
+                &actions,
+            )?;
             let state = state.clone();
             Ok(Self { actions, state, steps })
         };
@@ -122,7 +128,8 @@ impl ConditioningInput {
 /// Checks that there are as many actions as steps and that each action has all channels.
 fn check_actions(
     field: &str,
-    (model, steps): (&str, usize),
+    model: &str,
+    steps: usize,
     spec: &ModelSpec,
     actions: &[Action],
 ) -> Result<(), InputError> {

@@ -106,8 +106,8 @@ impl Session {
     pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
         let spec = self.model.spec();
         let steps = plans.first().map(Vec::len);
-        let from = (self.state.robot_state().cloned(), steps);
-        let inputs = ConditioningInput::of_plans(plans, from, &self.model.manifest.name, spec)?;
+        let state = self.state.robot_state().cloned();
+        let inputs = ConditioningInput::of_plans(plans, state, steps, &self.model.manifest.name, spec)?;
         if inputs.is_empty() || self.state.frame_count() < spec.context {
             return Ok(Vec::new());
         }

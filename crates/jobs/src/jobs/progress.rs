@@ -69,7 +69,7 @@ impl ReportBuffer {
     }
 
     /// Sets the units done, their total, and what the job is doing.
-    pub(super) fn progress(&mut self, (done, total): (u64, u64), message: &str, now_s: f64) {
+    pub(super) fn progress(&mut self, done: u64, total: u64, message: &str, now_s: f64) {
         // Without a total nothing is measured yet; fewer units than before belong to new work.
         let restarts = total != self.stored.progress.total || done < self.stored.progress.done;
         if total == 0 || restarts {
@@ -171,8 +171,8 @@ mod tests {
     #[test]
     fn rate_and_time_left_count_only_this_attempt() {
         let mut buffer = ReportBuffer::default();
-        buffer.progress((100, 200), "", 10.0);
-        buffer.progress((120, 200), "", 20.0);
+        buffer.progress(100, 200, "", 10.0);
+        buffer.progress(120, 200, "", 20.0);
         let progress = &buffer.stored().progress;
         assert_eq!((progress.rate_per_s, progress.remaining_s), (Some(2.0), Some(40.0)));
     }
@@ -180,25 +180,25 @@ mod tests {
     #[test]
     fn a_resumed_attempt_measures_no_earlier_work() {
         let mut buffer = ReportBuffer::default();
-        buffer.progress((0, 0), "reading the data set", 0.0);
-        buffer.progress((500, 1000), "sequence", 10.0);
+        buffer.progress(0, 0, "reading the data set", 0.0);
+        buffer.progress(500, 1000, "sequence", 10.0);
         assert_eq!(buffer.stored().progress.rate_per_s, None);
-        buffer.progress((501, 1000), "sequence", 10.001);
+        buffer.progress(501, 1000, "sequence", 10.001);
         assert_eq!(buffer.stored().progress.rate_per_s, None);
-        buffer.progress((520, 1000), "sequence", 20.0);
+        buffer.progress(520, 1000, "sequence", 20.0);
         assert_eq!(buffer.stored().progress.rate_per_s, Some(2.0));
     }
 
     #[test]
     fn a_repeated_report_is_no_progress() {
         let mut buffer = ReportBuffer::default();
-        buffer.progress((1, 9), "sequence", 1.0);
+        buffer.progress(1, 9, "sequence", 1.0);
         buffer.checkpoint(1);
         let reported = buffer.changes();
-        buffer.progress((1, 9), "sequence", 2.0);
+        buffer.progress(1, 9, "sequence", 2.0);
         buffer.checkpoint(1);
         assert_eq!(buffer.changes(), reported);
-        buffer.progress((2, 9), "sequence", 3.0);
+        buffer.progress(2, 9, "sequence", 3.0);
         buffer.line("a line".to_owned(), 4.0);
         assert_eq!(buffer.changes(), reported + 2);
     }

@@ -76,7 +76,7 @@ impl JobReporter {
             return;
         };
         match event {
-            ReportEvent::Progress(done, total, message) => buffer.progress((done, total), &message, unix_s()),
+            ReportEvent::Progress(done, total, message) => buffer.progress(done, total, &message, unix_s()),
             ReportEvent::Stage => buffer.stage(),
             ReportEvent::Losses(losses) => {
                 for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {

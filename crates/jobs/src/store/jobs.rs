@@ -119,6 +119,17 @@ pub struct JobOutcome {
     pub crashed: bool,
 }
 
+/// How many jobs of a kind are in a state.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct JobCount {
+    /// `collect`, `train`, …
+    pub kind: String,
+    /// `queued`, `running`, …
+    pub state: String,
+    /// The number of such jobs.
+    pub jobs: i64,
+}
+
 /// Which jobs to list, the newest first.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct JobPage {
@@ -145,8 +156,10 @@ async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
 /// Checks that the queue and the submitter's share of it have room, and that no queued or running job has the same output.
 async fn check_capacity(
     tx: &mut Tx,
-    (makes, submitter): (Option<&str>, &str),
-    (max_queued, now_s): (i64, f64),
+    makes: Option<&str>,
+    submitter: &str,
+    max_queued: i64,
+    now_s: f64,
 ) -> Result<Option<EnqueueResult>, StoreError> {
     // In SQL nothing equals NULL, so a job without an exclusive output never conflicts.
     let sql = "SELECT number FROM jobs WHERE makes = $1 AND state IN ('queued', 'running')";
@@ -189,7 +202,7 @@ impl Store {
             }
         }
         let output = new.exclusive_output.as_deref();
-        if let Some(refused) = check_capacity(&mut tx, (output, &new.submitter), (max_queued, now_s)).await? {
+        if let Some(refused) = check_capacity(&mut tx, output, &new.submitter, max_queued, now_s).await? {
             return Ok(refused);
         }
         tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'job'", vec![])
@@ -221,7 +234,7 @@ impl Store {
         let rows = tx.fetch(sql, vec![id.into()]).await?;
         let Some(row) = rows.first() else { return Ok(None) };
         let (makes, submitter): (Option<String>, String) = (row.get("makes")?, row.get("submitter")?);
-        if let Some(refused) = check_capacity(&mut tx, (makes.as_deref(), &submitter), (max_queued, now_s)).await? {
+        if let Some(refused) = check_capacity(&mut tx, makes.as_deref(), &submitter, max_queued, now_s).await? {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
@@ -270,12 +283,17 @@ impl Store {
     }
 
     /// The number of jobs of each kind and state, without zeros. Errors: `Query`.
-    pub async fn count_jobs(&self) -> Result<Vec<(String, String, i64)>, StoreError> {
+    pub async fn count_jobs(&self) -> Result<Vec<JobCount>, StoreError> {
         let sql = "SELECT kind, state, COUNT(*) AS jobs FROM jobs GROUP BY kind, state";
         let rows = self.database.fetch(sql, vec![]).await?;
-        rows.iter()
-            .map(|row| Ok((row.get("kind")?, row.get("state")?, row.get("jobs")?)))
-            .collect()
+        let count = |row: &DatabaseRow| {
+            Ok(JobCount {
+                kind: row.get("kind")?,
+                state: row.get("state")?,
+                jobs: row.get("jobs")?,
+            })
+        };
+        rows.iter().map(count).collect()
     }
 
     /// Claims a job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest

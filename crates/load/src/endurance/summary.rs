@@ -48,7 +48,8 @@ pub(super) fn print(
     args: &EnduranceArgs,
     run: &EnduranceRun,
     results: &LoadResults,
-    (incidents, hostile): (&Incidents, &HostileCounts),
+    incidents: &Incidents,
+    hostile: &HostileCounts,
 ) {
     println!(
         "\n{} min with {} robots at {} Hz:",
@@ -105,7 +106,8 @@ pub(super) fn check(
     args: &EnduranceArgs,
     run: &EnduranceRun,
     results: &LoadResults,
-    (incidents, bounds): (&Incidents, &mut Bounds),
+    incidents: &Incidents,
+    bounds: &mut Bounds,
 ) {
     let answers = results.sum(|robot| robot.answers.len() as u64);
     let unanswered = results.sum(|robot| robot.unanswered);

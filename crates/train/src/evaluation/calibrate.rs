@@ -64,7 +64,7 @@ pub fn calibrate(
     )?;
     let mut novelty = novelty_scale(&seen);
     let validation = evenly(&validation, config.max_windows);
-    let found = forecasts(loaded, dataset, (&validation, &novelty), &watched(Split::Validation))?;
+    let found = forecasts(loaded, dataset, &validation, &novelty, &watched(Split::Validation))?;
     let distances: Vec<f64> = found
         .iter()
         .map(|forecast| novelty.distance(&forecast.context))

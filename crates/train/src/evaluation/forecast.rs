@@ -28,7 +28,8 @@ pub(super) struct Forecast {
 pub(super) fn forecasts(
     loaded: &Model,
     dataset: &Dataset,
-    (windows, novelty): (&[Window], &NoveltyScale),
+    windows: &[Window],
+    novelty: &NoveltyScale,
     watched: &EvaluationContext,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     let mut found = Vec::with_capacity(windows.len());

@@ -94,7 +94,7 @@ pub fn identify(
         let futures: Result<Vec<Futures>, EvaluationError> = part
             .par_iter()
             .zip(&plans)
-            .map(|(&context, plans)| futures(spec, dataset, world, (context, plans)))
+            .map(|(&context, plans)| futures(spec, dataset, world, context, plans))
             .collect();
         let Some(futures) = futures?.into_iter().collect::<Option<Vec<_>>>() else {
             return skipped("the simulator no longer reproduces the frames of this data set");
@@ -139,7 +139,8 @@ fn futures(
     spec: &ModelSpec,
     dataset: &Dataset,
     world: &WorldConfig,
-    (context, plans): (Window, &[Window]),
+    context: Window,
+    plans: &[Window],
 ) -> Result<Futures, EvaluationError> {
     let episode = &dataset.episodes()[context.episode];
     let Some(trial) = &episode.trial else {

@@ -39,7 +39,7 @@ pub fn figure_inputs(
             inputs.samples.push(figure);
         }
         if is_first {
-            inputs.animation = animate(loaded, dataset, (report, split), scores)?;
+            inputs.animation = animate(loaded, dataset, report, split, scores)?;
         }
         inputs.charts.push(chart(split, scores));
     }
@@ -91,7 +91,8 @@ fn chart(split: Split, scores: &SetScores) -> Chart {
 fn animate(
     loaded: &Model,
     dataset: &Dataset,
-    (report, split): (&EvaluationReport, Split),
+    report: &EvaluationReport,
+    split: Split,
     scores: &SetScores,
 ) -> Result<Option<Animation>, EvaluationError> {
     let spec = loaded.spec();

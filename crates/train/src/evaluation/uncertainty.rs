@@ -46,10 +46,11 @@ pub struct NoveltyScores {
 pub(super) fn measure(
     loaded: &Model,
     calibration: &Calibration,
-    (dataset, windows): (&Dataset, &[Window]),
+    dataset: &Dataset,
+    windows: &[Window],
     watched: &EvaluationContext,
 ) -> Result<(UncertaintyScores, Vec<f64>), EvaluationError> {
-    let found = forecasts(loaded, dataset, (windows, &calibration.novelty), watched)?;
+    let found = forecasts(loaded, dataset, windows, &calibration.novelty, watched)?;
     let novelty: Vec<f64> = found
         .iter()
         .map(|forecast| f64::from(calibration.novelty.novelty(&forecast.context)))

@@ -262,7 +262,8 @@ impl Checkpoint {
     /// Errors: `Checkpoint` if it is of another run, `Io`.
     pub(super) fn load_latest(
         files: &RunFiles,
-        (spec, run): (&ModelSpec, &RunConfig),
+        spec: &ModelSpec,
+        run: &RunConfig,
         observer: &mut dyn Observer,
     ) -> Result<Option<Self>, TrainError> {
         for (path, is_previous) in [(files.checkpoint(), false), (files.previous_checkpoint(), true)] {
@@ -270,7 +271,7 @@ impl Checkpoint {
                 continue;
             };
             if is_intact(&bytes) {
-                return Self::load(files, (&path, &bytes), spec, run).map(Some);
+                return Self::load(files, &path, &bytes, spec, run).map(Some);
             }
             observer.on_event(TrainingEvent::CheckpointDamaged { is_previous });
             // The next save must not replace the intact one by it.
@@ -282,7 +283,8 @@ impl Checkpoint {
     /// The state in an intact checkpoint. Errors: `Checkpoint` if it is of another run.
     fn load(
         files: &RunFiles,
-        (path, bytes): (&Path, &[u8]),
+        path: &Path,
+        bytes: &[u8],
         spec: &ModelSpec,
         run: &RunConfig,
     ) -> Result<Self, TrainError> {

@@ -29,7 +29,8 @@ const MIN_STD: f64 = 1e-4;
 /// nothing, if cancelled. Errors: `Network` if the shapes do not match.
 pub(super) fn set_codec(
     parameters: &Parameters,
-    (frames, targets): (&Tensor, &Tensor),
+    frames: &Tensor,
+    targets: &Tensor,
     seed: Seed,
     cancelled: &AtomicBool,
 ) -> Result<bool, TrainError> {
@@ -150,9 +151,9 @@ mod tests {
             .collect();
         let frames = Tensor::from_vec(frames, (200, pixels), &Device::Cpu).unwrap();
         let go_on = AtomicBool::new(false);
-        assert!(set_codec(&parameters, (&frames, &frames), Seed(4), &go_on).unwrap());
+        assert!(set_codec(&parameters, &frames, &frames, Seed(4), &go_on).unwrap());
         let cancelled = AtomicBool::new(true);
-        assert!(!set_codec(&parameters, (&frames, &frames), Seed(4), &cancelled).unwrap());
+        assert!(!set_codec(&parameters, &frames, &frames, Seed(4), &cancelled).unwrap());
         let model = Network::new(spec, &parameters).unwrap();
         let back = model.decode_frames(&model.encode_frames(&frames).unwrap()).unwrap();
         let error = (back - &frames)

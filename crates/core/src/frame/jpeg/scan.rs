@@ -50,7 +50,8 @@ impl Scan {
         &self,
         layout: &mut ImageLayout,
         tables: &JpegTables,
-        (bytes, start): (&[u8], usize),
+        bytes: &[u8],
+        start: usize,
     ) -> Result<usize, JpegDamage> {
         let (columns, rows) = self.units(layout);
         let mut parts = self.parts(layout, tables)?;

@@ -28,7 +28,7 @@ pub(in crate::nn) fn predict_beyond_horizon(
     let (mut parts, mut done) = (Vec::new(), 0);
     while done < steps {
         let taken = spec.horizon.min(steps - done);
-        let part = actions_from(&actions, (count, steps), done, spec);
+        let part = actions_from(&actions, count, steps, done, spec);
         let conditioning = ConditioningTensors {
             actions: given(&part, &[count, spec.horizon, spec.actions.len()])?,
             state: given(&states, &[count, spec.states.len()])?,
@@ -52,7 +52,7 @@ fn given(values: &[f32], shape: &[usize]) -> Result<Option<Tensor>, NnError> {
 }
 
 /// The actions `[N, horizon, A]` from step `first` on; after the last one, it is held.
-fn actions_from(actions: &[f32], (count, steps): (usize, usize), first: usize, spec: &ModelSpec) -> Vec<f32> {
+fn actions_from(actions: &[f32], count: usize, steps: usize, first: usize, spec: &ModelSpec) -> Vec<f32> {
     let width = actions.len() / (count * steps);
     let place = |row: usize, step: usize| (row * steps + step.min(steps - 1)) * width;
     (0..count)

@@ -209,7 +209,7 @@ impl ImageGeometry {
     }
 
     /// Adds the convolution of a bordered image to `sums` `[places, outputs]`. The weight begins at `from` in its storage.
-    fn add_to(self, sums: &mut [f32], bordered: &CpuStorage, (weight, from): (&CpuStorage, usize)) -> Result<()> {
+    fn add_to(self, sums: &mut [f32], bordered: &CpuStorage, weight: &CpuStorage, from: usize) -> Result<()> {
         let outputs = sums.len() / self.places();
         let used = self.out_width() * outputs;
         for block in self.blocks() {
@@ -280,7 +280,7 @@ impl CustomOp3 for Convolution {
         let images = values.chunks_exact(image.inputs());
         for (values, sums) in images.zip(sums.chunks_exact_mut(image.places() * outputs)) {
             image.write(values, 1, &mut bordered);
-            image.add_to(sums, &bordered, (weight, weight_layout.start_offset()))?;
+            image.add_to(sums, &bordered, weight, weight_layout.start_offset())?;
         }
         let shape = (dims.0, image.out_height(), image.out_width(), outputs);
         Ok((CpuStorage::F32(sums), Shape::from(shape)))
@@ -311,7 +311,7 @@ impl CustomOp3 for Convolution {
                     backward.add_weight_gradient(&mut for_weight)?;
                     if let Some(for_x) = &mut for_x {
                         let for_x = &mut for_x[index * image.inputs()..(index + 1) * image.inputs()];
-                        backward.spread.add_to(for_x, &backward.gradient, (&turned, 0))?;
+                        backward.spread.add_to(for_x, &backward.gradient, &turned, 0)?;
                     }
                 }
                 Ok(())

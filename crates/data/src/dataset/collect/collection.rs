@@ -137,7 +137,7 @@ impl<'a> Collection<'a> {
     /// Saves the finished trials of a shard until a later call completes it. Errors: `Io`.
     pub(crate) fn save_unfinished(&self, shard: usize, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
         let first = self.config.shard_trials(shard).start;
-        unfinished::save(self.info(), &self.config.out, (shard, first), episodes)
+        unfinished::save(self.info(), &self.config.out, shard, first, episodes)
     }
 
     /// Writes the next shard.

@@ -21,7 +21,8 @@ fn path(out: &Path, shard: usize) -> PathBuf {
 pub(crate) fn save(
     info: &DatasetInfo,
     out: &Path,
-    (shard, first): (usize, u64),
+    shard: usize,
+    first: u64,
     episodes: &[EncodedEpisode],
 ) -> Result<(), DatasetError> {
     let start = ShardStart {
