@@ -8,7 +8,7 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use foreframe_core::registry::is_valid_name;
+use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
 use foreframe_data::dataset::{DatasetInfo, is_finished};
 
@@ -130,20 +130,19 @@ fn conditioning(info: &DatasetInfo) -> &'static str {
 }
 
 /// The data set's name: the one given, or one made of the source's. Errors: `Usage` if the given name is not valid.
-fn name(args: &ImportArgs) -> Result<String, CliError> {
+fn name(args: &ImportArgs) -> Result<DatasetName, CliError> {
     if let Some(name) = &args.name {
-        return if is_valid_name(name) {
-            Ok(name.clone())
-        } else {
-            Err(CliError::Usage(format!(
+        return name.parse().map_err(|_| {
+            CliError::Usage(format!(
                 "--name is {name:?}; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -"
-            )))
-        };
+            ))
+        });
     }
     let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
     let stem = source.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
     let name: String = stem.chars().map(allowed).take(64).collect();
     let name = name.trim_matches('-');
-    Ok(if name.is_empty() { "recording" } else { name }.to_owned())
+    let name = if name.is_empty() { "recording" } else { name };
+    Ok(name.parse().expect("a data set's name with other characters is a bug"))
 }

@@ -41,7 +41,11 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
     let (name, path) = (args.what.as_str(), Path::new(&args.what));
     let models = workspace.model_names()?;
     let is_model = registry::directory_of(name).is_ok_and(|dir| dir.is_some());
-    if is_model || models.iter().any(|model| name.split('@').next() == Some(model)) {
+    if is_model
+        || models
+            .iter()
+            .any(|model| name.split('@').next() == Some(model.as_str()))
+    {
         let (dir, loaded) = workspace.load_model(name)?;
         return match &args.html {
             Some(_) => Err(CliError::Usage(format!(

@@ -4,7 +4,7 @@ use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on, split_version};
-use foreframe_core::registry::{self, RegistryError};
+use foreframe_core::registry;
 use foreframe_jobs::versions::Versions;
 
 /// List, activate and remove versions of models.
@@ -79,9 +79,8 @@ async fn list(workspace: &Workspace, versions: &Versions) -> Result<(), CliError
             print_line(format!("{label:24} {state:6} {}", dir.display()))?;
         }
     }
-    for path in registry::misnamed(&server.models_dir)? {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        print_line(format!("not used: {}: {}", path.display(), RegistryError::Name(name)))?;
+    for (path, error) in registry::misnamed(&server.models_dir)? {
+        print_line(format!("not used: {}: {error}", path.display()))?;
     }
     Ok(())
 }
@@ -92,20 +91,20 @@ async fn activate(versions: &Versions, model: &str) -> Result<(), CliError> {
             "{model:?} names no version; write NAME@VERSION, as in {model}@1; `foreframe models list` lists them"
         )));
     };
-    versions.choose(name, version).await?;
+    versions.choose(&name, version).await?;
     print_line(format!("{name}@{version} is the active version"))
 }
 
 async fn remove(versions: &Versions, model: &str) -> Result<(), CliError> {
     let (name, version) = split_version(model)?;
-    let removed = versions.remove(name, version).await?;
+    let removed = versions.remove(&name, version).await?;
     for version in &removed {
         print_line(format!("removed {name}@{version}"))?;
     }
     if version.is_some() {
         return Ok(());
     }
-    match versions.active(name).await? {
+    match versions.active(&name).await? {
         Some(shipped) => print_line(format!("{name}@{shipped} is the active version")),
         None => print_line(format!(
             "no version of {name} is left; a running server answers with it until it is restarted"

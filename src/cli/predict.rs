@@ -17,6 +17,7 @@ use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::serving::{self, PredictionInput, Rollout};
+use foreframe_core::types::ModelName;
 use foreframe_train::evaluation::figures::{animation, montage};
 
 /// Predict the frames that follow the images in a directory.
@@ -131,7 +132,7 @@ fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
 
 /// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its
 /// horizon.
-fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, CliError> {
+fn select(args: &PredictArgs, name: &ModelName, spec: &ModelSpec) -> Result<Selected, CliError> {
     let mut images = ImagePaths::list(&args.frames, args.resize)?;
     let count = images.count();
     if count < spec.context {
@@ -160,7 +161,12 @@ fn select(args: &PredictArgs, name: &str, spec: &ModelSpec) -> Result<Selected, 
 }
 
 /// `spec` has the frames to predict as its horizon.
-fn input(args: &PredictArgs, name: &str, spec: &ModelSpec, selected: &Selected) -> Result<PredictionInput, CliError> {
+fn input(
+    args: &PredictArgs,
+    name: &ModelName,
+    spec: &ModelSpec,
+    selected: &Selected,
+) -> Result<PredictionInput, CliError> {
     let mut input = PredictionInput {
         frames: selected.seen.clone(),
         steps: Some(spec.horizon),

@@ -40,12 +40,9 @@ pub(super) fn run(args: &PublishArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(with_checked_directories(loaded)?);
     let model_dir = model_directory(&args.dir)?;
     let name = match &args.name {
-        Some(name) => name.clone(),
+        Some(name) => name.parse().map_err(RegistryError::from)?,
         None => registry::manifest::read(&model_dir)?.name,
     };
-    if !registry::is_valid_name(&name) {
-        return Err(RegistryError::Name(name).into());
-    }
     let version = block_on(async {
         let versions = workspace.versions().await?;
         Ok(versions.publish(&name, &model_dir, !args.no_activate).await?)

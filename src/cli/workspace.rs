@@ -9,6 +9,7 @@ use super::settings::open_store;
 use crate::config::Config;
 use crate::server::ServerConfig;
 use foreframe_core::registry::{self, Model, RegistryError, StoredWeights};
+use foreframe_core::types::{DatasetName, ModelName};
 use foreframe_data::dataset::{self, Dataset};
 use foreframe_jobs::jobs;
 use foreframe_jobs::versions::{VersionError, Versions};
@@ -51,11 +52,11 @@ impl Workspace {
 
     /// The directory of a data set, by its directory or its name; fetched if data sets are shared with other servers.
     pub(super) fn find_dataset(&self, dataset: &Path) -> Result<PathBuf, CliError> {
-        let name = dataset.to_str().filter(|name| registry::is_valid_name(name));
+        let name = dataset.to_str().and_then(|name| name.parse::<DatasetName>().ok());
         if let (Some(name), true) = (name, self.server().objects_url.is_some() && !dataset.exists()) {
             return block_on(async {
                 let store = open_store(&self.config).await?;
-                Ok(jobs::datasets::fetch(store.objects(), name).await?)
+                Ok(jobs::datasets::fetch(store.objects(), &name).await?)
             });
         }
         Ok(dataset::find(&self.datasets_dir(), dataset)?)
@@ -76,32 +77,29 @@ impl Workspace {
             return Ok((dir, loaded));
         }
         let (name, version) = split_version(model)?;
-        if !registry::is_valid_name(name) {
-            return Err(RegistryError::Name(name.to_owned()).into());
-        }
         if !self.server().store().exists() {
-            return self.load_shipped(name, version);
+            return self.load_shipped(&name, version);
         }
         block_on(async {
             let versions = self.versions().await?;
-            let active = versions.active(name).await?;
+            let active = versions.active(&name).await?;
             let Some(version) = version.or(active) else {
                 return Err(self.unknown_model(name, versions.all().await?.into_keys()));
             };
             Ok((
-                versions.directory(name, version).await?,
-                versions.load(name, version).await?,
+                versions.directory(&name, version).await?,
+                versions.load(&name, version).await?,
             ))
         })
     }
 
-    fn load_shipped(&self, name: &str, version: Option<u32>) -> Result<(PathBuf, Model), CliError> {
+    fn load_shipped(&self, name: &ModelName, version: Option<u32>) -> Result<(PathBuf, Model), CliError> {
         let dir = registry::find(&self.server().models_dir, name)?;
         let loaded = registry::load_as(&dir, name)?;
         let found = loaded.manifest.version;
         match version {
             Some(version) if version != found => Err(VersionError::Unknown {
-                model: name.to_owned(),
+                model: name.to_string(),
                 version,
                 available: vec![found],
             }
@@ -110,9 +108,9 @@ impl Workspace {
         }
     }
 
-    fn unknown_model(&self, name: &str, known: impl Iterator<Item = String>) -> CliError {
+    fn unknown_model(&self, name: ModelName, known: impl Iterator<Item = ModelName>) -> CliError {
         RegistryError::Unknown {
-            name: name.to_owned(),
+            name,
             dir: self.server().models_dir.clone(),
             known: known.collect(),
         }
@@ -128,11 +126,11 @@ impl Workspace {
     }
 
     /// The names of all models, shipped and published, sorted.
-    pub(super) fn model_names(&self) -> Result<Vec<String>, CliError> {
+    pub(super) fn model_names(&self) -> Result<Vec<ModelName>, CliError> {
         let shipped = registry::list(&self.server().models_dir)?
             .into_iter()
             .map(|(name, _)| name);
-        let mut names: BTreeSet<String> = shipped.collect();
+        let mut names: BTreeSet<ModelName> = shipped.collect();
         if self.server().store().exists() {
             let published = block_on(async { Ok(self.versions().await?.all().await?) })?;
             names.extend(published.into_keys());
@@ -158,12 +156,13 @@ pub(super) fn trained_on(loaded: &Model) -> Result<PathBuf, CliError> {
 }
 
 /// A model's name and, after an `@`, its version.
-pub(super) fn split_version(model: &str) -> Result<(&str, Option<u32>), CliError> {
+pub(super) fn split_version(model: &str) -> Result<(ModelName, Option<u32>), CliError> {
+    let named = |name: &str| name.parse::<ModelName>().map_err(RegistryError::from);
     let Some((name, version)) = model.split_once('@') else {
-        return Ok((model, None));
+        return Ok((named(model)?, None));
     };
     match version.parse() {
-        Ok(version) => Ok((name, Some(version))),
+        Ok(version) => Ok((named(name)?, Some(version))),
         Err(_) => Err(CliError::Usage(format!(
             "{model:?} is not NAME or NAME@VERSION; a version is a whole number, as in paper@2"
         ))),

@@ -11,6 +11,7 @@ use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{InputError, check_size};
+use foreframe_core::types::ModelName;
 
 /// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
 /// small body can take.
@@ -101,7 +102,7 @@ pub(in crate::server) enum ImageError {
     #[error("{field} holds {found} raw bytes; model \"{model}\" takes {width}×{height} px, {expected} bytes")]
     RawLength {
         field: String,
-        model: String,
+        model: ModelName,
         found: usize,
         expected: usize,
         width: u32,
@@ -143,7 +144,7 @@ pub(in crate::server) fn decode(
         field: field.to_owned(),
         source,
     };
-    let (model, spec) = (manifest.name.as_str(), &manifest.spec);
+    let (model, spec) = (&manifest.name, &manifest.spec);
     if input.format == ImageFormat::Raw {
         return raw(field, bytes, model, spec);
     }
@@ -160,13 +161,13 @@ pub(in crate::server) fn decode(
     resize(&frame, spec.frame_width_px, spec.frame_height_px, way).map_err(decode_error)
 }
 
-fn raw(field: &str, bytes: Vec<u8>, model: &str, spec: &ModelSpec) -> Result<Frame, ImageError> {
+fn raw(field: &str, bytes: Vec<u8>, model: &ModelName, spec: &ModelSpec) -> Result<Frame, ImageError> {
     let (width, height) = (spec.frame_width_px, spec.frame_height_px);
     let expected = width as usize * height as usize;
     if bytes.len() != expected {
         return Err(ImageError::RawLength {
             field: field.to_owned(),
-            model: model.to_owned(),
+            model: model.clone(),
             found: bytes.len(),
             expected,
             width,

@@ -176,7 +176,10 @@ async fn with_versions(dir: &Path, count: u64) {
     let versions = Versions::new(store(dir), &dir.join("none"));
     for _ in 0..count {
         let trained = trained.path().join("mine");
-        versions.publish("mine", &trained, true).await.unwrap();
+        versions
+            .publish(&"mine".parse().unwrap(), &trained, true)
+            .await
+            .unwrap();
     }
 }
 

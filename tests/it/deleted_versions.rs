@@ -16,7 +16,7 @@ async fn a_start_finishes_interrupted_deletions() {
     let versions = Versions::new(store.clone(), &none);
     for _ in 0..3 {
         versions
-            .publish("mine", &trained.path().join("mine"), true)
+            .publish(&"mine".parse().unwrap(), &trained.path().join("mine"), true)
             .await
             .unwrap();
     }
@@ -25,7 +25,7 @@ async fn a_start_finishes_interrupted_deletions() {
     for version in [1, 2] {
         assert!(
             store
-                .delete_version("mine", version, unix_s(), &Author::CommandLine)
+                .delete_version(&"mine".parse().unwrap(), version, unix_s(), &Author::CommandLine)
                 .await
                 .unwrap()
         );

@@ -51,7 +51,7 @@ pub(crate) fn moving_squares(episodes: usize, side: u32, period_s: f64) -> Datas
 /// A small dense network for the moving squares.
 pub(crate) fn squares_spec(side: u32) -> ModelSpec {
     let channel = |name: &str, unit: &str| ChannelScale {
-        name: name.to_owned(),
+        name: name.parse().unwrap(),
         unit: unit.to_owned(),
         mean: 1.0,
         std: 0.8,
@@ -86,7 +86,7 @@ pub(crate) fn stamp(dataset: &Dataset) -> DatasetStamp {
 pub(crate) fn model(model_dir: &Path, name: &str, spec: ModelSpec, trained_on: DatasetStamp) -> Model {
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
     let manifest = Manifest {
-        name: name.to_owned(),
+        name: name.parse().unwrap(),
         version: 1,
         weights_sha256: String::new(),
         dataset: trained_on,

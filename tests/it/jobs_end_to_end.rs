@@ -190,7 +190,7 @@ async fn model_versions_are_activated_refused_and_deleted() {
     assert!(and_gone.is_none());
     wait_for_version(&app, "plain", 1).await;
     poll_until(async || {
-        (store(dir.path()).active_versions().await.unwrap() == [("plain".to_owned(), 1)]).then_some(())
+        (store(dir.path()).active_versions().await.unwrap() == [("plain".parse().unwrap(), 1)]).then_some(())
     })
     .await;
     post(&app, "/v1/models/plain/versions/2/activate", &Value::Null)
@@ -246,12 +246,22 @@ async fn model_versions_are_activated_refused_and_deleted() {
     );
     // A version that another server activates is loaded. If it is invalid, the previous one is served, also after a restart.
     store(dir.path())
-        .set_active("plain", 1, 0.0, &foreframe_jobs::store::Author::CommandLine)
+        .set_active(
+            &"plain".parse().unwrap(),
+            1,
+            0.0,
+            &foreframe_jobs::store::Author::CommandLine,
+        )
         .await
         .unwrap();
     wait_for_version(&next, "plain", 1).await;
     store(dir.path())
-        .set_active("plain", 3, 0.0, &foreframe_jobs::store::Author::CommandLine)
+        .set_active(
+            &"plain".parse().unwrap(),
+            3,
+            0.0,
+            &foreframe_jobs::store::Author::CommandLine,
+        )
         .await
         .unwrap();
     let third = App::open(config).await.unwrap();

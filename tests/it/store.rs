@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use crate::skip::skip_without;
+use foreframe_core::types::ModelName;
 use foreframe_jobs::store::{
     Author, EnqueueResult, JobId, JobOutcome, JobPage, JobReport, JobRow, KeyRow, KeyScope, Lease, LossRow, NewJob,
     PublishedVersion, Store, StoreConfig,
@@ -169,7 +170,7 @@ async fn an_expired_lease_cannot_write() {
                 .await
                 .unwrap()
         );
-        assert_eq!(store.reserve_version(stale, "m", 0).await.unwrap(), None);
+        assert_eq!(store.reserve_version(stale, &model(), 0).await.unwrap(), None);
         assert_eq!(store.job_log(JobId::new(1), 0, 10).await.unwrap(), []);
         assert_eq!(
             store.renew_at(fresh, 40.0, JobReport::default()).await.unwrap(),
@@ -308,25 +309,29 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
     }
 }
 
+fn model() -> ModelName {
+    "m".parse().unwrap()
+}
+
 /// Claims a new job and reserves a version of the model for it.
-async fn reserve(store: &Store, model: &str) -> (Lease, u32) {
+async fn reserve(store: &Store) -> (Lease, u32) {
     enqueued(store).await;
     let (_, lease) = store.claim_at("me", 0.0, 10.0).await.unwrap().unwrap();
-    (lease, store.reserve_version(lease, model, 4).await.unwrap().unwrap())
+    (lease, store.reserve_version(lease, &model(), 4).await.unwrap().unwrap())
 }
 
 #[tokio::test]
 async fn versions_are_numbered_after_the_shipped_one() {
     for (_dir, store) in stores("versions").await {
-        let (lease, version) = reserve(&store, "m").await;
+        let (lease, version) = reserve(&store).await;
         assert_eq!(
-            (version, store.reserve_version(lease, "m", 4).await.unwrap()),
+            (version, store.reserve_version(lease, &model(), 4).await.unwrap()),
             (5, Some(5))
         );
         assert_eq!(store.published_versions().await.unwrap(), []);
         let published = |version, activates| JobOutcome {
             published: Some(PublishedVersion {
-                model: "m".to_owned(),
+                model: model(),
                 version,
                 activates,
             }),
@@ -338,7 +343,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
                 .await
                 .unwrap()
         );
-        let (lease, version) = reserve(&store, "m").await;
+        let (lease, version) = reserve(&store).await;
         assert_eq!(version, 6);
         assert!(
             store
@@ -355,10 +360,15 @@ async fn versions_are_numbered_after_the_shipped_one() {
             ["m@6", "m@5"]
         );
         // The first version stays active until another is activated.
-        assert_eq!(store.active_versions().await.unwrap(), [("m".to_owned(), 5)]);
-        assert!(!store.delete_version("m", 5, 1.0, &Author::CommandLine).await.unwrap());
+        assert_eq!(store.active_versions().await.unwrap(), [(model(), 5)]);
+        assert!(
+            !store
+                .delete_version(&model(), 5, 1.0, &Author::CommandLine)
+                .await
+                .unwrap()
+        );
         for _ in 0..2 {
-            store.set_active("m", 4, 1.0, &Author::CommandLine).await.unwrap();
+            store.set_active(&model(), 4, 1.0, &Author::CommandLine).await.unwrap();
         }
         let entries = store.audit(None, 10).await.unwrap();
         assert_eq!(
@@ -369,10 +379,16 @@ async fn versions_are_numbered_after_the_shipped_one() {
             1
         );
         assert!(
-            store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()
-                && !store.delete_version("m", 6, 1.0, &Author::CommandLine).await.unwrap()
+            store
+                .delete_version(&model(), 6, 1.0, &Author::CommandLine)
+                .await
+                .unwrap()
+                && !store
+                    .delete_version(&model(), 6, 1.0, &Author::CommandLine)
+                    .await
+                    .unwrap()
         );
-        assert_eq!(reserve(&store, "m").await.1, 7);
+        assert_eq!(reserve(&store).await.1, 7);
     }
 }
 
@@ -547,8 +563,14 @@ async fn the_audit_trail_is_kept_in_order() {
     for (_dir, store) in stores("audit").await {
         store.create_key("k", "robot", "hash", 1.0).await.unwrap();
         let (robot, nobody) = (Author::of_key("k"), Author::of_key(""));
-        store.record_dataset_deletion("one", &robot).await.unwrap();
-        store.record_dataset_deletion("two", &nobody).await.unwrap();
+        store
+            .record_dataset_deletion(&"one".parse().unwrap(), &robot)
+            .await
+            .unwrap();
+        store
+            .record_dataset_deletion(&"two".parse().unwrap(), &nobody)
+            .await
+            .unwrap();
         let rows = store.audit(None, 10).await.unwrap();
         let seen: Vec<_> = rows
             .iter()

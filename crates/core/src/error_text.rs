@@ -105,7 +105,7 @@ pub fn comma_separated<T: Display>(items: &[T]) -> String {
 
 /// `are: a, b` or `are none`. Messages about an unknown name write it after "there".
 #[must_use]
-pub fn existing(names: &[String]) -> String {
+pub fn existing(names: &[impl Display]) -> String {
     if names.is_empty() {
         "are none".to_owned()
     } else {

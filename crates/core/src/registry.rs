@@ -14,32 +14,33 @@ use std::path::{Path, PathBuf};
 pub use self::calibration::Calibration;
 pub use self::embedded::{EmbeddedModel, embed};
 pub use self::error::RegistryError;
-pub use self::layout::{MANIFEST_FILE, WEIGHTS_FILE, is_valid_name};
+pub use self::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 pub use self::loader::{Model, StoredWeights, load, load_as, load_weights};
 pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
+use crate::types::ModelName;
 
 /// Names and directories of the models in a directory, sorted by name. A missing directory contains none; if it is the
 /// default one, the embedded model stands in for it. Errors: `Io` if the directory cannot be listed.
-pub fn list(models_dir: &Path) -> Result<Vec<(String, PathBuf)>, RegistryError> {
+pub fn list(models_dir: &Path) -> Result<Vec<(ModelName, PathBuf)>, RegistryError> {
     let named = directories(models_dir)?
         .into_iter()
-        .map(|path| (directory_name(&path), path));
-    let mut models: Vec<_> = named
-        .filter(|(name, path)| is_valid_name(name) && path.join(MANIFEST_FILE).is_file())
-        .collect();
+        .filter_map(|path| Some((directory_name(&path).ok()?, path)));
+    let mut models: Vec<_> = named.filter(|(_, path)| path.join(MANIFEST_FILE).is_file()).collect();
     models.extend(embedded::in_place_of(models_dir));
     models.sort();
     Ok(models)
 }
 
-/// The directories that hold a model but have no valid name, sorted: [`list`] leaves them out. Errors: `Io`.
-pub fn misnamed(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
+/// The directories that hold a model but have no valid name, sorted, each with its error: [`list`] leaves them out.
+/// Errors: `Io`.
+pub fn misnamed(models_dir: &Path) -> Result<Vec<(PathBuf, RegistryError)>, RegistryError> {
     let mut paths = directories(models_dir)?;
-    paths.retain(|path| !is_valid_name(&directory_name(path)) && path.join(MANIFEST_FILE).is_file());
+    paths.retain(|path| path.join(MANIFEST_FILE).is_file());
     paths.sort();
-    Ok(paths)
+    let misnamed = |path: PathBuf| directory_name(&path).err().map(|error| (path, error));
+    Ok(paths.into_iter().filter_map(misnamed).collect())
 }
 
 /// Everything in a directory; an absent one holds nothing. Errors: `Io`.
@@ -58,15 +59,14 @@ fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
     })
 }
 
-fn directory_name(path: &Path) -> String {
-    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+/// The name of the model in this directory. Errors: `Name`.
+fn directory_name(path: &Path) -> Result<ModelName, RegistryError> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    Ok(name.parse()?)
 }
 
-/// The directory of the model with this name. Errors: `Name`, `Unknown` with the existing names.
-pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
-    if !is_valid_name(name) {
-        return Err(RegistryError::Name(name.to_owned()));
-    }
+/// The directory of the model with this name. Errors: `Unknown` with the existing names.
+pub fn find(models_dir: &Path, name: &ModelName) -> Result<PathBuf, RegistryError> {
     let path = models_dir.join(name);
     if path.join(MANIFEST_FILE).is_file() {
         return Ok(path);
@@ -76,7 +76,7 @@ pub fn find(models_dir: &Path, name: &str) -> Result<PathBuf, RegistryError> {
     }
     let known = list(models_dir)?.into_iter().map(|(name, _)| name).collect();
     Err(RegistryError::Unknown {
-        name: name.to_owned(),
+        name: name.clone(),
         dir: models_dir.to_owned(),
         known,
     })
@@ -89,7 +89,7 @@ pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
     if path.join(MANIFEST_FILE).is_file() {
         return Ok(Some(path.to_owned()));
     }
-    if !is_valid_name(model) && (model.contains('/') || path.exists()) {
+    if model.parse::<ModelName>().is_err() && (model.contains('/') || path.exists()) {
         return Err(RegistryError::NotAModel(path.to_owned()));
     }
     Ok(None)
@@ -185,14 +185,6 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_leaves_the_directory_is_refused() {
-        for name in ["../paper", "", "-x", "Paper", "a/b", "a b", "ä"] {
-            assert!(!is_valid_name(name), "{name:?} was accepted");
-        }
-        assert!(is_valid_name("moving-2"));
-    }
-
-    #[test]
     fn a_directory_with_an_invalid_name_is_reported() {
         let dir = tempfile::tempdir().unwrap();
         for name in ["my_model", "paper"] {
@@ -200,7 +192,8 @@ mod tests {
             std::fs::write(dir.path().join(name).join(MANIFEST_FILE), "{}").unwrap();
         }
         std::fs::create_dir(dir.path().join("Pictures")).unwrap();
-        assert_eq!(misnamed(dir.path()).unwrap(), [dir.path().join("my_model")]);
+        let misnamed = misnamed(dir.path()).unwrap();
+        assert_eq!((misnamed.len(), &misnamed[0].0), (1, &dir.path().join("my_model")));
         assert_eq!(list(dir.path()).unwrap().len(), 1);
     }
 
@@ -209,7 +202,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("paper")).unwrap();
         std::fs::write(dir.path().join("paper").join(MANIFEST_FILE), "{}").unwrap();
-        let error = find(dir.path(), "papper").unwrap_err().to_string();
+        let error = find(dir.path(), &"papper".parse().unwrap()).unwrap_err().to_string();
         assert!(
             error.contains("no model \"papper\"") && error.ends_with("there are: paper"),
             "{error}"

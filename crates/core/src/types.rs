@@ -1,10 +1,14 @@
-//! Values that every module uses: seeds, actions, states and channels. They are validated once, when they are made.
+//! Values that every module uses: seeds, names, actions, states and channels. They are validated once, when they are made.
+
+mod names;
 
 use std::fmt;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+
+pub use self::names::{DatasetName, ModelName, NameError};
 
 /// Why a value was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]

@@ -24,6 +24,7 @@ pub mod state;
 use crate::store::{JobId, JobIdError, StoreError, unix_s};
 use crate::versions::VersionError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::DatasetError;
 
 pub use executor::{JobExecutor, JobFailure, JobResult};
@@ -89,12 +90,10 @@ pub enum JobError {
         available: Vec<String>,
     },
     /// The job's output exists already, or another job is making it.
-    #[error("name: {kind} \"{name}\" {why}; choose another name")]
+    #[error("name: data set \"{name}\" {why}; choose another name")]
     Taken {
-        /// `data set`, …
-        kind: &'static str,
         /// The requested name.
-        name: String,
+        name: DatasetName,
         /// Why it is not free.
         why: &'static str,
     },
@@ -102,17 +101,15 @@ pub enum JobError {
     #[error("name: data set \"{name}\" {why}, or choose another name")]
     Occupied {
         /// The requested name.
-        name: String,
+        name: DatasetName,
         /// What is in the directory, and how to free it.
         why: String,
     },
     /// A queued or running job needs it.
-    #[error("{kind} \"{name}\" is in use by {job}; wait until that job has ended, or cancel it")]
+    #[error("data set \"{name}\" is in use by {job}; wait until that job has ended, or cancel it")]
     InUse {
-        /// `data set`, …
-        kind: &'static str,
         /// Its name.
-        name: String,
+        name: DatasetName,
         /// The job's id.
         job: JobId,
     },

@@ -11,13 +11,14 @@ use metrics::counter;
 use tokio::sync::Mutex;
 use tracing::{info, warn};
 
-use crate::store::{Author, Lease, Store, StoreError, unix_s};
+use crate::store::{Author, Lease, PublishedVersion, Store, StoreError, unix_s};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
 use foreframe_core::files::{is_transient, write_atomically};
 use foreframe_core::metric_names;
 use foreframe_core::registry::{self, Manifest, Model, RegistryError};
 use foreframe_core::serving::{Predictor, ServingError};
+use foreframe_core::types::ModelName;
 
 /// Why a version could not be loaded, published, activated or deleted.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +40,7 @@ pub enum VersionError {
     #[error("version {version} of model \"{model}\" is active; activate another before deleting it")]
     Active {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The version.
         version: u32,
     },
@@ -49,7 +50,7 @@ pub enum VersionError {
     )]
     Shipped {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The version.
         version: u32,
     },
@@ -57,7 +58,7 @@ pub enum VersionError {
     #[error("version {version} of model \"{model}\" is refused: {reason}")]
     Refused {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The version.
         version: u32,
         /// What is wrong with it.
@@ -132,26 +133,26 @@ impl Versions {
 
     /// The shipped version of a model, if there is one.
     #[must_use]
-    pub fn shipped(&self, model: &str) -> Option<u32> {
+    pub fn shipped(&self, model: &ModelName) -> Option<u32> {
         let dir = registry::find(&self.shipped_dir, model).ok()?;
         registry::manifest::read(&dir).ok().map(|manifest| manifest.version)
     }
 
     /// All versions by model, in rising order. Errors: `Registry`, `Store`.
-    pub async fn all(&self) -> Result<BTreeMap<String, Vec<u32>>, VersionError> {
-        let mut all = BTreeMap::<String, BTreeSet<u32>>::new();
+    pub async fn all(&self) -> Result<BTreeMap<ModelName, Vec<u32>>, VersionError> {
+        let mut all = BTreeMap::<ModelName, BTreeSet<u32>>::new();
         for (model, _) in registry::list(&self.shipped_dir)? {
             all.entry(model.clone()).or_default().extend(self.shipped(&model));
         }
         for row in self.store.published_versions().await? {
             all.entry(row.model).or_default().insert(row.version);
         }
-        let sorted = |(model, versions): (String, BTreeSet<u32>)| (model, versions.into_iter().collect());
+        let sorted = |(model, versions): (ModelName, BTreeSet<u32>)| (model, versions.into_iter().collect());
         Ok(all.into_iter().map(sorted).collect())
     }
 
     /// The versions of a model, in rising order. Errors: `Registry`, `Store`.
-    pub async fn of(&self, model: &str) -> Result<Vec<u32>, VersionError> {
+    pub async fn of(&self, model: &ModelName) -> Result<Vec<u32>, VersionError> {
         Ok(self.all().await?.remove(model).unwrap_or_default())
     }
 
@@ -159,7 +160,7 @@ impl Versions {
     /// Errors: `Store`.
     pub async fn metrics(&self, manifest: &Manifest) -> Result<serde_json::Value, VersionError> {
         let measured = self.store.model_metrics().await?.into_iter().find(|measured| {
-            (measured.model.as_str(), measured.version) == (manifest.name.as_str(), manifest.version)
+            (&measured.model, measured.version) == (&manifest.name, manifest.version)
                 && measured.weights_sha256 == manifest.weights_sha256
         });
         let parsed = measured.and_then(|measured| serde_json::from_str(&measured.metrics).ok());
@@ -168,13 +169,13 @@ impl Versions {
 
     /// Deletes what is left of versions whose deletion was interrupted, for example by `kill -9`. Failures are logged.
     async fn sweep(&self) -> Result<(), StoreError> {
-        let mut deleted = BTreeMap::<String, Vec<String>>::new();
+        let mut deleted = BTreeMap::<ModelName, Vec<String>>::new();
         for (model, version) in self.store.deleted_versions().await? {
             deleted.entry(model).or_default().push(version.to_string());
         }
         for (model, versions) in deleted {
             if let Err(error) = self.store.objects().sweep(&format!("models/{model}"), &versions).await {
-                warn!(model, %error, "could not delete what is left of deleted versions");
+                warn!(%model, %error, "could not delete what is left of deleted versions");
             }
         }
         Ok(())
@@ -184,15 +185,14 @@ impl Versions {
     /// that cannot be loaded are logged. Errors: `Registry`, `Store`.
     pub async fn load_serving(&self) -> Result<Vec<Model>, VersionError> {
         self.sweep().await?;
-        let active: BTreeMap<String, u32> = self.store.active_versions().await?.into_iter().collect();
-        for path in registry::misnamed(&self.shipped_dir)? {
-            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            warn!(directory = %path.display(), error = %RegistryError::Name(name), "a model is not loaded");
+        let active: BTreeMap<ModelName, u32> = self.store.active_versions().await?.into_iter().collect();
+        for (path, error) in registry::misnamed(&self.shipped_dir)? {
+            warn!(directory = %path.display(), %error, "a model is not loaded");
         }
         let mut serving = Vec::new();
         for (model, mut versions) in self.all().await? {
             if versions.is_empty() {
-                warn!(model, "the model's manifest cannot be read");
+                warn!(%model, "the model's manifest cannot be read");
             }
             // The active one, then the shipped one, then the newest.
             versions.reverse();
@@ -204,7 +204,7 @@ impl Versions {
                         serving.push(loaded);
                         break;
                     }
-                    Err(error) => warn!(model, version, %error, "a version was not loaded"),
+                    Err(error) => warn!(%model, version, %error, "a version was not loaded"),
                 }
             }
         }
@@ -212,21 +212,21 @@ impl Versions {
     }
 
     /// Loads the active version, else the shipped one, else the newest. Errors: `Unknown`, `Refused`, `Store`.
-    pub async fn load_active(&self, model: &str) -> Result<Model, VersionError> {
+    pub async fn load_active(&self, model: &ModelName) -> Result<Model, VersionError> {
         let version = self.active(model).await?.unwrap_or_default();
         self.load(model, version).await
     }
 
     /// Loads a version after checking its hash and shapes. Fetches it into the data directory if necessary.
     /// Errors: `Unknown`, `Refused`, `Store`.
-    pub async fn load(&self, model: &str, version: u32) -> Result<Model, VersionError> {
+    pub async fn load(&self, model: &ModelName, version: u32) -> Result<Model, VersionError> {
         let dir = self.directory(model, version).await?;
         let refused = |reason: String| VersionError::Refused {
-            model: model.to_owned(),
+            model: model.clone(),
             version,
             reason,
         };
-        let name = model.to_owned();
+        let name = model.clone();
         let is_shipped = self.shipped(model) == Some(version);
         // The name of a shipped model is that of its directory.
         let load = move || {
@@ -243,18 +243,18 @@ impl Versions {
         let Manifest {
             name, version: found, ..
         } = &*loaded.manifest;
-        if (name.as_str(), *found) != (model, version) {
+        if (name, *found) != (model, version) {
             return Err(refused(format!("its manifest is of version {found} of \"{name}\"")));
         }
         Ok(loaded)
     }
 
     /// The directory of a version, fetched into the data directory if it is not there. Errors: `Unknown`, `Store`.
-    pub async fn directory(&self, model: &str, version: u32) -> Result<PathBuf, VersionError> {
+    pub async fn directory(&self, model: &ModelName, version: u32) -> Result<PathBuf, VersionError> {
         let available = self.of(model).await?;
         if !available.contains(&version) {
             return Err(VersionError::Unknown {
-                model: model.to_owned(),
+                model: model.to_string(),
                 version,
                 available,
             });
@@ -270,24 +270,28 @@ impl Versions {
         Ok(dir)
     }
 
-    /// Writes a trained model as its job's version. Returns the version and whether the model was not shipped. The version is
+    /// Writes a trained model as its job's version, which becomes active if the model was not shipped and no version is. It is
     /// published when the job's outcome is written. `None` if the lease is lost. Errors: `Registry`, `Io`, `Store`.
     pub async fn write(
         &self,
         lease: Lease,
-        model: &str,
+        model: &ModelName,
         trained_dir: &Path,
-    ) -> Result<Option<(u32, bool)>, VersionError> {
+    ) -> Result<Option<PublishedVersion>, VersionError> {
         let shipped = self.shipped(model);
         let reserved = self.store.reserve_version(lease, model, shipped.unwrap_or(0)).await?;
         let Some(version) = reserved else { return Ok(None) };
         self.write_files(model, version, trained_dir).await?;
-        Ok(Some((version, shipped.is_none())))
+        Ok(Some(PublishedVersion {
+            model: model.clone(),
+            version,
+            activates: shipped.is_none(),
+        }))
     }
 
     /// The version that serves, or else the one that would: the chosen one, the shipped one, the newest.
     /// Errors: `Registry`, `Store`.
-    pub async fn active(&self, model: &str) -> Result<Option<u32>, VersionError> {
+    pub async fn active(&self, model: &ModelName) -> Result<Option<u32>, VersionError> {
         let active = self.store.active_versions().await?;
         let chosen = active.into_iter().find(|(name, _)| name == model);
         match chosen.map(|(_, version)| version).or_else(|| self.shipped(model)) {
@@ -297,7 +301,7 @@ impl Versions {
     }
 
     /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Io`, `Store`.
-    async fn write_files(&self, model: &str, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
+    async fn write_files(&self, model: &ModelName, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
         let objects = self.store.objects();
         let dir = objects.data_dir().join(key(model, version));
         let failed = |action, path: &Path| {
@@ -312,7 +316,7 @@ impl Versions {
         let weights = std::fs::read(&from).map_err(failed("read", &from))?;
         write_atomically(&to, &weights).map_err(failed("write", &to))?;
         let manifest = Manifest {
-            name: model.to_owned(),
+            name: model.clone(),
             version,
             ..registry::manifest::read(trained_dir)?
         };
@@ -326,12 +330,12 @@ impl Versions {
     pub async fn activate(
         &self,
         predictor: &Predictor,
-        model: &str,
+        model: &ModelName,
         version: u32,
         by: &Author,
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
-        let before = predictor.model(model).map(|manifest| manifest.version);
+        let before = predictor.model(model.as_str()).map(|manifest| manifest.version);
         count_load(self.load_model(predictor, model, version).await)?;
         if let Err(error) = self.store.set_active(model, version, unix_s(), by).await {
             if let Ok(before) = before {
@@ -339,7 +343,7 @@ impl Versions {
             }
             return Err(error.into());
         }
-        info!(model, version, "version activated");
+        info!(%model, version, "version activated");
         Ok(())
     }
 
@@ -347,16 +351,18 @@ impl Versions {
     pub async fn delete(
         &self,
         predictor: &Predictor,
-        model: &str,
+        model: &ModelName,
         version: u32,
         by: &Author,
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
-        let (model_name, available) = (model.to_owned(), self.of(model).await?);
-        let serves = predictor.model(model).is_ok_and(|manifest| manifest.version == version);
+        let (model_name, available) = (model.clone(), self.of(model).await?);
+        let serves = predictor
+            .model(model.as_str())
+            .is_ok_and(|manifest| manifest.version == version);
         if !available.contains(&version) {
             return Err(VersionError::Unknown {
-                model: model_name,
+                model: model.to_string(),
                 version,
                 available,
             });
@@ -382,20 +388,20 @@ impl Versions {
     pub async fn load_activated(
         &self,
         predictor: &Predictor,
-        refused: &mut BTreeSet<(String, u32)>,
+        refused: &mut BTreeSet<(ModelName, u32)>,
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         for (model, version) in self.store.active_versions().await? {
             let serves = predictor
-                .model(&model)
+                .model(model.as_str())
                 .is_ok_and(|manifest| manifest.version == version);
             if serves || refused.contains(&(model.clone(), version)) {
                 continue;
             }
             match count_load(self.load_model(predictor, &model, version).await) {
-                Ok(()) => info!(model, version, "version loaded"),
+                Ok(()) => info!(%model, version, "version loaded"),
                 Err(error) => {
-                    warn!(model, version, %error, "a version was not loaded");
+                    warn!(%model, version, %error, "a version was not loaded");
                     if let VersionError::Refused { .. } = error {
                         refused.insert((model, version));
                     }
@@ -406,7 +412,7 @@ impl Versions {
     }
 
     /// Loads a version into the predictor.
-    async fn load_model(&self, predictor: &Predictor, model: &str, version: u32) -> Result<(), VersionError> {
+    async fn load_model(&self, predictor: &Predictor, model: &ModelName, version: u32) -> Result<(), VersionError> {
         let loaded = self.load(model, version).await?;
         let predictor = predictor.clone();
         let result = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
@@ -414,7 +420,7 @@ impl Versions {
             Ok(()) => Ok(()),
             Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
             Err(error) => Err(VersionError::Refused {
-                model: model.to_owned(),
+                model: model.clone(),
                 version,
                 reason: error_text::with_causes(&error),
             }),
@@ -422,7 +428,7 @@ impl Versions {
     }
 }
 
-fn key(model: &str, version: u32) -> String {
+fn key(model: &ModelName, version: u32) -> String {
     format!("models/{model}/{version}")
 }
 

@@ -11,6 +11,7 @@ use foreframe_core::files::natural_order;
 use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::nn::ModelSpec;
+use foreframe_core::types::ModelName;
 
 /// The endings of the files that are read.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
@@ -50,12 +51,17 @@ impl ImagePaths {
 
     /// Reads some of the images as frames of the model's size. Errors: `Usage` for an image of another size that is not to
     /// be resized.
-    pub(super) fn read(&mut self, range: Range<usize>, model: &str, spec: &ModelSpec) -> Result<Vec<Frame>, CliError> {
+    pub(super) fn read(
+        &mut self,
+        range: Range<usize>,
+        model: &ModelName,
+        spec: &ModelSpec,
+    ) -> Result<Vec<Frame>, CliError> {
         let paths: Vec<PathBuf> = self.paths.get(range).unwrap_or_default().to_vec();
         paths.iter().map(|path| self.read_one(path, model, spec)).collect()
     }
 
-    fn read_one(&mut self, path: &Path, model: &str, spec: &ModelSpec) -> Result<Frame, CliError> {
+    fn read_one(&mut self, path: &Path, model: &ModelName, spec: &ModelSpec) -> Result<Frame, CliError> {
         let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
         let unreadable = |error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error)));
         let frame = codec::decode(&bytes).map_err(unreadable)?;

@@ -1,5 +1,6 @@
 //! Extractors: the parts of a request as typed values. Errors are problem details.
 
+use std::error::Error as _;
 use std::marker::PhantomData;
 
 use axum::extract::path::ErrorKind;
@@ -121,7 +122,10 @@ impl From<JsonRejection> for ApiError {
             JsonRejection::MissingJsonContentType(_) => Self::UnsupportedMedia(
                 "the body must be JSON, and the header Content-Type must say application/json".to_owned(),
             ),
-            JsonRejection::JsonDataError(error) => Self::Unprocessable(error.body_text()),
+            // Without axum's words before it: what is wrong, with its field.
+            JsonRejection::JsonDataError(error) => {
+                Self::Unprocessable(error.source().map_or_else(|| error.body_text(), ToString::to_string))
+            }
             JsonRejection::BytesRejection(error) => error.into(),
             other => Self::Malformed(other.body_text()),
         }

@@ -15,7 +15,7 @@ use crate::server::http::page::Page;
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use foreframe_core::frame::{Frame, FrameError, codec};
-use foreframe_core::types::Channel;
+use foreframe_core::types::{Channel, DatasetName};
 use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo};
 use foreframe_jobs::jobs::{JobError, datasets};
 use foreframe_jobs::store::Author;
@@ -106,7 +106,7 @@ impl DatasetDescription {
 async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
     let _turn = app.render_cache().turn().await;
     let names = datasets::names(app.store().objects()).await?;
-    let (names, next) = page.of(names, |name| name)?;
+    let (names, next) = page.of(names, DatasetName::as_str)?;
     let mut datasets = Vec::new();
     for name in names {
         // A damaged data set, or one that is being deleted, must not hide the others.
@@ -122,6 +122,7 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
     responses((status = 200, body = DatasetDescription), (status = 404, description = "No such data set", body = Problem))
 )]
 async fn get(State(app): State<App>, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
+    let name = dataset_name(&app, &name).await?;
     describe(&app, &name).await.map(axum::Json)
 }
 
@@ -140,15 +141,10 @@ async fn delete(
     Extension(author): Extension<Author>,
     Path(name): Path<String>,
 ) -> Result<StatusCode, ApiError> {
+    let name = dataset_name(&app, &name).await?;
     let open = app.jobs().open().await?;
-    if let Some(job) = open.into_iter().find(|job| job.spec.dataset() == name) {
-        let kind = "data set";
-        return Err(JobError::InUse {
-            kind,
-            name,
-            job: job.id,
-        }
-        .into());
+    if let Some(job) = open.into_iter().find(|job| *job.spec.dataset() == name) {
+        return Err(JobError::InUse { name, job: job.id }.into());
     }
     datasets::delete(app.store(), &name, &author).await.map_err(absent)?;
     Ok(StatusCode::NO_CONTENT)
@@ -170,6 +166,7 @@ async fn sheet(
     State(app): State<App>,
     Path((name, episode)): Path<(String, usize)>,
 ) -> Result<impl IntoResponse, ApiError> {
+    let name = dataset_name(&app, &name).await?;
     let title = format!("{name}, episode {episode}");
     let draw = move |frames, _| contact_sheet(&title, frames);
     let png = picture(&app, &name, episode, "png", draw).await?;
@@ -192,6 +189,7 @@ async fn animation(
     State(app): State<App>,
     Path((name, episode)): Path<(String, usize)>,
 ) -> Result<impl IntoResponse, ApiError> {
+    let name = dataset_name(&app, &name).await?;
     let gif = picture(&app, &name, episode, "gif", |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
         enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
@@ -199,16 +197,21 @@ async fn animation(
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
 }
 
-async fn describe(app: &App, name: &str) -> Result<DatasetDescription, ApiError> {
+/// The name in the path. Errors: 404 if it is no valid name.
+async fn dataset_name(app: &App, text: &str) -> Result<DatasetName, ApiError> {
+    datasets::named(app.store().objects(), text).await.map_err(absent)
+}
+
+async fn describe(app: &App, name: &DatasetName) -> Result<DatasetDescription, ApiError> {
     let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
-    Ok(DatasetDescription::new(name.to_owned(), info))
+    Ok(DatasetDescription::new(name.to_string(), info))
 }
 
 /// A picture of an episode's frames, given them and the seconds from one to the next. It is kept as long as the data set
 /// has the same content.
 async fn picture(
     app: &App,
-    name: &str,
+    name: &DatasetName,
     episode: usize,
     kind: &str,
     draw: impl FnOnce(Vec<Frame>, f64) -> Result<Vec<u8>, FrameError> + Send + 'static,

@@ -13,6 +13,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
+use foreframe_core::types::{ModelName, NameError};
 use foreframe_jobs::store::Author;
 use foreframe_jobs::versions::VersionError;
 
@@ -88,7 +89,7 @@ impl ModelDescription {
             versions.insert(place, manifest.version);
         }
         Self {
-            name: manifest.name.clone(),
+            name: manifest.name.to_string(),
             versions,
             active_version: manifest.version,
             spec: manifest.spec.clone(),
@@ -115,7 +116,7 @@ impl ModelDescription {
     responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range", body = Problem))
 )]
 async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
-    let (manifests, next) = page.of(app.predictor().models(), |manifest| &manifest.name)?;
+    let (manifests, next) = page.of(app.predictor().models(), |manifest| manifest.name.as_str())?;
     let mut versions = app.versions().all().await?;
     let mut models = Vec::with_capacity(manifests.len());
     for manifest in &manifests {
@@ -138,7 +139,7 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
 )]
 async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
     let manifest = app.predictor().model(&model)?;
-    let versions = app.versions().of(&model).await?;
+    let versions = app.versions().of(&manifest.name).await?;
     let metrics = app.versions().metrics(&manifest).await?;
     Ok(axum::Json(ModelDescription::new(&manifest, versions, metrics)))
 }
@@ -162,7 +163,8 @@ async fn activate(
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
     let versions = app.versions();
-    versions.activate(app.predictor(), &model, version, &author).await?;
+    let name = model_name(&model, version)?;
+    versions.activate(app.predictor(), &name, version, &author).await?;
     get(State(app), Path(model)).await
 }
 
@@ -185,8 +187,18 @@ async fn delete(
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<StatusCode, ApiError> {
     let versions = app.versions();
-    versions.delete(app.predictor(), &model, version, &author).await?;
+    let name = model_name(&model, version)?;
+    versions.delete(app.predictor(), &name, version, &author).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// The name in the path of a version. Errors: `Unknown` if it is no valid name.
+fn model_name(text: &str, version: u32) -> Result<ModelName, VersionError> {
+    text.parse().map_err(|NameError(model)| VersionError::Unknown {
+        model,
+        version,
+        available: Vec::new(),
+    })
 }
 
 impl From<VersionError> for ApiError {

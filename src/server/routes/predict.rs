@@ -228,7 +228,7 @@ impl Units {
                 return Err(PredictError::Units {
                     field,
                     found: found.join(", "),
-                    model: manifest.name.clone(),
+                    model: manifest.name.to_string(),
                     expected: expected.join(", "),
                 });
             }
@@ -352,7 +352,7 @@ fn answer(
         ResponseFormat::Json => {
             let format = format.answer();
             Ok(axum::Json(PredictResponse {
-                model: manifest.name.clone(),
+                model: manifest.name.to_string(),
                 version: manifest.version,
                 expected_mse: rollout.expected_mse(),
                 mse_band_90: rollout.mse_bands(),

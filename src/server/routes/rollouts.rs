@@ -263,7 +263,7 @@ fn answer(
             let is_calibrated = rollouts.iter().any(|rollout| !rollout.errors.is_empty());
             let calibrated = || rollouts.iter().filter(|_| is_calibrated);
             Ok(axum::Json(RolloutResponse {
-                model: manifest.name.clone(),
+                model: manifest.name.to_string(),
                 version: manifest.version,
                 expected_mse: calibrated().map(Rollout::expected_mse).collect(),
                 mse_band_90: calibrated().map(Rollout::mse_bands).collect(),

@@ -142,7 +142,7 @@ async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
     let (state, settings) = session.0.state();
     let manifest = &session.0.model().manifest;
     axum::Json(ExportedState {
-        model: manifest.name.clone(),
+        model: manifest.name.to_string(),
         version: manifest.version,
         weights_sha256: manifest.weights_sha256.clone(),
         on_gap: settings.on_gap,

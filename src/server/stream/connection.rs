@@ -98,8 +98,8 @@ impl StreamConnection {
         let ownership = session.connect();
         let model = &session.model().manifest.name;
         Self {
-            frames: counter!(metric_names::STREAM_FRAMES, "model" => model.clone()),
-            overtaken: counter!(metric_names::STREAM_OVERTAKEN, "model" => model.clone()),
+            frames: counter!(metric_names::STREAM_FRAMES, "model" => model.to_string()),
+            overtaken: counter!(metric_names::STREAM_OVERTAKEN, "model" => model.to_string()),
             services,
             ownership,
             is_persistent,
@@ -141,7 +141,7 @@ impl StreamConnection {
         let manifest = &session.model().manifest;
         ServerMessage::Ready {
             session: self.is_persistent.then(|| session.id().to_owned()),
-            model: manifest.name.clone(),
+            model: manifest.name.to_string(),
             version: manifest.version,
             spec: Box::new(manifest.spec.clone()),
             limits: StreamLimits::new(&self.services.config, self.is_persistent),

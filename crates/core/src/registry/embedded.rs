@@ -4,6 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use crate::types::ModelName;
+
 /// The default models directory, which the embedded model stands in for.
 const STANDS_IN_FOR: &str = "models";
 
@@ -26,8 +28,13 @@ pub fn embed(model: EmbeddedModel) {
 }
 
 /// Name and directory of the embedded model, if it stands in for this directory of models.
-pub(super) fn in_place_of(models_dir: &Path) -> Option<(String, PathBuf)> {
-    standing_in_for(models_dir).map(|model| (model.name.to_owned(), models_dir.join(model.name)))
+pub(super) fn in_place_of(models_dir: &Path) -> Option<(ModelName, PathBuf)> {
+    let model = standing_in_for(models_dir)?;
+    let name = model
+        .name
+        .parse()
+        .expect("an embedded model without a valid name is a bug");
+    Some((name, models_dir.join(model.name)))
 }
 
 /// The manifest of the model in this directory, if that is the embedded model.

@@ -6,6 +6,7 @@ use super::layout::MANIFEST_FILE;
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::existing;
 use crate::files::is_transient;
+use crate::types::{ModelName, NameError};
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
@@ -15,11 +16,11 @@ pub enum RegistryError {
     #[error("there is no model {name:?} in {}; there {}", dir.display(), existing(known))]
     Unknown {
         /// The name asked for.
-        name: String,
+        name: ModelName,
         /// The directory that was searched.
         dir: PathBuf,
         /// The names of the existing models.
-        known: Vec<String>,
+        known: Vec<ModelName>,
     },
     /// The name is not safe as a directory name or in a URL.
     #[error("{0:?} is not a valid model name; use 1 to 64 of a–z, 0–9 and '-', starting with a letter or digit")]
@@ -82,6 +83,12 @@ pub enum RegistryError {
         /// The reader's error.
         source: crate::nn::TensorError,
     },
+}
+
+impl From<NameError> for RegistryError {
+    fn from(NameError(name): NameError) -> Self {
+        Self::Name(name)
+    }
 }
 
 impl HasErrorKind for RegistryError {

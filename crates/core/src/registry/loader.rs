@@ -14,6 +14,7 @@ use super::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 use super::manifest::{self, Manifest};
 use crate::files::sha256_hex;
 use crate::nn::{ModelSpec, Network, NnError, Parameters};
+use crate::types::ModelName;
 
 /// The largest weights file that is accepted, in bytes.
 const MAX_WEIGHTS_BYTES: u64 = 1 << 30;
@@ -112,10 +113,10 @@ fn read_weights(path: &Path) -> Result<Vec<u8>, RegistryError> {
 }
 
 /// As [`load`], under another name than the manifest's. Errors: as [`load`].
-pub fn load_as(model_dir: &Path, name: &str) -> Result<Model, RegistryError> {
+pub fn load_as(model_dir: &Path, name: &ModelName) -> Result<Model, RegistryError> {
     let loaded = load(model_dir)?;
     let manifest = Manifest {
-        name: name.to_owned(),
+        name: name.clone(),
         ..(*loaded.manifest).clone()
     };
     Ok(Model {

@@ -10,7 +10,7 @@ use super::embedded;
 use super::error::RegistryError;
 use super::layout::MANIFEST_FILE;
 use crate::nn::ModelSpec;
-use crate::types::Seed;
+use crate::types::{ModelName, Seed};
 
 /// The largest manifest that is accepted, in bytes.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
@@ -22,7 +22,7 @@ static GIT_COMMIT: OnceLock<&'static str> = OnceLock::new();
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// The model's name.
-    pub name: String,
+    pub name: ModelName,
     /// The version of this model name, counted from 1.
     pub version: u32,
     /// Dimensions, channels and preprocessing.

@@ -6,12 +6,13 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 use super::error::ServingError;
 use crate::registry::Model;
+use crate::types::ModelName;
 
 /// Number of panics in a row after which the predictor is not ready.
 const MAX_PANICS: u32 = 3;
 
 pub(super) struct Catalog {
-    models: RwLock<BTreeMap<String, Arc<Model>>>,
+    models: RwLock<BTreeMap<ModelName, Arc<Model>>>,
     ready: AtomicBool,
     /// Panics of the inference thread since its last batch.
     panics: AtomicU32,

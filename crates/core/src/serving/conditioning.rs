@@ -3,7 +3,7 @@
 use super::error::InputError;
 use crate::nn::spec::MAX_STEPS;
 use crate::nn::{ChannelScale, Conditioning, ModelSpec};
-use crate::types::{Action, RobotState};
+use crate::types::{Action, ModelName, RobotState};
 
 /// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -52,7 +52,7 @@ impl ConditioningInput {
     pub fn new(
         raw: RawConditioning<'_>,
         fields: &FieldNames,
-        model: &str,
+        model: &ModelName,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {
         let steps = raw.steps.unwrap_or(spec.horizon);
@@ -78,7 +78,7 @@ impl ConditioningInput {
             (None, None) => {
                 return Err(InputError::Missing {
                     field: fields.missing,
-                    model: model.to_owned(),
+                    model: model.clone(),
                     channels: channels_of(&spec.actions).join(", "),
                 });
             }
@@ -96,13 +96,11 @@ impl ConditioningInput {
         plans: Vec<Vec<Action>>,
         state: Option<RobotState>,
         steps: Option<usize>,
-        model: &str,
+        model: &ModelName,
         spec: &ModelSpec,
     ) -> Result<Vec<Self>, InputError> {
         if spec.action_inputs().is_none() {
-            return Err(InputError::Unconditioned {
-                model: model.to_owned(),
-            });
+            return Err(InputError::Unconditioned { model: model.clone() });
         }
         let state = check_state(model, spec, state)?;
         let conditioning = |(index, actions): (usize, Vec<Action>)| {
@@ -128,7 +126,7 @@ impl ConditioningInput {
 /// Checks that there are as many actions as steps and that each action has all channels.
 fn check_actions(
     field: &str,
-    model: &str,
+    model: &ModelName,
     steps: usize,
     spec: &ModelSpec,
     actions: &[Action],
@@ -136,7 +134,7 @@ fn check_actions(
     if actions.len() != steps {
         return Err(InputError::PlanLength {
             field: field.to_owned(),
-            model: model.to_owned(),
+            model: model.clone(),
             found: actions.len(),
             expected: steps,
         });
@@ -148,14 +146,18 @@ fn check_actions(
 }
 
 /// Checks the state; `None` if the model takes none.
-fn check_state(model: &str, spec: &ModelSpec, state: Option<RobotState>) -> Result<Option<RobotState>, InputError> {
+fn check_state(
+    model: &ModelName,
+    spec: &ModelSpec,
+    state: Option<RobotState>,
+) -> Result<Option<RobotState>, InputError> {
     if spec.state_inputs().is_none() {
         return Ok(None);
     }
     let Some(state) = state else {
         return Err(InputError::Missing {
             field: "state",
-            model: model.to_owned(),
+            model: model.clone(),
             channels: channels_of(&spec.states).join(", "),
         });
     };
@@ -165,7 +167,7 @@ fn check_state(model: &str, spec: &ModelSpec, state: Option<RobotState>) -> Resu
 
 fn check_length(
     field: impl Fn() -> String,
-    model: &str,
+    model: &ModelName,
     values: &[f32],
     scales: &[ChannelScale],
 ) -> Result<(), InputError> {
@@ -174,7 +176,7 @@ fn check_length(
     }
     Err(InputError::Dimension {
         field: field(),
-        model: model.to_owned(),
+        model: model.clone(),
         found: values.len(),
         expected: scales.len(),
         channels: channels_of(scales).join(", "),

@@ -3,19 +3,21 @@
 use std::sync::Arc;
 
 use crate::error_kind::{ErrorKind, HasErrorKind};
+use crate::error_text::comma_separated;
 use crate::frame::FrameError;
 use crate::nn::{NnError, TensorError};
+use crate::types::ModelName;
 
 /// Why a prediction failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServingError {
     /// No model of that name is loaded.
-    #[error("there is no model \"{name}\"; there are: {}", .available.join(", "))]
+    #[error("there is no model \"{name}\"; there are: {}", comma_separated(.available))]
     UnknownModel {
         /// The requested name.
         name: String,
         /// The names of the loaded models.
-        available: Vec<String>,
+        available: Vec<ModelName>,
     },
     /// The input does not fit the model.
     #[error(transparent)]
@@ -44,7 +46,7 @@ pub enum ServingError {
     #[error("model \"{model}\" could not be computed")]
     Model {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// What failed.
         #[source]
         source: Arc<NnError>,
@@ -53,7 +55,7 @@ pub enum ServingError {
     #[error("the output of model \"{model}\" is not an image")]
     Frame {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// What was wrong with it.
         #[source]
         source: FrameError,
@@ -87,7 +89,7 @@ pub enum InputError {
     #[error("frames holds {found} images; model \"{model}\" takes {expected}")]
     FrameCount {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Frames given.
         found: usize,
         /// Frames needed.
@@ -99,7 +101,7 @@ pub enum InputError {
         /// The field, with its index.
         field: String,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Its width in pixels.
         width: u32,
         /// Its height in pixels.
@@ -123,7 +125,7 @@ pub enum InputError {
         /// The field, with its index.
         field: String,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Actions given.
         found: usize,
         /// Actions needed.
@@ -141,7 +143,7 @@ pub enum InputError {
         /// The field, with its index.
         field: String,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Numbers given.
         found: usize,
         /// Numbers needed.
@@ -153,7 +155,7 @@ pub enum InputError {
     #[error("model \"{model}\" takes no actions, so all plans give the same prediction; use predict instead")]
     Unconditioned {
         /// The model's name.
-        model: String,
+        model: ModelName,
     },
     /// A field that the model needs is missing.
     #[error("{field} is missing; model \"{model}\" takes {channels}")]
@@ -161,7 +163,7 @@ pub enum InputError {
         /// The field.
         field: &'static str,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Names and units of the numbers it takes.
         channels: String,
     },

@@ -7,7 +7,7 @@ use super::task::{Task, check_frames};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
-use crate::types::{Action, RobotState};
+use crate::types::{Action, ModelName, RobotState};
 
 /// The input of a prediction. A model uses the fields that its conditioning names and ignores the others.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -27,12 +27,12 @@ pub struct PredictionInput {
 
 impl PredictionInput {
     /// Checks that the input fits the model named `model`. Errors name the field, its value and the expected value.
-    pub fn check(&self, model: &str, spec: &ModelSpec) -> Result<(), InputError> {
+    pub fn check(&self, model: &ModelName, spec: &ModelSpec) -> Result<(), InputError> {
         self.checked(model, spec).map(|_| ())
     }
 
     /// The conditioning input, if the whole input fits the model.
-    fn checked(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
+    fn checked(&self, model: &ModelName, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
         check_frames(&self.frames, model, spec)?;
         if self.actions.len() > self.frames.len() {
             return Err(InputError::ActionCount {
@@ -45,7 +45,7 @@ impl PredictionInput {
 
     /// The conditioning input of the prediction. Errors name the field, its value and the expected value.
     #[doc(hidden)]
-    pub fn conditioning(&self, model: &str, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
+    pub fn conditioning(&self, model: &ModelName, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
         let raw = RawConditioning {
             past: &self.actions,
             plan: self.plan.as_deref(),
@@ -64,7 +64,7 @@ impl PredictionInput {
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
     #[doc(hidden)]
-    pub fn into_task(self, model: &str, spec: &ModelSpec) -> Result<Task, InputError> {
+    pub fn into_task(self, model: &ModelName, spec: &ModelSpec) -> Result<Task, InputError> {
         Ok(Task {
             conditioning_inputs: vec![self.checked(model, spec)?],
             frames: self.frames,

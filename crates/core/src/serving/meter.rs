@@ -5,10 +5,11 @@ use std::time::{Duration, Instant};
 use metrics::{counter, gauge, histogram};
 
 use crate::metric_names;
+use crate::types::ModelName;
 
 /// Records a batch of one model: when its tasks were accepted, when its computation started, and how long that took.
-pub(super) fn record_batch(model: &str, accepted: &[Instant], started: Instant, compute_us: u64) {
-    let model = model.to_owned();
+pub(super) fn record_batch(model: &ModelName, accepted: &[Instant], started: Instant, compute_us: u64) {
+    let model = model.to_string();
     histogram!(metric_names::PREDICTION_COMPUTE_SECONDS, "model" => model.clone())
         .record(Duration::from_micros(compute_us));
     histogram!(metric_names::PREDICTION_BATCH_SIZE, "model" => model.clone()).record(accepted.len() as f64);

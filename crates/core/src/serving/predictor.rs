@@ -204,9 +204,9 @@ mod tests {
     }
 
     fn task(model: &Model) -> Task {
-        let input = worker::blank_input(model.spec()).unwrap();
+        let input = worker::blank_input(&model).unwrap();
         Task {
-            conditioning_inputs: vec![input.conditioning("test", model.spec()).unwrap()],
+            conditioning_inputs: vec![input.conditioning(&model.manifest.name, model.spec()).unwrap()],
             frames: input.frames,
             ..Task::default()
         }

@@ -10,7 +10,7 @@ use super::error::InputError;
 use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
-use crate::types::{Action, RobotState};
+use crate::types::{Action, ModelName, RobotState};
 
 /// Why an imported session state does not fit the model.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -87,7 +87,7 @@ pub struct SessionState {
 
 impl SessionState {
     /// Restores an exported state for the model named `model`. Errors name the field that does not fit.
-    pub fn restore(snapshot: SessionSnapshot, model: &str, spec: &ModelSpec) -> Result<Self, SnapshotError> {
+    pub fn restore(snapshot: SessionSnapshot, model: &ModelName, spec: &ModelSpec) -> Result<Self, SnapshotError> {
         let frames = snapshot.features.len();
         if frames > spec.context {
             return Err(SnapshotError::FrameCount {
@@ -244,7 +244,7 @@ mod tests {
             actions in proptest::collection::vec(-2.0f32..2.0, 0..4),
             state in proptest::option::of(-2.0f32..2.0),
         ) {
-            let spec = test_model().network.spec().clone();
+            let model = test_model();
             let snapshot = SessionSnapshot {
                 next_seq,
                 features,
@@ -256,7 +256,7 @@ mod tests {
                 && snapshot.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
                 && (snapshot.features.is_empty() == (next_seq == 0) && next_seq >= snapshot.features.len() as u64)
                 && (snapshot.features.is_empty() || (snapshot.actions.len() == 2 && snapshot.state.is_some()));
-            match SessionState::restore(snapshot.clone(), "test", &spec) {
+            match SessionState::restore(snapshot.clone(), &model.manifest.name, model.spec()) {
                 Ok(restored) => {
                     prop_assert!(is_sound);
                     if next_seq > 0 {
@@ -270,7 +270,7 @@ mod tests {
 
     #[test]
     fn a_feature_out_of_range_is_refused_with_its_position() {
-        let spec = test_model().network.spec().clone();
+        let model = test_model();
         let mut snapshot = SessionSnapshot {
             next_seq: 1,
             features: vec![vec![0.0; 5]],
@@ -279,7 +279,7 @@ mod tests {
             steps: None,
         };
         snapshot.features[0][3] = f32::NAN;
-        let error = SessionState::restore(snapshot, "test", &spec).unwrap_err();
+        let error = SessionState::restore(snapshot, &model.manifest.name, model.spec()).unwrap_err();
         assert_eq!(
             error.to_string(),
             "snapshot.features[0][3] is NaN; a feature is -1 to 1"

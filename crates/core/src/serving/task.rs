@@ -6,6 +6,7 @@ use super::conditioning::ConditioningInput;
 use super::error::InputError;
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
+use crate::types::ModelName;
 
 /// The features of one frame, `[F]`.
 pub type Features = Arc<[f32]>;
@@ -26,7 +27,7 @@ impl Task {
     pub fn rollout(
         frames: Vec<Frame>,
         conditioning_inputs: Vec<ConditioningInput>,
-        model: &str,
+        model: &ModelName,
         spec: &ModelSpec,
     ) -> Result<Self, InputError> {
         check_frames(&frames, model, spec)?;
@@ -52,10 +53,10 @@ impl Task {
 }
 
 /// Checks that the frames fill the model's context and have its size.
-pub(super) fn check_frames(frames: &[Frame], model: &str, spec: &ModelSpec) -> Result<(), InputError> {
+pub(super) fn check_frames(frames: &[Frame], model: &ModelName, spec: &ModelSpec) -> Result<(), InputError> {
     if frames.len() != spec.context {
         return Err(InputError::FrameCount {
-            model: model.to_owned(),
+            model: model.clone(),
             found: frames.len(),
             expected: spec.context,
         });
@@ -72,13 +73,18 @@ pub(super) fn check_frames(frames: &[Frame], model: &str, spec: &ModelSpec) -> R
 }
 
 /// Checks that the frame in `field` has the model's width and height in pixels.
-pub fn check_size(field: &str, model: &str, spec: &ModelSpec, (width, height): (u32, u32)) -> Result<(), InputError> {
+pub fn check_size(
+    field: &str,
+    model: &ModelName,
+    spec: &ModelSpec,
+    (width, height): (u32, u32),
+) -> Result<(), InputError> {
     if (width, height) == (spec.frame_width_px, spec.frame_height_px) {
         return Ok(());
     }
     Err(InputError::FrameSize {
         field: field.to_owned(),
-        model: model.to_owned(),
+        model: model.clone(),
         width,
         height,
         model_width: spec.frame_width_px,

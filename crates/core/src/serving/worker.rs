@@ -16,7 +16,6 @@ use super::queue::{ModelLoad, Queue, QueuedTask, WorkItem};
 use super::task::Task;
 use super::{compute, local, meter};
 use crate::frame::Frame;
-use crate::nn::ModelSpec;
 use crate::registry::Model;
 use crate::types::{Action, RobotState};
 
@@ -86,18 +85,19 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
 /// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &Model) -> Result<(), ServingError> {
     let started = Instant::now();
-    local::predict(model, &[&blank_input(model.spec())?])?;
+    local::predict(model, &[&blank_input(model)?])?;
     let warm_up_us = micros_since(started);
     info!(model.id = %model.manifest.name, warm_up_us, "first prediction made");
     Ok(())
 }
 
 /// Black frames, with actions and a state of zeros.
-pub(super) fn blank_input(spec: &ModelSpec) -> Result<PredictionInput, ServingError> {
+pub(super) fn blank_input(model: &Model) -> Result<PredictionInput, ServingError> {
+    let spec = model.spec();
     let pixels = vec![0; spec.frame_width_px as usize * spec.frame_height_px as usize];
     let frame =
         Frame::new(spec.frame_width_px, spec.frame_height_px, pixels).map_err(|source| ServingError::Frame {
-            model: String::new(),
+            model: model.manifest.name.clone(),
             source,
         })?;
     Ok(PredictionInput {

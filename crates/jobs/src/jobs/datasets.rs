@@ -7,7 +7,7 @@ use tracing::warn;
 
 use super::JobError;
 use crate::store::{Author, Objects, Store};
-use foreframe_core::registry::is_valid_name;
+use foreframe_core::types::{DatasetName, NameError};
 use foreframe_data::dataset::import::{ImportConfig, ImportError, check_out};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
 
@@ -18,26 +18,26 @@ const LOOKUPS: usize = 16;
 
 /// The key of a data set's directory.
 #[must_use]
-pub(super) fn key(name: &str) -> String {
+pub(super) fn key(name: &DatasetName) -> String {
     format!("datasets/{name}")
 }
 
 /// The names of the finished data sets. With a shared object store, only that store counts. Errors: `Store`, `Dataset`.
-pub async fn names(objects: &Objects) -> Result<Vec<String>, JobError> {
+pub async fn names(objects: &Objects) -> Result<Vec<DatasetName>, JobError> {
     let mut names = if objects.are_shared() {
         list_shared(objects).await?
     } else {
-        dataset::list(&objects.data_dir().join("datasets"))?
+        let found = dataset::list(&objects.data_dir().join("datasets"))?.into_iter();
+        found.filter_map(|name| name.parse().ok()).collect()
     };
-    names.retain(|name| is_valid_name(name));
     names.sort();
     Ok(names)
 }
 
 /// The finished data sets in the object store.
-async fn list_shared(objects: &Objects) -> Result<Vec<String>, JobError> {
+async fn list_shared(objects: &Objects) -> Result<Vec<DatasetName>, JobError> {
     let dirs = objects.directories("datasets").await?.into_iter();
-    let finished = stream::iter(dirs.filter(|name| is_valid_name(name)))
+    let finished = stream::iter(dirs.filter_map(|name| name.parse::<DatasetName>().ok()))
         .map(async |name| Ok::<_, JobError>(is_finished(objects, &name).await?.then_some(name)))
         .buffered(LOOKUPS)
         .try_collect::<Vec<_>>();
@@ -46,8 +46,8 @@ async fn list_shared(objects: &Objects) -> Result<Vec<String>, JobError> {
 
 /// The local directory of a data set. With a shared object store, it is fetched from there unless the local copy is the
 /// same. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
-pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
-    if is_valid_name(name) && is_finished(objects, name).await? {
+pub async fn fetch(objects: &Objects, name: &DatasetName) -> Result<PathBuf, JobError> {
+    if is_finished(objects, name).await? {
         let dir = objects.data_dir().join(key(name));
         if objects.are_shared() && !(dataset::is_finished(&dir) && is_current(objects, name).await?) {
             objects.pull_same(&key(name), dataset::METADATA, LAST_FILE).await?;
@@ -56,17 +56,17 @@ pub async fn fetch(objects: &Objects, name: &str) -> Result<PathBuf, JobError> {
             return Ok(dir);
         }
     }
-    Err(not_found(objects, name).await?)
+    Err(not_found(objects, name.to_string()).await?)
 }
 
 /// Whether the local data set is the same as the one in the object store.
-async fn is_current(objects: &Objects, name: &str) -> Result<bool, JobError> {
+async fn is_current(objects: &Objects, name: &DatasetName) -> Result<bool, JobError> {
     Ok(objects.is_same(&format!("{}/{}", key(name), dataset::METADATA)).await?)
 }
 
 /// Prepares the local directory of a data set that is to be collected. With a shared object store, a local data set that
 /// was deleted there, or was started with other arguments, is deleted. Errors: `Store`, `Dataset`.
-pub(super) async fn clear_stale(objects: &Objects, name: &str, config: &CollectConfig) -> Result<(), JobError> {
+pub(super) async fn clear_stale(objects: &Objects, name: &DatasetName, config: &CollectConfig) -> Result<(), JobError> {
     if !objects.are_shared() {
         return Ok(());
     }
@@ -83,7 +83,11 @@ pub(super) async fn clear_stale(objects: &Objects, name: &str, config: &CollectC
 }
 
 /// The same for a data set that is to be imported. Errors: `Store`, `Dataset`.
-pub(super) async fn clear_stale_import(objects: &Objects, name: &str, config: &ImportConfig) -> Result<(), JobError> {
+pub(super) async fn clear_stale_import(
+    objects: &Objects,
+    name: &DatasetName,
+    config: &ImportConfig,
+) -> Result<(), JobError> {
     if !objects.are_shared() {
         return Ok(());
     }
@@ -102,36 +106,45 @@ pub(super) async fn clear_stale_import(objects: &Objects, name: &str, config: &I
 }
 
 /// Describes a finished data set without fetching it. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
-pub async fn describe(objects: &Objects, name: &str) -> Result<DatasetInfo, JobError> {
-    if is_valid_name(name) && is_finished(objects, name).await? {
+pub async fn describe(objects: &Objects, name: &DatasetName) -> Result<DatasetInfo, JobError> {
+    if is_finished(objects, name).await? {
         let path = format!("{}/{}", key(name), dataset::METADATA);
         if let Some(text) = objects.read(&path).await? {
             return Ok(dataset::describe_metadata(Path::new(&path), &text)?);
         }
     }
-    Err(not_found(objects, name).await?)
+    Err(not_found(objects, name.to_string()).await?)
 }
 
 /// Whether the data set is complete in the object store.
-async fn is_finished(objects: &Objects, name: &str) -> Result<bool, JobError> {
+async fn is_finished(objects: &Objects, name: &DatasetName) -> Result<bool, JobError> {
     Ok(objects.has(&format!("{}/{}", key(name), dataset::INFO)).await?)
 }
 
-async fn not_found(objects: &Objects, name: &str) -> Result<JobError, JobError> {
+/// The name that a caller gave. Errors: `NotFound` with the existing names if it is no valid name, `Store`, `Dataset`.
+pub async fn named(objects: &Objects, text: &str) -> Result<DatasetName, JobError> {
+    match text.parse() {
+        Ok(name) => Ok(name),
+        Err(NameError(name)) => Err(not_found(objects, name).await?),
+    }
+}
+
+async fn not_found(objects: &Objects, name: String) -> Result<JobError, JobError> {
+    let available = names(objects).await?;
     Ok(JobError::NotFound {
         field: "dataset",
         kind: "data set",
-        name: name.to_owned(),
-        available: names(objects).await?,
+        name,
+        available: available.iter().map(DatasetName::to_string).collect(),
     })
 }
 
 /// Deletes a data set, finished or not, and records it in the audit trail. Errors: `NotFound` with the existing names, `Store`,
 /// `Dataset`.
-pub async fn delete(store: &Store, name: &str, by: &Author) -> Result<(), JobError> {
+pub async fn delete(store: &Store, name: &DatasetName, by: &Author) -> Result<(), JobError> {
     let objects = store.objects();
-    if !(is_valid_name(name) && exists(objects, name).await?) {
-        return Err(not_found(objects, name).await?);
+    if !exists(objects, name).await? {
+        return Err(not_found(objects, name.to_string()).await?);
     }
     // Files are not part of a transaction, so the entry comes first.
     store.record_dataset_deletion(name, by).await?;
@@ -139,13 +152,18 @@ pub async fn delete(store: &Store, name: &str, by: &Author) -> Result<(), JobErr
     if deleted.is_err()
         && let Err(error) = store.record_failed_deletion(name, by).await
     {
-        warn!(dataset = name, %error, "could not record that a deletion failed");
+        warn!(dataset = %name, %error, "could not record that a deletion failed");
     }
     Ok(deleted?)
 }
 
 /// Whether any part of the data set exists, locally or in the object store.
-async fn exists(objects: &Objects, name: &str) -> Result<bool, JobError> {
+async fn exists(objects: &Objects, name: &DatasetName) -> Result<bool, JobError> {
     let is_local = objects.data_dir().join(key(name)).is_dir();
-    Ok(is_local || objects.directories("datasets").await?.iter().any(|known| known == name))
+    Ok(is_local
+        || objects
+            .directories("datasets")
+            .await?
+            .iter()
+            .any(|known| name == known.as_str()))
 }

@@ -20,12 +20,12 @@ use super::report::JobReporter;
 use super::retry_policy::{RetryPolicy, retry_while_busy};
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
-use crate::store::{JobId, ModelMetrics, PublishedVersion, Store, StoreError};
+use crate::store::{JobId, ModelMetrics, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
 use foreframe_core::registry::Model;
-use foreframe_core::types::Seed;
+use foreframe_core::types::{DatasetName, ModelName, Seed};
 use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
 use foreframe_data::dataset::{self, Dataset, DatasetError};
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError};
@@ -203,15 +203,12 @@ impl Pipeline {
                 retry.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
                 report.progress(steps, steps, "publishing");
                 let written = retry.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
-                let (version, activates) = written.ok_or(JobFailure::Cancelled)?;
+                let published = written.ok_or(JobFailure::Cancelled)?;
+                let version = published.version;
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
                 Ok(JobResult {
                     result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
-                    published: Some(PublishedVersion {
-                        model: spec.name.clone(),
-                        version,
-                        activates,
-                    }),
+                    published: Some(published),
                     measured: None,
                 })
             }
@@ -234,9 +231,9 @@ impl Pipeline {
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
         let retry = self.retry_policy(report, cancelled);
-        let model = |name: &str, version| retry.run(async || self.model(name, version).await);
+        let model = |name: &ModelName, version| retry.run(async || self.model(name, version).await);
         let loaded = model(&spec.model, spec.version)?;
-        let twin = spec.twin.as_deref().map(|twin| model(twin, None)).transpose()?;
+        let twin = spec.twin.as_ref().map(|twin| model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
         let dataset = self.dataset(&spec.dataset, &retry)?;
         let config = EvaluateConfig {
@@ -287,20 +284,20 @@ impl Pipeline {
         })
     }
 
-    async fn model(&self, name: &str, version: Option<u32>) -> Result<Model, VersionError> {
+    async fn model(&self, name: &ModelName, version: Option<u32>) -> Result<Model, VersionError> {
         match version {
             Some(version) => self.versions.load(name, version).await,
             None => self.versions.load_active(name).await,
         }
     }
 
-    fn dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
+    fn dataset(&self, name: &DatasetName, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
         let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
         Dataset::open_within(&fetched, self.memory.held_mib()).map_err(|error| failed(&error))
     }
 
     /// Copies a finished data set to the object store, if there is a shared one.
-    fn push_dataset(&self, name: &str, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
+    fn push_dataset(&self, name: &DatasetName, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
         let objects = self.store.objects();
         retry.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)
     }

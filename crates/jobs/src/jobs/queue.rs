@@ -72,7 +72,7 @@ impl Jobs {
         shared.execute.check(&spec).await?;
         let new = NewJob {
             kind: spec.kind().to_owned(),
-            exclusive_output: spec.exclusive_output().map(|(kind, name)| format!("{kind} {name}")),
+            exclusive_output: spec.made_dataset().map(|name| format!("data set {name}")),
             spec: json(&spec)?,
             progress: json(&StoredProgress::default())?,
             idempotency_key: key,
@@ -92,11 +92,10 @@ impl Jobs {
     }
 
     fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
-        match (enqueued, spec.exclusive_output()) {
+        match (enqueued, spec.made_dataset()) {
             (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull { limit: *limit },
-            (EnqueueResult::Taken, Some((kind, name))) => JobError::Taken {
-                kind,
-                name: name.to_owned(),
+            (EnqueueResult::Taken, Some(name)) => JobError::Taken {
+                name: name.clone(),
                 why: "is the output of another job that has not ended",
             },
             _ => JobError::QueueFull {

@@ -5,14 +5,15 @@ mod import;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use serde::de::{Error as _, IntoDeserializer as _};
+use serde::{Deserialize, Deserializer, Serialize};
 
 pub use self::import::ImportSpec;
 use super::JobError;
 use foreframe_core::error_text;
-use foreframe_core::registry;
-use foreframe_core::types::Seed;
+use foreframe_core::types::{DatasetName, ModelName, NameError, Seed};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
 use foreframe_sim::Scenario;
 use foreframe_train::evaluation::EvaluateConfig;
@@ -46,8 +47,9 @@ pub enum JobSpec {
 #[serde(deny_unknown_fields)]
 pub struct CollectSpec {
     /// The data set's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
-    pub name: String,
+    #[serde(deserialize_with = "name")]
+    #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: DatasetName,
     /// `static-observer`, `moving-observer` or `crowded`.
     pub scenario: String,
     /// Trials, 1 to 1,000,000.
@@ -64,13 +66,16 @@ pub struct CollectSpec {
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
     /// The model's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
-    pub name: String,
+    #[serde(deserialize_with = "name")]
+    #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: ModelName,
     /// The preset of its settings.
     #[schema(schema_with = preset_schema)]
     pub preset: String,
     /// Name of a data set in the data directory.
-    pub dataset: String,
+    #[serde(deserialize_with = "dataset")]
+    #[schema(value_type = String)]
+    pub dataset: DatasetName,
     /// Settings that replace those of the preset.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
@@ -91,15 +96,20 @@ fn preset_schema() -> utoipa::openapi::Object {
 #[serde(deny_unknown_fields)]
 pub struct EvaluateSpec {
     /// The model's name.
-    pub model: String,
+    #[serde(deserialize_with = "model")]
+    #[schema(value_type = String)]
+    pub model: ModelName,
     /// Its version; the active one by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u32>,
     /// Name of a data set in the data directory.
-    pub dataset: String,
+    #[serde(deserialize_with = "dataset")]
+    #[schema(value_type = String)]
+    pub dataset: DatasetName,
     /// A model of the same size without conditioning. The report then shows what the actions are worth.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub twin: Option<String>,
+    #[serde(default, deserialize_with = "twin", skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    pub twin: Option<ModelName>,
     /// The maximum number of windows of each test set, 1 to 100,000.
     #[serde(default = "default_windows")]
     #[schema(minimum = 1, maximum = 100_000)]
@@ -133,9 +143,9 @@ pub struct AvailableInputs<'a> {
     /// The directory that imports may read; without one, they are off.
     pub import_dir: Option<&'a Path>,
     /// The finished data sets.
-    pub datasets: &'a [String],
+    pub datasets: &'a [DatasetName],
     /// The versions of each model.
-    pub models: &'a BTreeMap<String, Vec<u32>>,
+    pub models: &'a BTreeMap<ModelName, Vec<u32>>,
 }
 
 impl JobSpec {
@@ -153,19 +163,19 @@ impl JobSpec {
         }
     }
 
-    /// Kind and name of the output, if only one job at a time can make it. Versions and reports have unique names.
+    /// The data set that it makes, which only one job at a time can make. Versions and reports have unique names.
     #[must_use]
-    pub fn exclusive_output(&self) -> Option<(&'static str, &str)> {
+    pub fn made_dataset(&self) -> Option<&DatasetName> {
         match self {
-            Self::Collect(spec) => Some(("data set", &spec.name)),
-            Self::Import(spec) => Some(("data set", &spec.name)),
+            Self::Collect(spec) => Some(&spec.name),
+            Self::Import(spec) => Some(&spec.name),
             Self::Train(_) | Self::Evaluate(_) => None,
         }
     }
 
     /// The data set that it writes or reads.
     #[must_use]
-    pub fn dataset(&self) -> &str {
+    pub fn dataset(&self) -> &DatasetName {
         match self {
             Self::Collect(spec) => &spec.name,
             Self::Import(spec) => &spec.name,
@@ -209,7 +219,6 @@ impl EvaluateSpec {
 
 impl CollectSpec {
     fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
-        check_name("name", &self.name)?;
         if !(1..=MAX_TRIALS).contains(&self.trials) {
             return Err(JobError::Invalid {
                 field: "trials",
@@ -228,7 +237,6 @@ impl CollectSpec {
         match CollectionStatus::of(&config) {
             Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
             Ok(_) => Err(JobError::Taken {
-                kind: "data set",
                 name: self.name.clone(),
                 why: "exists",
             }),
@@ -265,8 +273,7 @@ impl CollectSpec {
 }
 
 impl TrainSpec {
-    fn check(&self, datasets: &[String]) -> Result<(), JobError> {
-        check_name("name", &self.name)?;
+    fn check(&self, datasets: &[DatasetName]) -> Result<(), JobError> {
         self.config()?;
         check_dataset(&self.dataset, datasets)
     }
@@ -297,45 +304,55 @@ impl TrainSpec {
     }
 }
 
-/// Names become directories. Only small letters, digits and `-` are allowed, so no name can leave the data directory.
-fn check_name(field: &'static str, name: &str) -> Result<(), JobError> {
-    if registry::is_valid_name(name) {
+/// A name in a field of a job. The error starts with the field, as those of [`JobError`] do.
+fn named<'de, D: Deserializer<'de>, N: FromStr<Err = NameError>>(field: &str, deserializer: D) -> Result<N, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    text.parse()
+        .map_err(|error| D::Error::custom(format!("{field}: {error}")))
+}
+
+fn name<'de, D: Deserializer<'de>, N: FromStr<Err = NameError>>(deserializer: D) -> Result<N, D::Error> {
+    named("name", deserializer)
+}
+
+fn dataset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<DatasetName, D::Error> {
+    named("dataset", deserializer)
+}
+
+fn model<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {
+    named("model", deserializer)
+}
+
+fn twin<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>, D::Error> {
+    let text = Option::<String>::deserialize(deserializer)?;
+    text.map(|text| named("twin", text.into_deserializer())).transpose()
+}
+
+fn check_dataset(name: &DatasetName, available: &[DatasetName]) -> Result<(), JobError> {
+    if available.contains(name) {
         return Ok(());
     }
-    Err(JobError::Invalid {
-        field,
-        reason: format!(
-            "\"{}\" is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -",
-            name.escape_default()
-        ),
+    Err(JobError::NotFound {
+        field: "dataset",
+        kind: "data set",
+        name: name.to_string(),
+        available: available.iter().map(DatasetName::to_string).collect(),
     })
 }
 
-fn check_dataset(name: &str, available: &[String]) -> Result<(), JobError> {
-    check_name("dataset", name)?;
-    check_exists("dataset", "data set", name, available.iter())
-}
-
-fn check_model(field: &'static str, name: &str, available: &BTreeMap<String, Vec<u32>>) -> Result<(), JobError> {
-    check_name(field, name)?;
-    check_exists(field, "model", name, available.keys())
-}
-
-fn check_exists<'a>(
+fn check_model(
     field: &'static str,
-    kind: &'static str,
-    name: &str,
-    mut available: impl Iterator<Item = &'a String> + Clone,
+    name: &ModelName,
+    available: &BTreeMap<ModelName, Vec<u32>>,
 ) -> Result<(), JobError> {
-    let all = available.clone();
-    if available.any(|other| other == name) {
+    if available.contains_key(name) {
         return Ok(());
     }
     Err(JobError::NotFound {
         field,
-        kind,
-        name: name.to_owned(),
-        available: all.cloned().collect(),
+        kind: "model",
+        name: name.to_string(),
+        available: available.keys().map(ModelName::to_string).collect(),
     })
 }
 
@@ -358,11 +375,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_name_can_leave_the_data_directory() {
-        for name in ["", "..", "../x", "a/b", "A", "-a", "a b", &"a".repeat(65), "ä"] {
-            assert!(check_name("name", name).is_err(), "{name}");
+    fn an_invalid_name_is_refused_with_its_field() {
+        let refused = |spec: serde_json::Value| serde_json::from_value::<JobSpec>(spec).unwrap_err().to_string();
+        let wrong = |field: &str| format!("{field}: \"../x\" is not a valid name; a name has 1 to 64 characters");
+        let collect = serde_json::json!({"kind": "collect", "name": "../x", "scenario": "crowded", "trials": 1});
+        assert!(refused(collect).starts_with(&wrong("name")));
+        for field in ["model", "dataset", "twin"] {
+            let mut spec = serde_json::json!({"kind": "evaluate", "model": "m", "dataset": "d"});
+            spec[field] = "../x".into();
+            assert!(refused(spec).starts_with(&wrong(field)), "{field}");
         }
-        assert!(check_name("name", "a-1").is_ok());
     }
 
     #[test]
@@ -375,9 +397,9 @@ mod tests {
     #[test]
     fn an_unknown_preset_is_refused_with_the_available_ones() {
         let spec = TrainSpec {
-            name: "a".to_owned(),
+            name: "a".parse().unwrap(),
             preset: "papr".to_owned(),
-            dataset: "d".to_owned(),
+            dataset: "d".parse().unwrap(),
             settings: serde_json::Map::new(),
         };
         let error = spec.check(&[]).unwrap_err().to_string();

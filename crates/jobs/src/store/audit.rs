@@ -4,6 +4,7 @@ use tracing::info;
 
 use super::database::{DatabaseRow, DatabaseValue, Tx};
 use super::{Store, StoreError, unix_s};
+use foreframe_core::types::DatasetName;
 
 /// How many rows are kept; the oldest are deleted.
 const MAX_ROWS: i64 = 100_000;
@@ -127,14 +128,14 @@ impl Store {
     }
 
     /// Records a deletion of a data set, before its files are deleted: so none is deleted without an entry. Errors: `Query`.
-    pub async fn record_dataset_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
-        let change = by.change("dataset.delete", dataset);
+    pub async fn record_dataset_deletion(&self, dataset: &DatasetName, by: &Author) -> Result<(), StoreError> {
+        let change = by.change("dataset.delete", dataset.to_string());
         change.commit(self.database.begin().await?).await
     }
 
     /// Records that the files of a data set could not be deleted, after all. Errors: `Query`.
-    pub async fn record_failed_deletion(&self, dataset: &str, by: &Author) -> Result<(), StoreError> {
-        let change = by.change("dataset.delete.failed", dataset);
+    pub async fn record_failed_deletion(&self, dataset: &DatasetName, by: &Author) -> Result<(), StoreError> {
+        let change = by.change("dataset.delete.failed", dataset.to_string());
         change.commit(self.database.begin().await?).await
     }
 

@@ -19,6 +19,7 @@ use sqlx::{
 use super::job_id::JobId;
 use super::{StoreError, wal};
 use foreframe_core::files::open_lock;
+use foreframe_core::types::ModelName;
 
 /// The maximum number of connections to the database.
 const MAX_CONNECTIONS: u32 = 8;
@@ -59,7 +60,7 @@ macro_rules! value_from {
         })+
     };
 }
-value_from!(Text: &str => |text: &str| Some(text.to_owned()), String => Some, Option<String> => |text| text,
+value_from!(Text: &str => |text: &str| Some(text.to_owned()), &ModelName => |name: &ModelName| Some(name.to_string()), String => Some, Option<String> => |text| text,
     Option<&str> => |text: Option<&str>| text.map(str::to_owned));
 value_from!(Int: i64 => Some, Option<i64> => |int| int, u32 => |int| Some(i64::from(int)),
     JobId => |id: JobId| Some(id.number()));

@@ -6,12 +6,13 @@ use super::audit::Author;
 use super::database::{DatabaseRow, Tx};
 use super::lease::Lease;
 use super::{Store, StoreError};
+use foreframe_core::types::ModelName;
 
 /// A published version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VersionRow {
     /// The model's name.
-    pub model: String,
+    pub model: ModelName,
     /// The version's number.
     pub version: u32,
     /// When it was published, in seconds since 1970.
@@ -22,7 +23,7 @@ pub struct VersionRow {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PublishedVersion {
     /// The model's name.
-    pub model: String,
+    pub model: ModelName,
     /// The version's number.
     pub version: u32,
     /// Whether it becomes active if no version is.
@@ -33,7 +34,7 @@ pub struct PublishedVersion {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ModelMetrics {
     /// The model's name.
-    pub model: String,
+    pub model: ModelName,
     /// Its version.
     pub version: u32,
     /// The hash of the weights that were measured.
@@ -47,10 +48,20 @@ fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
     u32::try_from(version).map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
 }
 
+fn model_of(row: &DatabaseRow) -> Result<ModelName, StoreError> {
+    let name = ModelName::try_from(row.get::<String>("model")?);
+    name.map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
+}
+
 impl Store {
     /// Reserves the version that a job publishes: the next number above `shipped`. A second call of the same job returns the
     /// same number. `None` if the lease is lost. Errors: `Query`.
-    pub async fn reserve_version(&self, lease: Lease, model: &str, shipped: u32) -> Result<Option<u32>, StoreError> {
+    pub async fn reserve_version(
+        &self,
+        lease: Lease,
+        model: &ModelName,
+        shipped: u32,
+    ) -> Result<Option<u32>, StoreError> {
         let mut tx = self.database.begin().await?;
         // Held until the commit, so that two jobs never reserve one number.
         let sql = "UPDATE counters SET value = value WHERE name = 'job' \
@@ -72,7 +83,7 @@ impl Store {
     }
 
     /// The next version of a name, above `shipped`, for a model that no job trained. Errors: `Query`.
-    pub async fn reserve_next_version(&self, model: &str, shipped: u32) -> Result<u32, StoreError> {
+    pub async fn reserve_next_version(&self, model: &ModelName, shipped: u32) -> Result<u32, StoreError> {
         let mut tx = self.database.begin().await?;
         // The row is locked until the commit, so that a number is never given twice.
         tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
@@ -87,7 +98,13 @@ impl Store {
     }
 
     /// Records that the files of a reserved version are there. Errors: `Query`.
-    pub async fn publish_version(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
+    pub async fn publish_version(
+        &self,
+        model: &ModelName,
+        version: u32,
+        now_s: f64,
+        by: &Author,
+    ) -> Result<(), StoreError> {
         let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
         let values = vec![model.into(), version.into(), now_s.into()];
         let change = by.change("version.publish", version_id(model, version));
@@ -95,7 +112,7 @@ impl Store {
     }
 
     /// Forgets which version of a model was chosen to serve. Errors: `Query`.
-    pub async fn clear_active(&self, model: &str) -> Result<(), StoreError> {
+    pub async fn clear_active(&self, model: &ModelName) -> Result<(), StoreError> {
         let sql = "DELETE FROM active_versions WHERE model = $1";
         self.database.execute(sql, vec![model.into()]).await.map(drop)
     }
@@ -107,7 +124,7 @@ impl Store {
         let rows = self.database.fetch(sql, vec![]).await?;
         let version = |row: &DatabaseRow| {
             Ok(VersionRow {
-                model: row.get("model")?,
+                model: model_of(row)?,
                 version: version_of(row)?,
                 published_s: row.get("published_s")?,
             })
@@ -116,20 +133,16 @@ impl Store {
     }
 
     /// All versions that were deleted, by name and number. Errors: `Query`.
-    pub async fn deleted_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
+    pub async fn deleted_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
         let sql = "SELECT model, version FROM model_versions WHERE deleted_s IS NOT NULL ORDER BY model, version";
         let rows = self.database.fetch(sql, vec![]).await?;
-        rows.iter()
-            .map(|row| Ok((row.get("model")?, version_of(row)?)))
-            .collect()
+        rows.iter().map(|row| Ok((model_of(row)?, version_of(row)?))).collect()
     }
 
     /// The active version of each model that has one. Errors: `Query`.
-    pub async fn active_versions(&self) -> Result<Vec<(String, u32)>, StoreError> {
+    pub async fn active_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
         let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;
-        rows.iter()
-            .map(|row| Ok((row.get("model")?, version_of(row)?)))
-            .collect()
+        rows.iter().map(|row| Ok((model_of(row)?, version_of(row)?))).collect()
     }
 
     /// The latest metrics of all versions that were evaluated. Errors: `Query`.
@@ -137,7 +150,7 @@ impl Store {
         let rows = self.database.fetch("SELECT * FROM model_metrics", vec![]).await?;
         let metrics = |row: &DatabaseRow| {
             Ok(ModelMetrics {
-                model: row.get("model")?,
+                model: model_of(row)?,
                 version: version_of(row)?,
                 weights_sha256: row.get("weights_sha256")?,
                 metrics: row.get("metrics")?,
@@ -147,7 +160,7 @@ impl Store {
     }
 
     /// Makes a version active, if it is not. Errors: `Query`.
-    pub async fn set_active(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
+    pub async fn set_active(&self, model: &ModelName, version: u32, now_s: f64, by: &Author) -> Result<(), StoreError> {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
              ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s \
              WHERE active_versions.version <> excluded.version";
@@ -157,7 +170,13 @@ impl Store {
     }
 
     /// Marks a version as deleted unless it is active. Returns whether it did. Errors: `Query`.
-    pub async fn delete_version(&self, model: &str, version: u32, now_s: f64, by: &Author) -> Result<bool, StoreError> {
+    pub async fn delete_version(
+        &self,
+        model: &ModelName,
+        version: u32,
+        now_s: f64,
+        by: &Author,
+    ) -> Result<bool, StoreError> {
         let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
              AND published_s IS NOT NULL AND deleted_s IS NULL \
              AND NOT EXISTS (SELECT 1 FROM active_versions WHERE model = $1 AND version = $2)";
@@ -168,13 +187,13 @@ impl Store {
 }
 
 /// A version in the audit trail.
-pub(super) fn version_id(model: &str, version: u32) -> String {
+pub(super) fn version_id(model: &ModelName, version: u32) -> String {
     format!("{model}@{version}")
 }
 
 pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, now_s: f64) -> Result<(), StoreError> {
     let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
-    let values = || vec![published.model.as_str().into(), published.version.into(), now_s.into()];
+    let values = || vec![(&published.model).into(), published.version.into(), now_s.into()];
     tx.execute(sql, values()).await?;
     if published.activates {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
@@ -189,7 +208,7 @@ pub(super) async fn write_metrics(tx: &mut Tx, measured: ModelMetrics, now_s: f6
          VALUES ($1, $2, $3, $4, $5) ON CONFLICT (model, version) DO UPDATE SET \
          weights_sha256 = excluded.weights_sha256, metrics = excluded.metrics, measured_s = excluded.measured_s";
     let values = vec![
-        measured.model.into(),
+        (&measured.model).into(),
         measured.version.into(),
         measured.weights_sha256.into(),
         measured.metrics.into(),

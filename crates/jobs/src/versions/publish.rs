@@ -6,14 +6,12 @@ use std::path::Path;
 use super::{VersionError, Versions, key};
 use crate::store::{Author, unix_s};
 use foreframe_core::registry::{self, RegistryError};
+use foreframe_core::types::ModelName;
 
 impl Versions {
     /// Publishes the model in a directory as the next version of a name, and returns the version. If it becomes the active
     /// version, a running server of the same store serves it within seconds. Errors: `Registry`, `Io`, `Store`.
-    pub async fn publish(&self, model: &str, trained_dir: &Path, activates: bool) -> Result<u32, VersionError> {
-        if !registry::is_valid_name(model) {
-            return Err(RegistryError::Name(model.to_owned()).into());
-        }
+    pub async fn publish(&self, model: &ModelName, trained_dir: &Path, activates: bool) -> Result<u32, VersionError> {
         registry::load(trained_dir)?;
         let shipped = self.shipped(model).unwrap_or(0);
         let version = self.store.reserve_next_version(model, shipped).await?;
@@ -30,7 +28,7 @@ impl Versions {
     }
 
     /// Makes a version the active one, for servers of the store to load. Errors: `Unknown`, `Refused`, `Store`.
-    pub async fn choose(&self, model: &str, version: u32) -> Result<(), VersionError> {
+    pub async fn choose(&self, model: &ModelName, version: u32) -> Result<(), VersionError> {
         self.load(model, version).await?;
         let by = Author::CommandLine;
         Ok(self.store.set_active(model, version, unix_s(), &by).await?)
@@ -38,16 +36,16 @@ impl Versions {
 
     /// Deletes one published version that is not active, or all published versions of a model; then the shipped one is
     /// active, if there is one. Returns the deleted versions. Errors: `Unknown`, `Active`, `Shipped`, `Store`.
-    pub async fn remove(&self, model: &str, version: Option<u32>) -> Result<Vec<u32>, VersionError> {
+    pub async fn remove(&self, model: &ModelName, version: Option<u32>) -> Result<Vec<u32>, VersionError> {
         let (known, shipped) = (self.of(model).await?, self.shipped(model));
         let doomed: Vec<u32> = match version {
             Some(version) => vec![version],
             None => known.iter().copied().filter(|&known| shipped != Some(known)).collect(),
         };
-        let of_model = |version| (model.to_owned(), version);
+        let of_model = |version| (model.clone(), version);
         if known.is_empty() {
             return Err(RegistryError::Unknown {
-                name: model.to_owned(),
+                name: model.clone(),
                 dir: self.shipped_dir.clone(),
                 known: self.all().await?.into_keys().collect(),
             }
@@ -57,7 +55,7 @@ impl Versions {
             let (model, version) = of_model(version);
             if !known.contains(&version) {
                 return Err(VersionError::Unknown {
-                    model,
+                    model: model.to_string(),
                     version,
                     available: known,
                 });

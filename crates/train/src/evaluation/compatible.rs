@@ -4,7 +4,7 @@ use super::EvaluationError;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Model;
-use foreframe_core::types::Seed;
+use foreframe_core::types::{ModelName, Seed};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 
 /// Frame periods count as equal if they differ by less than this share.
@@ -35,7 +35,7 @@ pub fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
     check_channels(info, spec, &model())
 }
 
-fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(), EvaluationError> {
+fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &ModelName) -> Result<(), EvaluationError> {
     let uses = [
         ("action", spec.action_inputs(), &spec.actions, &info.action_channels),
         ("state", spec.state_inputs(), &spec.states, &info.state_channels),
@@ -50,7 +50,7 @@ fn check_channels(info: &DatasetInfo, spec: &ModelSpec, model: &str) -> Result<(
                 dataset: info.name.clone(),
                 kind,
                 found,
-                model: model.to_owned(),
+                model: model.clone(),
                 wanted,
             });
         }

@@ -7,7 +7,7 @@ use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::NnError;
 use foreframe_core::registry::RegistryError;
-use foreframe_core::types::ValueError;
+use foreframe_core::types::{ModelName, ValueError};
 use foreframe_data::dataset::DatasetError;
 use foreframe_sim::SimError;
 
@@ -21,7 +21,7 @@ pub enum EvaluationError {
     )]
     TrainedOn {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The data set's name.
         dataset: String,
     },
@@ -37,7 +37,7 @@ pub enum EvaluationError {
         /// Height of its frames.
         height: u32,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Width that it takes.
         wanted_width: u32,
         /// Height that it takes.
@@ -51,7 +51,7 @@ pub enum EvaluationError {
         /// Seconds between its frames.
         period_s: f64,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// Seconds between the model's frames.
         wanted_s: f64,
     },
@@ -65,7 +65,7 @@ pub enum EvaluationError {
         /// Its components with units.
         found: String,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The components that it takes, with units.
         wanted: String,
     },
@@ -75,7 +75,7 @@ pub enum EvaluationError {
     )]
     SplitSeed {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// The seed of its training's split.
         trained: u64,
         /// The seed asked for.
@@ -85,11 +85,11 @@ pub enum EvaluationError {
     #[error("twin \"{twin}\" has {found}; to be compared with model \"{model}\" it needs {wanted}")]
     Twin {
         /// The twin's name.
-        twin: String,
+        twin: ModelName,
         /// What it has.
         found: String,
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// What it needs.
         wanted: String,
     },
@@ -117,7 +117,7 @@ pub enum EvaluationError {
     )]
     NotFinite {
         /// The model's name.
-        model: String,
+        model: ModelName,
         /// First frame of the window.
         frame: usize,
     },
@@ -125,7 +125,7 @@ pub enum EvaluationError {
     #[error("model \"{model}\" is not calibrated, so it has no novelty; run `foreframe calibrate` first")]
     NotCalibrated {
         /// The model's name.
-        model: String,
+        model: ModelName,
     },
     /// No recording is as long as the model's context.
     #[error("data set \"{dataset}\" has no recording of {context} frames or more, which the model's context takes")]

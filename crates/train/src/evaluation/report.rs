@@ -15,7 +15,7 @@ use super::plans::PlanOutcome;
 use super::skill::{Skill, skill};
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
-use foreframe_core::types::Seed;
+use foreframe_core::types::{ModelName, Seed};
 use foreframe_data::dataset::{Dataset, Window};
 
 /// The result of an evaluation, and how to repeat it.
@@ -84,12 +84,12 @@ pub struct ReportStamp {
     /// Seed of the split into training, validation and test.
     pub split_seed: Seed,
     /// The model's name.
-    pub model: String,
+    pub model: ModelName,
     /// SHA-256 of its weights' file.
     pub model_sha256: String,
     /// Name and SHA-256 of each twin that was compared.
     #[serde(default)]
-    pub twins: Vec<(String, String)>,
+    pub twins: Vec<(ModelName, String)>,
     /// Whether the validation split or the test sets were scored.
     #[serde(default)]
     pub split: ScoredSplit,

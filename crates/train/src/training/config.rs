@@ -12,7 +12,7 @@ use foreframe_core::nn::{
     Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec,
     PredictorOutput, Reconstruction,
 };
-use foreframe_core::types::{Channel, Seed};
+use foreframe_core::types::{Channel, ModelName, Seed};
 use foreframe_data::dataset::{Dataset, sampler::WindowShape};
 
 /// All settings of a training. Together with the data set, they determine the weights.
@@ -20,7 +20,7 @@ use foreframe_data::dataset::{Dataset, sampler::WindowShape};
 #[serde(deny_unknown_fields)]
 pub struct TrainConfig {
     /// The model's name.
-    pub name: String,
+    pub name: ModelName,
     /// The origin of all randomness.
     pub seed: Seed,
     /// Settings of the network.

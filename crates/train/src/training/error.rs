@@ -9,6 +9,7 @@ use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
 use foreframe_core::nn::{Conditioning, NnError};
 use foreframe_core::registry::RegistryError;
+use foreframe_core::types::ModelName;
 use foreframe_data::dataset::DatasetError;
 
 /// Why a training could not start or stopped.
@@ -95,7 +96,7 @@ pub enum TrainError {
     )]
     OtherNetwork {
         /// The model.
-        model: String,
+        model: ModelName,
         /// The first difference.
         source: NnError,
     },
@@ -106,7 +107,7 @@ pub enum TrainError {
     )]
     OtherUnits {
         /// The model.
-        model: String,
+        model: ModelName,
         /// `action` or `state`.
         kind: &'static str,
         /// What the model takes, with units.

@@ -104,6 +104,7 @@ fn extract(
 /// What a setting must be, where its type does not say it well.
 fn expected(key: &str) -> Option<String> {
     let expected = match key {
+        "name" => "a name of 1 to 64 characters of a to z, 0 to 9 and -, not starting with -",
         "data.windows" => "a whole number, 1 or more, or \"all\"",
         "data.mirror" => {
             "\"off\", \"movers\" (for a camera that stands), or a list of the channels whose sign changes, as in [\"steering\"]"

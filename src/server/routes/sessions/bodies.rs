@@ -158,7 +158,7 @@ impl SessionDescription {
         let left = session.left(grace, now);
         Self {
             id: session.id().to_owned(),
-            model: manifest.name.clone(),
+            model: manifest.name.to_string(),
             version: manifest.version,
             next_seq: state.next_seq(),
             have: state.frame_count(),

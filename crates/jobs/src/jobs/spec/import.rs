@@ -7,10 +7,11 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AvailableInputs, check_name};
+use super::{AvailableInputs, name};
 use crate::jobs::JobError;
 use foreframe_core::error_text;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{
     DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, check_out, parse_size,
 };
@@ -23,8 +24,9 @@ use foreframe_data::dataset::is_finished;
 #[serde(deny_unknown_fields)]
 pub struct ImportSpec {
     /// The data set's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[schema(pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
-    pub name: String,
+    #[serde(deserialize_with = "name")]
+    #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: DatasetName,
     /// The recording: the path of a file or folder below the server's `import_dir`.
     #[schema(min_length = 1)]
     pub source: String,
@@ -91,11 +93,9 @@ fn default_hold() -> f64 {
 
 impl ImportSpec {
     pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
-        check_name("name", &self.name)?;
         let config = self.config(available.data_dir, available.import_dir)?;
         if available.datasets.contains(&self.name) {
             return Err(JobError::Taken {
-                kind: "data set",
                 name: self.name.clone(),
                 why: "exists",
             });

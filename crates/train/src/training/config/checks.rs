@@ -13,9 +13,6 @@ const MAX_BATCH_SIZE: usize = 4096;
 impl TrainConfig {
     /// Checks all settings. Errors: `Config` with the first field that is out of range, and its range.
     pub fn validate(&self) -> Result<(), TrainError> {
-        if !foreframe_core::registry::is_valid_name(&self.name) {
-            return Err(foreframe_core::registry::RegistryError::Name(self.name.clone()).into());
-        }
         let (run, sequence, pretrain) = (&self.run, &self.sequence, &self.pretrain);
         let counts = [
             ("pretrain.steps", pretrain.steps, 0, MAX_STEPS),
