@@ -60,7 +60,7 @@ pub use foreframe_core::serving::{
     predict,
 };
 #[doc(inline)]
-pub use foreframe_core::types::{Action, Channel, RobotState, Seed, ValueError};
+pub use foreframe_core::types::{Action, Channel, ModelName, RobotState, Seed, ValueError};
 
 /// Image files, resizing, and the measures of a prediction's error.
 pub mod images {

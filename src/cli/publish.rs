@@ -6,7 +6,7 @@ use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on};
-use foreframe_core::registry::{self, MANIFEST_FILE, RegistryError};
+use foreframe_core::registry::{self, MANIFEST_FILE};
 
 /// The directory of the model in a run's directory.
 const RUN_MODEL: &str = "model";
@@ -40,7 +40,7 @@ pub(super) fn run(args: &PublishArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(with_checked_directories(loaded)?);
     let model_dir = model_directory(&args.dir)?;
     let name = match &args.name {
-        Some(name) => name.parse().map_err(RegistryError::from)?,
+        Some(name) => registry::model_name(name)?,
         None => registry::manifest::read(&model_dir)?.name,
     };
     let version = block_on(async {

@@ -157,12 +157,11 @@ pub(super) fn trained_on(loaded: &Model) -> Result<PathBuf, CliError> {
 
 /// A model's name and, after an `@`, its version.
 pub(super) fn split_version(model: &str) -> Result<(ModelName, Option<u32>), CliError> {
-    let named = |name: &str| name.parse::<ModelName>().map_err(RegistryError::from);
     let Some((name, version)) = model.split_once('@') else {
-        return Ok((named(model)?, None));
+        return Ok((registry::model_name(model)?, None));
     };
     match version.parse() {
-        Ok(version) => Ok((named(name)?, Some(version))),
+        Ok(version) => Ok((registry::model_name(name)?, Some(version))),
         Err(_) => Err(CliError::Usage(format!(
             "{model:?} is not NAME or NAME@VERSION; a version is a whole number, as in paper@2"
         ))),

@@ -61,8 +61,12 @@ fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
 
 /// The name of the model in this directory. Errors: `Name`.
 fn directory_name(path: &Path) -> Result<ModelName, RegistryError> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    Ok(name.parse()?)
+    model_name(&path.file_name().unwrap_or_default().to_string_lossy())
+}
+
+/// The text as the name of a model. Errors: `Name`.
+pub fn model_name(text: &str) -> Result<ModelName, RegistryError> {
+    text.parse().map_err(|_| RegistryError::Name(text.to_owned()))
 }
 
 /// The directory of the model with this name. Errors: `Unknown` with the existing names.
@@ -89,7 +93,7 @@ pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
     if path.join(MANIFEST_FILE).is_file() {
         return Ok(Some(path.to_owned()));
     }
-    if model.parse::<ModelName>().is_err() && (model.contains('/') || path.exists()) {
+    if model_name(model).is_err() && (model.contains('/') || path.exists()) {
         return Err(RegistryError::NotAModel(path.to_owned()));
     }
     Ok(None)

@@ -8,7 +8,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-pub use self::names::{DatasetName, ModelName, NameError};
+pub use self::names::{DatasetName, ModelName};
 
 /// Why a value was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -24,6 +24,12 @@ pub enum ValueError {
         /// The value found.
         value: f32,
     },
+    /// A text is no valid name of a model or a data set.
+    #[error(
+        "\"{}\" is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -",
+        .0.escape_default()
+    )]
+    Name(String),
 }
 
 /// The greatest magnitude of a component of an action or a state. It stays finite when it is scaled and weighted in a

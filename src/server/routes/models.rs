@@ -13,7 +13,7 @@ use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
-use foreframe_core::types::{ModelName, NameError};
+use foreframe_core::types::ModelName;
 use foreframe_jobs::store::Author;
 use foreframe_jobs::versions::VersionError;
 
@@ -194,8 +194,8 @@ async fn delete(
 
 /// The name in the path of a version. Errors: `Unknown` if it is no valid name.
 fn model_name(text: &str, version: u32) -> Result<ModelName, VersionError> {
-    text.parse().map_err(|NameError(model)| VersionError::Unknown {
-        model,
+    text.parse().map_err(|_| VersionError::Unknown {
+        model: text.to_owned(),
         version,
         available: Vec::new(),
     })

@@ -6,7 +6,7 @@ use super::layout::MANIFEST_FILE;
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::existing;
 use crate::files::is_transient;
-use crate::types::{ModelName, NameError};
+use crate::types::ModelName;
 
 /// Why a model could not be listed, loaded or published.
 #[derive(Debug, thiserror::Error)]
@@ -83,12 +83,6 @@ pub enum RegistryError {
         /// The reader's error.
         source: crate::nn::TensorError,
     },
-}
-
-impl From<NameError> for RegistryError {
-    fn from(NameError(name): NameError) -> Self {
-        Self::Name(name)
-    }
 }
 
 impl HasErrorKind for RegistryError {

@@ -7,13 +7,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// A text that is no valid name.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "\"{}\" is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -",
-    .0.escape_default()
-)]
-pub struct NameError(pub String);
+use super::ValueError;
 
 /// Whether the name is safe as a directory name and in a URL: 1 to 64 of a–z, 0–9 and '-', not starting with '-'.
 fn is_valid(name: &str) -> bool {
@@ -39,17 +33,17 @@ macro_rules! name {
         }
 
         impl TryFrom<String> for $name {
-            type Error = NameError;
+            type Error = ValueError;
 
-            fn try_from(text: String) -> Result<Self, NameError> {
-                if is_valid(&text) { Ok(Self(text)) } else { Err(NameError(text)) }
+            fn try_from(text: String) -> Result<Self, ValueError> {
+                if is_valid(&text) { Ok(Self(text)) } else { Err(ValueError::Name(text)) }
             }
         }
 
         impl FromStr for $name {
-            type Err = NameError;
+            type Err = ValueError;
 
-            fn from_str(text: &str) -> Result<Self, NameError> {
+            fn from_str(text: &str) -> Result<Self, ValueError> {
                 text.to_owned().try_into()
             }
         }

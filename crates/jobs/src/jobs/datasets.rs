@@ -7,7 +7,7 @@ use tracing::warn;
 
 use super::JobError;
 use crate::store::{Author, Objects, Store};
-use foreframe_core::types::{DatasetName, NameError};
+use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{ImportConfig, ImportError, check_out};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
 
@@ -125,7 +125,7 @@ async fn is_finished(objects: &Objects, name: &DatasetName) -> Result<bool, JobE
 pub async fn named(objects: &Objects, text: &str) -> Result<DatasetName, JobError> {
     match text.parse() {
         Ok(name) => Ok(name),
-        Err(NameError(name)) => Err(not_found(objects, name).await?),
+        Err(_) => Err(not_found(objects, text.to_owned()).await?),
     }
 }
 

@@ -13,7 +13,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub use self::import::ImportSpec;
 use super::JobError;
 use foreframe_core::error_text;
-use foreframe_core::types::{DatasetName, ModelName, NameError, Seed};
+use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
 use foreframe_sim::Scenario;
 use foreframe_train::evaluation::EvaluateConfig;
@@ -305,13 +305,13 @@ impl TrainSpec {
 }
 
 /// A name in a field of a job. The error starts with the field, as those of [`JobError`] do.
-fn named<'de, D: Deserializer<'de>, N: FromStr<Err = NameError>>(field: &str, deserializer: D) -> Result<N, D::Error> {
+fn named<'de, D: Deserializer<'de>, N: FromStr<Err = ValueError>>(field: &str, deserializer: D) -> Result<N, D::Error> {
     let text = String::deserialize(deserializer)?;
     text.parse()
         .map_err(|error| D::Error::custom(format!("{field}: {error}")))
 }
 
-fn name<'de, D: Deserializer<'de>, N: FromStr<Err = NameError>>(deserializer: D) -> Result<N, D::Error> {
+fn name<'de, D: Deserializer<'de>, N: FromStr<Err = ValueError>>(deserializer: D) -> Result<N, D::Error> {
     named("name", deserializer)
 }
 
