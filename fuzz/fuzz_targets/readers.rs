@@ -17,7 +17,7 @@ use foreframe::server::protocol::{ClientMessage, Codec};
 use foreframe_core::serving::{SessionSnapshot, SessionState};
 use foreframe_sim::{Scenario, WorldConfig};
 use foreframe_train::training::{self, CHECKPOINT_FILE, CheckpointPosition, TrainConfig, Training};
-use foreframe_core::types::Seed;
+use foreframe_core::types::{ModelName, Seed};
 use libfuzzer_sys::fuzz_target;
 
 #[allow(dead_code)]
@@ -108,8 +108,9 @@ fn states(bytes: &[u8]) {
     let Ok(snapshot) = serde_json::from_slice::<SessionSnapshot>(bytes) else {
         return;
     };
-    if let Ok(state) = SessionState::restore(snapshot, "moving", spec) {
-        let again = SessionState::restore(state.snapshot(), "moving", spec).unwrap();
+    let model: ModelName = "moving".parse().unwrap();
+    if let Ok(state) = SessionState::restore(snapshot, &model, spec) {
+        let again = SessionState::restore(state.snapshot(), &model, spec).unwrap();
         assert!(state.next_seq() == again.next_seq() && state.frame_count() == again.frame_count());
     }
 }
