@@ -10,7 +10,7 @@
 //! ```
 //! use std::path::Path;
 //!
-//! use foreframe::frame::codec;
+//! use foreframe::images::decode;
 //! use foreframe::{Action, PredictionInput, RobotState, load, predict};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {

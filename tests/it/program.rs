@@ -297,7 +297,8 @@ fn the_directory_of_a_model_gives_it_its_name() {
     let models = dir.path().join("models");
     model(&models, "plain", spec(Conditioning::None));
     std::fs::rename(models.join("plain"), models.join("other")).unwrap();
-    model(&models, "my_model", spec(Conditioning::None));
+    model(&models, "plain", spec(Conditioning::None));
+    std::fs::rename(models.join("plain"), models.join("my_model")).unwrap();
     let server = RunningServer::start(dir.path(), &[]);
     assert!(server.get("/v1/models/other").contains("\"name\":\"other\""));
     server.terminate();

@@ -105,12 +105,13 @@ impl Session {
     /// number in all plans. Empty until the context is full. Errors: `Input` if a plan does not fit the model.
     pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
         let spec = self.model.spec();
+        // Also while there is no state to predict from.
+        if plans.is_empty() || self.state.frame_count() < spec.context {
+            return Ok(Vec::new());
+        }
         let steps = plans.first().map(Vec::len);
         let state = self.state.robot_state().cloned();
         let inputs = ConditioningInput::of_plans(plans, state, steps, &self.model.manifest.name, spec)?;
-        if inputs.is_empty() || self.state.frame_count() < spec.context {
-            return Ok(Vec::new());
-        }
         let mut predictions = compute::run(&self.model, &[&self.state.rollout_task(inputs)])?;
         Ok(predictions
             .pop()

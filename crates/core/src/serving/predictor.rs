@@ -184,6 +184,7 @@ impl Predictor {
 mod tests {
     use super::*;
     use crate::nn::{ModelSpec, Network, Parameters};
+    use crate::registry::Manifest;
     use crate::serving::test_model;
     use crate::types::Seed;
 
@@ -198,8 +199,11 @@ mod tests {
         Model {
             network: Network::detached(model.spec().clone(), &parameters)
                 .unwrap()
-                .with_spec(spec),
-            ..model
+                .with_spec(spec.clone()),
+            manifest: Arc::new(Manifest {
+                spec,
+                ..Manifest::clone(&model.manifest)
+            }),
         }
     }
 

@@ -17,6 +17,14 @@ fn is_valid(name: &str) -> bool {
         && bytes.iter().all(|b| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'-'))
 }
 
+/// A message quotes only the start of a long text.
+fn not_a_name(text: &str) -> ValueError {
+    const MOST: usize = 80;
+    let start: String = text.chars().take(MOST).collect();
+    let end = if start.len() < text.len() { "…" } else { "" };
+    ValueError::Name(start + end)
+}
+
 macro_rules! name {
     ($(#[$doc:meta])* $name:ident) => {
         $(#[$doc])*
@@ -36,7 +44,7 @@ macro_rules! name {
             type Error = ValueError;
 
             fn try_from(text: String) -> Result<Self, ValueError> {
-                if is_valid(&text) { Ok(Self(text)) } else { Err(ValueError::Name(text)) }
+                if is_valid(&text) { Ok(Self(text)) } else { Err(not_a_name(&text)) }
             }
         }
 
@@ -116,6 +124,8 @@ mod tests {
                 "{name:?} was accepted"
             );
         }
+        let error = "a".repeat(1_000_000).parse::<ModelName>().unwrap_err().to_string();
+        assert!(error.len() < 250 && error.contains("a…"), "{error}");
         assert_eq!("moving-2".parse::<ModelName>().unwrap(), "moving-2");
     }
 }
