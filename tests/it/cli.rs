@@ -138,7 +138,10 @@ fn usage_errors_exit_with_2_and_advice() {
             "train --set model.context=90",
             "a window of 95 frames (context 90, horizon 5) is longer than every episode",
         ),
-        ("train --set name=A", "name is \"A\" (--set); it must be a name of 1 to 64 characters"),
+        (
+            "train --set name=A",
+            "name is \"A\" (--set); it must be a name of 1 to 64 characters",
+        ),
         (
             "evaluate --model plane",
             "there is no model \"plane\" in models; there are: moving, plain",

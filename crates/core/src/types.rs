@@ -25,7 +25,9 @@ pub enum ValueError {
         value: f32,
     },
     /// A text is no valid name of a model or a data set.
-    #[error("{0:?} is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -")]
+    #[error(
+        "{0:?} is not a valid name; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -"
+    )]
     Name(String),
 }
 
