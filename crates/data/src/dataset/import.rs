@@ -21,7 +21,6 @@ mod timing;
 mod video;
 mod writer;
 
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 pub use self::error::ImportError;
@@ -30,18 +29,12 @@ pub use self::options::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, parse_siz
 use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
-pub use self::writer::{ImportProgress, Imported};
+pub use self::writer::{ImportProgress, Imported, saved_shards};
 
 /// Whether a directory can be written by this import: it is unused, holds the same import, or holds another one that has
 /// written no frames yet. Errors: `OutExists`, `Io`.
 pub fn check_out(config: &ImportConfig) -> Result<(), ImportError> {
     writer::Directory::check(config).map(drop)
-}
-
-/// How many shards an unfinished import has written; a later run continues after them.
-#[must_use]
-pub fn saved_shards(out: &Path) -> usize {
-    writer::saved_shards(out)
 }
 
 /// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once

@@ -146,10 +146,10 @@ impl ImportError {
         move |source| Self::Image { place, path, source }
     }
 
-    pub(super) fn record(place: impl Into<String>, reason: impl Into<String>) -> Self {
+    pub(super) fn record(place: impl ToString, reason: impl ToString) -> Self {
         Self::Record {
-            place: place.into(),
-            reason: reason.into(),
+            place: place.to_string(),
+            reason: reason.to_string(),
         }
     }
 

@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::error::ImportError;
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::types::Channel;
 
 /// The largest [`ImportOptions::every`].
 const MAX_EVERY: usize = 1_000_000;
@@ -140,10 +141,10 @@ impl ImportOptions {
         Ok(())
     }
 
-    /// The unit that `--unit NAME=UNIT` gives a channel; empty if none does.
-    pub(super) fn unit(&self, name: &str) -> String {
+    /// A channel with the unit that `--unit NAME=UNIT` gives it, or else with that of the source.
+    pub(super) fn channel(&self, name: &str, unit: &str) -> Channel {
         let mut given = self.units.iter().filter_map(|unit| unit.split_once('='));
-        let found = given.find(|(channel, _)| *channel == name);
-        found.map_or_else(String::new, |(_, unit)| unit.to_owned())
+        let given = given.find(|(channel, unit)| *channel == name && !unit.is_empty());
+        Channel::new(name, given.map_or(unit, |(_, unit)| unit))
     }
 }
