@@ -20,6 +20,7 @@ mod rosbag2;
 mod sqlite;
 
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use self::choice::ChosenValues;
@@ -37,7 +38,7 @@ pub(super) fn is_bag(source: &Path) -> bool {
 
 /// The images of a bag, by their position in its files.
 struct BagImages {
-    files: Vec<Box<dyn MessageFile>>,
+    files: Vec<Arc<dyn MessageFile>>,
     /// File and position of each.
     positions: Vec<(usize, Position)>,
     kind: RosType,

@@ -1,6 +1,5 @@
 //! What is imported, and how a recording is read.
 
-use std::fmt::Display;
 use std::path::PathBuf;
 
 use serde::Serialize;
@@ -112,33 +111,33 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), ImportError> {
 impl ImportOptions {
     /// Checks what can be checked without the source. Errors: `OptionValue`.
     pub fn validate(&self) -> Result<(), ImportError> {
-        let wrong = |option, value: &dyn Display, right: &str| {
-            Err(ImportError::OptionValue {
-                option,
-                value: value.to_string(),
-                right: right.to_owned(),
-            })
-        };
-        if !(1..=MAX_EVERY).contains(&self.every) {
-            return wrong("every", &self.every, &format!("it must be 1 to {MAX_EVERY}"));
-        }
-        if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
-            return wrong("rate", &rate, "it must be 0.01 to 1000 frames per second");
-        }
-        if !(0.0..=3600.0).contains(&self.hold_s) {
-            return wrong("hold", &self.hold_s, "it must be 0 to 3600 seconds");
-        }
         let (width, height) = (self.frame_width_px, self.frame_height_px);
         let sides = 1..=MAX_SIDE_PX;
-        if !(sides.contains(&width) && sides.contains(&height)) {
+        let bad_unit = self.units.iter().find(|unit| !unit.contains('='));
+        let (option, value, right) = if !(1..=MAX_EVERY).contains(&self.every) {
+            ("every", self.every.to_string(), format!("it must be 1 to {MAX_EVERY}"))
+        } else if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
+            (
+                "rate",
+                rate.to_string(),
+                "it must be 0.01 to 1000 frames per second".to_owned(),
+            )
+        } else if !(0.0..=3600.0).contains(&self.hold_s) {
+            (
+                "hold",
+                self.hold_s.to_string(),
+                "it must be 0 to 3600 seconds".to_owned(),
+            )
+        } else if !sides.contains(&width) || !sides.contains(&height) {
             let right = format!("each side must be 1 to {MAX_SIDE_PX} px");
-            return wrong("size", &format!("{width}x{height}"), &right);
-        }
-        if let Some(unit) = self.units.iter().find(|unit| !unit.contains('=')) {
+            ("size", format!("{width}x{height}"), right)
+        } else if let Some(unit) = bad_unit {
             let given = format!("\"{}\"", unit.escape_default());
-            return wrong("unit", &given, "write NAME=UNIT, as in speed=m/s");
-        }
-        Ok(())
+            ("unit", given, "write NAME=UNIT, as in speed=m/s".to_owned())
+        } else {
+            return Ok(());
+        };
+        Err(ImportError::OptionValue { option, value, right })
     }
 
     /// A channel with the unit that `--unit NAME=UNIT` gives it, or else with that of the source.

@@ -6,7 +6,7 @@
 //! of the records' actions from this frame up to the next one. Its state is that of its record. Very long episodes are cut.
 
 use std::cmp::Ordering;
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 
 use super::recording::{Record, Recording};
@@ -169,24 +169,20 @@ fn whole_rate(period_s: f64) -> f64 {
 }
 
 /// Ranges of records without a gap.
-fn segments(records: &[Record], max_step_s: f64) -> Vec<std::ops::Range<usize>> {
-    let mut segments = Vec::new();
+fn segments(records: &[Record], max_step_s: f64) -> impl Iterator<Item = Range<usize>> {
+    let follows = move |before: &Record, now: &Record| {
+        before.session == now.session && now.timestamp_s - before.timestamp_s <= max_step_s
+    };
     let mut start = 0;
-    for index in 1..=records.len() {
-        let ends = index == records.len() || {
-            let (before, now) = (&records[index - 1], &records[index]);
-            before.session != now.session || now.timestamp_s - before.timestamp_s > max_step_s
-        };
-        if ends {
-            segments.push(start..index);
-            start = index;
-        }
-    }
-    segments
+    records.chunk_by(follows).map(move |segment| {
+        let range = start..start + segment.len();
+        start = range.end;
+        range
+    })
 }
 
 /// The records nearest to a regular grid of times; a grid time without a record near it starts a new list.
-fn nearest(records: &[Record], segment: std::ops::Range<usize>, period_s: f64) -> Vec<Vec<usize>> {
+fn nearest(records: &[Record], segment: Range<usize>, period_s: f64) -> Vec<Vec<usize>> {
     let start_s = records[segment.start].timestamp_s;
     let end_s = records[segment.end - 1].timestamp_s;
     let (mut lists, mut list, mut index) = (Vec::new(), Vec::new(), segment.start);

@@ -19,7 +19,7 @@ use crate::dataset::store::files::{is_unused, write_atomically};
 use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::{ShardWriter, shard_ranges};
-use foreframe_core::files::remove_partials;
+use foreframe_core::files::{none_if_missing, remove_partials};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::resize;
 
@@ -74,11 +74,7 @@ impl<'a> Directory<'a> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
         // The file may be replaced, so the old one is locked first: another import may still use it.
-        let old = if path.is_file() {
-            Some(lock_file(&path, out)?)
-        } else {
-            None
-        };
+        let old = path.is_file().then(|| lock_file(&path, out)).transpose()?;
         let lock = match (Self::check(config)?, old) {
             (None, Some(lock)) => lock,
             (text, _) => {
@@ -97,12 +93,10 @@ impl<'a> Directory<'a> {
     pub(super) fn check(config: &ImportConfig) -> Result<Option<String>, ImportError> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
+        let source = config.source.canonicalize();
         let arguments = ImportArguments {
             program_version: env!("CARGO_PKG_VERSION"),
-            source: &config
-                .source
-                .canonicalize()
-                .map_err(ImportError::io("read", &config.source))?,
+            source: &source.map_err(ImportError::io("read", &config.source))?,
             options: &config.options,
         };
         let text = serde_json::to_string_pretty(&arguments)
@@ -119,11 +113,8 @@ impl<'a> Directory<'a> {
                 "an import with another source or other options; delete it to import again",
             )),
             Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-                if is_unused(out, IMPORT_ARGUMENTS)? {
-                    Ok(Some(text))
-                } else {
-                    Err(occupied("other files"))
-                }
+                let is_unused = is_unused(out, IMPORT_ARGUMENTS)?;
+                is_unused.then_some(Some(text)).ok_or_else(|| occupied("other files"))
             }
             Err(error) => Err(ImportError::io("read", &path)(error)),
         }
@@ -131,11 +122,12 @@ impl<'a> Directory<'a> {
 
     /// The data set, if it is complete. Errors: `Dataset`, `Io`.
     pub(super) fn finished(&self) -> Result<Option<Imported>, ImportError> {
-        if !self.config.out.join(INFO).exists() {
+        let out = &self.config.out;
+        if !out.join(INFO).exists() {
             return Ok(None);
         }
         Ok(Some(Imported {
-            info: DatasetMetadata::read(&self.config.out)?.info_in(&self.config.out)?,
+            info: DatasetMetadata::read(out)?.info_in(out)?,
             skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
         }))
     }
@@ -146,10 +138,9 @@ impl<'a> Directory<'a> {
 
     fn read_skipped(&self) -> Result<Vec<(Option<usize>, SkippedItem)>, ImportError> {
         let path = self.skipped_path();
-        match fs::read(&path) {
-            Ok(text) => serde_json::from_slice(&text).map_err(|error| ImportError::record(path.display(), error)),
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-            Err(error) => Err(ImportError::io("read", &path)(error)),
+        match none_if_missing(fs::read(&path)).map_err(ImportError::io("read", &path))? {
+            Some(text) => serde_json::from_slice(&text).map_err(|error| ImportError::record(path.display(), error)),
+            None => Ok(Vec::new()),
         }
     }
 

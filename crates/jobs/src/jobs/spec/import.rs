@@ -138,7 +138,7 @@ impl ImportSpec {
 
     /// The options but for the CSV file. Errors: `Invalid`, which names the field.
     fn options(&self) -> Result<ImportOptions, JobError> {
-        let wrong = |error: ImportError| match error {
+        let wrong = |error| match error {
             ImportError::OptionValue { option, value, right } => {
                 invalid(option, format!("{value} is not valid; {right}"))
             }
@@ -170,29 +170,22 @@ fn invalid(field: &'static str, reason: String) -> JobError {
 }
 
 fn wrong_path(field: &'static str, path: &str, what: &str) -> JobError {
-    let shown = path.escape_default();
-    invalid(
-        field,
-        format!("\"{shown}\" {what}; give the path of a recording below the server's import_dir, as in mycar/data"),
-    )
+    let path = path.escape_default();
+    let right = "give the path of a recording below the server's import_dir, as in mycar/data";
+    invalid(field, format!("\"{path}\" {what}; {right}"))
 }
 
 /// The real path of a file or folder below `root`, which is a real path itself. Errors: `Invalid`.
 fn existing(root: &Path, path: &str, field: &'static str) -> Result<PathBuf, JobError> {
-    let is_plain = Path::new(path)
-        .components()
-        .all(|part| matches!(part, Component::Normal(_)));
+    let mut parts = Path::new(path).components();
+    let is_plain = parts.all(|part| matches!(part, Component::Normal(_)));
     if path.is_empty() || !is_plain || path.contains(['\0', '\\']) {
         return Err(wrong_path(field, path, "is not a relative path without .."));
     }
-    let real = root
-        .join(path)
-        .canonicalize()
-        .map_err(|_| wrong_path(field, path, "does not exist"))?;
-    if real.starts_with(root) {
-        Ok(real)
-    } else {
-        Err(wrong_path(field, path, "is a link that leads out of import_dir"))
+    match root.join(path).canonicalize() {
+        Ok(real) if real.starts_with(root) => Ok(real),
+        Ok(_) => Err(wrong_path(field, path, "is a link that leads out of import_dir")),
+        Err(_) => Err(wrong_path(field, path, "does not exist")),
     }
 }
 
@@ -208,19 +201,18 @@ fn check_links(root: &Path, source: &Path) -> Result<(), JobError> {
         for entry in fs::read_dir(&folder).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let kind = entry.file_type().map_err(unreadable)?;
-            if !kind.is_symlink() {
-                folders.extend(kind.is_dir().then(|| entry.path()));
+            if kind.is_dir() {
+                folders.push(entry.path());
+            }
+            // A link to nothing is as good as a missing file, which the import reports.
+            let Some(real) = kind.is_symlink().then(|| entry.path().canonicalize().ok()).flatten() else {
                 continue;
+            };
+            if !real.starts_with(root) {
+                let what = "is a link that leads out of import_dir";
+                return Err(wrong_path("source", &shown(root, &entry.path()), what));
             }
-            match entry.path().canonicalize() {
-                Ok(real) if real.starts_with(root) => folders.push(real),
-                Ok(_) => {
-                    let what = "is a link that leads out of import_dir";
-                    return Err(wrong_path("source", &shown(root, &entry.path()), what));
-                }
-                // A link to nothing is as good as a missing file, which the import reports.
-                Err(_) => {}
-            }
+            folders.push(real);
         }
     }
     Ok(())

@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use indexmap::IndexMap;
@@ -192,7 +193,7 @@ pub(super) struct BagIndex<'a> {
     pub(super) topics: Vec<Topic>,
     by_name: HashMap<(String, String), usize>,
     /// The files; the messages that follow are in the last one.
-    pub(super) files: Vec<Box<dyn MessageFile>>,
+    pub(super) files: Vec<Arc<dyn MessageFile>>,
     /// Damage that belongs to no topic.
     pub(super) skipped: SkippedList,
 }

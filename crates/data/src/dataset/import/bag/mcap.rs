@@ -5,8 +5,6 @@
 
 use std::borrow::Cow;
 use std::collections::{HashMap, VecDeque};
-use std::fs::File;
-use std::io::{BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -118,9 +116,7 @@ fn too_large(what: &str, bytes: u64) -> String {
 
 /// One pass over a file.
 struct McapScan<'a, 'b> {
-    path: &'a Path,
-    reader: BufReader<File>,
-    length: u64,
+    file: Arc<McapFile>,
     /// Names of the schemas, by the numbers that the file gives them.
     schemas: HashMap<u16, String>,
     /// Topics of the channels, likewise.
@@ -131,53 +127,43 @@ struct McapScan<'a, 'b> {
 /// Passes every message of a file to the index. Errors: `Io`, `Stopped`, `Record` where damage may not be left out.
 pub(super) fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportError> {
     let file = open_file(path)?;
-    let length = file.metadata().map_err(ImportError::io("read", path))?.len();
-    index.files.push(Box::new(McapFile {
+    let file = Arc::new(McapFile {
         path: path.to_owned(),
-        file: PositionedFile::new(open_file(path)?),
-        length,
+        length: file.metadata().map_err(ImportError::io("read", path))?.len(),
+        file: PositionedFile::new(file),
         cache: Mutex::default(),
-    }));
+    });
+    index.files.push(file.clone());
+    if file.length < MAGIC.len() as u64 || file.bytes(0, MAGIC.len())? != MAGIC {
+        let reason = "this is not an MCAP file; it does not start with its magic bytes";
+        return Err(ImportError::record(file.place_at(0), reason));
+    }
     let mut scan = McapScan {
-        path,
-        reader: BufReader::new(file),
-        length,
+        file,
         schemas: HashMap::new(),
         topics: HashMap::new(),
         index,
     };
-    let mut magic = [0; 8];
-    if scan.reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
-        return Err(ImportError::record(
-            format!("{} byte 0", path.display()),
-            "this is not an MCAP file; it does not start with its magic bytes",
-        ));
-    }
     scan.records()
 }
 
 impl McapScan<'_, '_> {
     fn fault(&mut self, offset: u64, reason: impl ToString) -> Result<(), ImportError> {
-        self.index
-            .fault(format!("{} byte {offset}", self.path.display()), reason)
+        self.index.fault(self.file.place_at(offset), reason)
     }
 
     fn records(&mut self) -> Result<(), ImportError> {
-        let (mut offset, mut body) = (MAGIC.len() as u64, Vec::new());
+        let file = Arc::clone(&self.file);
+        let mut offset = MAGIC.len() as u64;
         loop {
             self.index.check_cancelled()?;
             let content = offset.saturating_add(RECORD_HEADER_BYTES);
-            let Some(left) = self.length.checked_sub(content) else {
-                return self.fault(
-                    offset,
-                    "the file ends without the end of its data; the recording was cut off",
-                );
+            let Some(left) = file.length.checked_sub(content) else {
+                let reason = "the file ends without the end of its data; the recording was cut off";
+                return self.fault(offset, reason);
             };
-            let mut header = [0; RECORD_HEADER_BYTES as usize];
-            self.read(&mut header)?;
-            let [code, length @ ..] = header;
-            let length = u64::from_le_bytes(length);
-            let there = length.min(left);
+            let (code, length) = file.header(offset)?;
+            let body = || file.bytes(content, length.min(left) as usize);
             let is_read = matches!(
                 code,
                 operation::SCHEMA | operation::CHANNEL | operation::MESSAGE | operation::CHUNK
@@ -185,44 +171,23 @@ impl McapScan<'_, '_> {
             match code {
                 operation::DATA_END | operation::FOOTER => return Ok(()),
                 0 => return self.fault(offset, "no record starts here; the file is damaged from here on"),
-                _ if is_read && there > MAX_RECORD_BYTES => {
+                _ if is_read && length.min(left) > MAX_RECORD_BYTES => {
                     self.fault(offset, too_large("the record", length))?;
-                    self.skip(there)?;
                 }
                 _ if length > left => {
                     let place = "the file ends in the middle of a record that starts here; the recording was cut off";
                     self.fault(offset, format!("{place} ({left} of {length} bytes are there)"))?;
                     if code == operation::CHUNK {
-                        body.resize(left as usize, 0);
-                        self.read(&mut body)?;
-                        self.chunk(&body, offset, true)?;
+                        self.chunk(&body()?, offset, true)?;
                     }
                     return Ok(());
                 }
-                _ if is_read => {
-                    body.resize(length as usize, 0);
-                    self.read(&mut body)?;
-                    match code {
-                        operation::CHUNK => self.chunk(&body, offset, false)?,
-                        _ => self.record(code, &body, None, content)?,
-                    }
-                }
-                _ => self.skip(length)?,
+                operation::CHUNK => self.chunk(&body()?, offset, false)?,
+                _ if is_read => self.record(code, &body()?, None, content)?,
+                _ => {}
             }
             offset = content.saturating_add(length);
         }
-    }
-
-    fn read(&mut self, bytes: &mut [u8]) -> Result<(), ImportError> {
-        self.reader
-            .read_exact(bytes)
-            .map_err(ImportError::io("read", self.path))
-    }
-
-    fn skip(&mut self, bytes: u64) -> Result<(), ImportError> {
-        self.reader
-            .seek_relative(bytes as i64)
-            .map_err(ImportError::io("read", self.path))
     }
 
     fn chunk(&mut self, body: &[u8], offset: u64, was_cut: bool) -> Result<(), ImportError> {
@@ -323,27 +288,34 @@ impl MessageFile for McapFile {
         };
         let records = self.chunk(chunk)?;
         let message = records.get(start as usize..).and_then(|rest| rest.get(..bytes));
-        message.map(<[u8]>::to_vec).ok_or_else(|| {
-            let place = format!("{} byte {chunk}", self.path.display());
-            ImportError::record(place, "the file has changed while it was read")
-        })
+        let changed = || ImportError::record(self.place_at(chunk), "the file has changed while it was read");
+        message.map(<[u8]>::to_vec).ok_or_else(changed)
     }
 
     fn place(&self, Position { chunk, start, .. }: Position) -> String {
-        let path = self.path.display();
         match chunk {
-            None => format!("{path} byte {start}"),
-            Some(chunk) => format!("{path} byte {start} of the chunk at byte {chunk}"),
+            None => self.place_at(start),
+            Some(chunk) => format!("{} of the chunk at byte {chunk}", self.place_at(start)),
         }
     }
 }
 
 impl McapFile {
+    fn place_at(&self, offset: u64) -> String {
+        format!("{} byte {offset}", self.path.display())
+    }
+
     fn bytes(&self, offset: u64, count: usize) -> Result<Vec<u8>, ImportError> {
         let mut bytes = vec![0; count];
         let read = self.file.read_at(&mut bytes, offset);
         read.map_err(ImportError::io("read", &self.path))?;
         Ok(bytes)
+    }
+
+    /// Operation code and length of the record at a position.
+    fn header(&self, offset: u64) -> Result<(u8, u64), ImportError> {
+        let header = self.bytes(offset, RECORD_HEADER_BYTES as usize)?;
+        Ok((header[0], Fields(&header[1..]).u64().unwrap_or_default()))
     }
 
     /// The decompressed records of a chunk.
@@ -353,13 +325,11 @@ impl McapFile {
             return Ok(Arc::clone(found));
         }
         let content = offset + RECORD_HEADER_BYTES;
-        let header = self.bytes(offset, RECORD_HEADER_BYTES as usize)?;
-        let length = Fields(&header[1..]).u64().unwrap_or_default();
+        let (_, length) = self.header(offset)?;
         let left = self.length.saturating_sub(content);
         let body = self.bytes(content, length.min(left).min(MAX_RECORD_BYTES) as usize)?;
         let chunk = Chunk::read(&body, length > left);
-        let chunk =
-            chunk.map_err(|reason| ImportError::record(format!("{} byte {offset}", self.path.display()), reason))?;
+        let chunk = chunk.map_err(|reason| ImportError::record(self.place_at(offset), reason))?;
         let records = Arc::new(chunk.records.into_owned());
         let mut cache = cache();
         let mut total = cache.iter().map(|(_, records)| records.len()).sum::<usize>() + records.len();

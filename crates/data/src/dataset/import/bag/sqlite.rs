@@ -1,7 +1,7 @@
 //! Bags in SQLite databases (`.db3`), with the tables `topics` and `messages` of rosbag2.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rusqlite::Row;
 
@@ -22,7 +22,7 @@ pub(super) fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportEr
         path: path.to_owned(),
         database: Mutex::new(BagDatabase::open(path, true)?),
     };
-    index.files.push(Box::new(file));
+    index.files.push(Arc::new(file));
     let topics = topics(&database, path, index)?;
     let wrong = |error: rusqlite::Error| unreadable(path, &error);
     database.begin_row();
