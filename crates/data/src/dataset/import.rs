@@ -21,6 +21,7 @@ mod timing;
 mod video;
 mod writer;
 
+use std::collections::BTreeSet;
 use std::sync::atomic::AtomicBool;
 
 pub use self::error::ImportError;
@@ -30,6 +31,7 @@ use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
 pub use self::writer::{ImportProgress, Imported, saved_shards};
+use foreframe_core::types::Channel;
 
 /// Whether a directory can be written by this import: it is unused, holds the same import, or holds another one that has
 /// written no frames yet. Errors: `OutExists`, `Io`.
@@ -63,13 +65,11 @@ fn check_channels(recording: &Recording) -> Result<(), ImportError> {
         ("action", &recording.action_channels),
         ("state", &recording.state_channels),
     ] {
-        for (index, channel) in channels.iter().enumerate() {
-            if channels[..index].iter().any(|earlier| earlier.name == channel.name) {
-                return Err(ImportError::Option(format!(
-                    "two components of the {what} are named \"{}\"; choose and name them with --{what}, each once",
-                    channel.name
-                )));
-            }
+        let mut names = BTreeSet::new();
+        if let Some(Channel { name, .. }) = channels.iter().find(|channel| !names.insert(&channel.name)) {
+            return Err(ImportError::Option(format!(
+                "two components of the {what} are named \"{name}\"; choose and name them with --{what}, each once"
+            )));
         }
     }
     Ok(())
@@ -82,11 +82,10 @@ fn check_units(options: &ImportOptions, recording: &Recording) -> Result<(), Imp
     let Some((name, _)) = named.find(|(name, _)| channels().all(|channel| channel.name != *name)) else {
         return Ok(());
     };
-    let known = listed(channels().map(|channel| channel.name.as_str()));
+    let known = listed(channels().map(|channel| &channel.name));
+    let name = name.escape_default();
     Err(ImportError::Option(format!(
-        "--unit names the channel \"{}\", which is not imported; there are: {}",
-        name.escape_default(),
-        known
+        "--unit names the channel \"{name}\", which is not imported; there are: {known}"
     )))
 }
 

@@ -153,26 +153,15 @@ impl ImportError {
         }
     }
 
-    /// The item to list when what is damaged is left out; `None` if it is no damage of a single item.
-    pub(super) fn skippable(&self) -> Option<SkippedItem> {
-        match self {
-            Self::Record { place, reason } => Some(SkippedItem::new(place, reason)),
-            Self::Image { place, path, source } => {
-                let reason = format!("{} is damaged: {source}", path.display());
-                Some(SkippedItem::new(place, &reason))
-            }
-            _ => None,
-        }
-    }
-
-    /// Lists what is damaged, if it may be left out. Errors: itself, if not.
+    /// Lists what is damaged, if it may be left out. Errors: itself, if not, or if it is no damage of a single item.
     pub(super) fn leave_out(self, skip_bad: bool, skipped: &mut SkippedList) -> Result<(), Self> {
-        match self.skippable().filter(|_| skip_bad) {
-            Some(item) => {
-                skipped.push(item);
-                Ok(())
+        skipped.push(match &self {
+            Self::Record { place, reason } if skip_bad => SkippedItem::new(place, reason),
+            Self::Image { place, path, source } if skip_bad => {
+                SkippedItem::new(place, &format!("{} is damaged: {source}", path.display()))
             }
-            None => Err(self),
-        }
+            _ => return Err(self),
+        });
+        Ok(())
     }
 }

@@ -82,11 +82,8 @@ pub(super) type ResizeImage<'a> = &'a (dyn Fn(&Frame, &str) -> Result<Frame, Imp
 
 /// Seconds per unit of a time column, by its name's ending.
 pub(super) fn seconds_per_unit(name: &str) -> f64 {
-    let unit = |ending: &str| name.ends_with(ending);
-    match () {
-        () if unit("_ms") => 1e-3,
-        () if unit("_us") => 1e-6,
-        () if unit("_ns") => 1e-9,
-        () => 1.0,
-    }
+    let mut units = [("_ms", 1e-3), ("_us", 1e-6), ("_ns", 1e-9)].into_iter();
+    units
+        .find(|(ending, _)| name.ends_with(ending))
+        .map_or(1.0, |(_, unit_s)| unit_s)
 }

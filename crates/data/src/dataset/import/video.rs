@@ -98,13 +98,9 @@ fn number(fields: &str, name: &str) -> Option<f64> {
     value.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
-/// A path that ffmpeg cannot take for an option or a protocol.
+/// A path that ffmpeg cannot take for an option or a protocol; an absolute one stays as it is.
 fn argument(video: &Path) -> PathBuf {
-    if video.is_absolute() {
-        video.to_owned()
-    } else {
-        Path::new(".").join(video)
-    }
+    Path::new(".").join(video)
 }
 
 /// A message of ffmpeg or ffprobe without the part of the program that wrote it, as in `[matroska,webm @ 0x55fc6ae96800]`.

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde::Serialize;
 
 use super::recording::{Record, Recording};
-use super::skipped::{MAX_ITEMS, SkippedItem};
+use super::skipped::{MAX_ITEMS, SkippedItem, SkippedList};
 use super::timing::ImportPlan;
 use super::{ImportConfig, ImportError, ImportOptions};
 use crate::dataset::info::{DatasetInfo, EpisodeData};
@@ -180,11 +180,7 @@ impl<'a> Directory<'a> {
                     other => other,
                 })?;
                 let room = MAX_ITEMS.saturating_sub(skipped.len());
-                let not_listed = bad.len().saturating_sub(room) as u64;
-                skipped.extend(bad.into_iter().take(room).map(|item| (Some(shard), item)));
-                if not_listed > 0 {
-                    skipped.push((Some(shard), SkippedItem::not_listed(not_listed)));
-                }
+                skipped.extend(bad.items(room).into_iter().map(|item| (Some(shard), item)));
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }
@@ -194,7 +190,7 @@ impl<'a> Directory<'a> {
         if writer.episode_count() == 0 {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
-        let listed = plan.recording.skipped.items().into_iter();
+        let listed = plan.recording.skipped.items(MAX_ITEMS).into_iter();
         let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
@@ -246,9 +242,9 @@ impl EpisodeEncoder<'_> {
         episodes: Range<usize>,
         cancelled: &AtomicBool,
         on_frames: &dyn Fn(usize),
-    ) -> Result<(Vec<EncodedEpisode>, Vec<SkippedItem>), ImportError> {
+    ) -> Result<(Vec<EncodedEpisode>, SkippedList), ImportError> {
         let Recording { records, images, .. } = &self.plan.recording;
-        let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
+        let (mut encoded, mut bad, mut count) = (Vec::new(), SkippedList::default(), 0);
         let resize = |image: &Frame, place: &str| {
             let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
             resize(image, width, height, self.options.resize).map_err(ImportError::image(place, place))
@@ -266,13 +262,10 @@ impl EpisodeEncoder<'_> {
                             data.actions.extend_from_slice(&planned.action);
                             data.states.extend_from_slice(&record.state);
                         }
-                        Err(error) => match error.skippable().filter(|_| self.options.skip_bad) {
-                            Some(item) => {
-                                bad.push(item);
-                                self.close(&mut data, &mut encoded)?;
-                            }
-                            None => return Err(error),
-                        },
+                        Err(error) => {
+                            error.leave_out(self.options.skip_bad, &mut bad)?;
+                            self.close(&mut data, &mut encoded)?;
+                        }
                     }
                 }
                 count += chunk.len();

@@ -5,8 +5,10 @@
 //! that holds at its time. Its action is the mean of what holds from its time until the next image, each value weighted by
 //! how long it holds. An image without an action or a state is left out.
 
+use std::ops::Range;
+
 use super::choice::{ChosenTopics, ChosenValues};
-use super::index::{BagIndex, MessageEntry, MessageTime, Position};
+use super::index::{BagIndex, MessageTime, Position};
 use crate::dataset::import::recording::Record;
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
 use crate::dataset::import::timing::{GAP_PERIODS, median};
@@ -151,7 +153,8 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
     let mut held = |chosen| HeldValues::new(index, chosen, &mut joined.skipped);
     let actions = chosen.actions.iter().map(&mut held).collect::<Result<Vec<_>, _>>()?;
     let states = chosen.states.iter().map(&mut held).collect::<Result<Vec<_>, _>>()?;
-    let mut left_out = LeftOut::default();
+    // Runs of images without an action or a state, with the topic that has no value.
+    let mut left_out: Vec<(&str, Range<u64>)> = Vec::new();
     for (image, entry) in images.iter().enumerate() {
         let start_ns = times_ns[image];
         let next_ns = times_ns.get(image + 1).copied().unwrap_or(i64::MAX);
@@ -167,7 +170,10 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
         let messages = match messages.collect::<Result<Vec<usize>, &str>>() {
             Ok(messages) => messages,
             Err(missing) => {
-                left_out.add(missing, entry);
+                match left_out.last_mut() {
+                    Some((topic, run)) if *topic == missing && run.end == entry.number => run.end += 1,
+                    _ => left_out.push((missing, entry.number..entry.number + 1)),
+                }
                 continue;
             }
         };
@@ -186,26 +192,14 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
         joined.positions.push((entry.file, entry.position));
     }
     let (source, hold_s) = (index.source.display(), index.options.hold_s);
-    for (topic, first, last) in left_out.0 {
+    for (topic, run) in left_out {
+        let (first, last) = (run.start, run.end - 1);
         joined.skipped.push(SkippedItem::new(
             &format!("{source} messages {first} to {last} of {}", chosen.image.name),
             &format!("{topic} has no value in the {hold_s} s before them (--hold)"),
         ));
     }
     Ok(joined)
-}
-
-/// Images without an action or a state, in runs: the topic that has no value, first and last image.
-#[derive(Default)]
-struct LeftOut<'a>(Vec<(&'a str, u64, u64)>);
-
-impl<'a> LeftOut<'a> {
-    fn add(&mut self, missing: &'a str, image: &MessageEntry) {
-        match self.0.last_mut() {
-            Some((topic, _, last)) if *topic == missing && *last + 1 == image.number => *last = image.number,
-            _ => self.0.push((missing, image.number, image.number)),
-        }
-    }
 }
 
 #[cfg(test)]
