@@ -120,17 +120,12 @@ impl HasErrorKind for ImportError {
         }
         match self {
             Self::Dataset(error) => error.kind(),
-            Self::UnknownSource(_)
-            | Self::Option(_)
-            | Self::OptionValue { .. }
-            | Self::Record { .. }
-            | Self::Image { .. }
-            | Self::Disk { .. }
-            | Self::Empty(_) => ErrorKind::Usage,
             Self::OutExists { .. } => ErrorKind::Conflict,
-            Self::Io { source, .. } if DAMAGED_INPUT.contains(&source.kind()) => ErrorKind::Usage,
             Self::Cancelled { .. } | Self::Stopped => ErrorKind::Cancelled,
-            Self::Io { .. } | Self::Program(_) => ErrorKind::Internal,
+            Self::Program(_) => ErrorKind::Internal,
+            Self::Io { source, .. } if !DAMAGED_INPUT.contains(&source.kind()) => ErrorKind::Internal,
+            // Something is wrong with the recording or an option.
+            _ => ErrorKind::Usage,
         }
     }
 }

@@ -10,11 +10,12 @@ use zip::read::ZipFile;
 use zip::{CompressionMethod, ZipArchive};
 
 use super::files::{open_file, stem};
-use super::numpy::{ArrayHeader, FrameLayout, FramePosition};
+use super::numpy::ArrayHeader;
+use super::raw_images::{FrameLayout, FramePosition, RawImages};
 use super::recording::{Record, Recording, seconds_per_unit};
 use super::skipped::listed;
 use super::{ImportConfig, ImportError, ImportOptions};
-use foreframe_core::files::partial_path;
+use foreframe_core::files::{PositionedFile, partial_path};
 use foreframe_core::types::Channel;
 
 /// Names of the arrays if none are given.
@@ -47,7 +48,7 @@ pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Reco
     let frames = npz.frames(options)?;
     let place = npz.place(&frames);
     let header = ArrayHeader::read(npz.entry(&frames)?, &place)?;
-    let layout = FrameLayout::of(&header, &place)?;
+    let layout = FrameLayout::of(header.number, &header.shape, &place)?;
     npz.check_size(&frames, &header)?;
     let actions = npz.chosen(&options.actions, &ACTIONS, "--action", &layout)?;
     let states = npz.chosen(&options.states, &STATES, "--state", &layout)?;
@@ -66,8 +67,13 @@ pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Reco
         }
     };
     let records = layout.positions().map(record).collect();
-    let (pixels, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
-    let images = layout.images(&pixels, file, start);
+    let (path_of_frames, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
+    let images = RawImages {
+        path: path_of_frames,
+        file: PositionedFile::new(file),
+        start,
+        layout,
+    };
     let channels = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.channels(options)).collect();
     Ok(Recording {
         action_channels: channels(&actions),

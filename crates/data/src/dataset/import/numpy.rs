@@ -4,16 +4,14 @@
 //! The header is parsed here, not by the crate `npyz`: it allocates whatever length a header states (up to 4 GiB), and its parser
 //! calls itself for each bracket of the header.
 
-use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
 use super::files::{open_file, stem};
-use super::raw_images::{NumberType, RawImages};
-use super::recording::{Record, Recording};
+use super::raw_images::{FrameLayout, FramePosition, NumberType, RawImages};
+use super::recording::Recording;
 use super::{ImportError, ImportOptions};
 use foreframe_core::files::PositionedFile;
-use foreframe_core::frame::MAX_SIDE_PX;
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// A header is a short Python dictionary.
@@ -38,7 +36,7 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
     let file = open_file(path)?;
     let place = path.display().to_string();
     let header = ArrayHeader::read(BufReader::new(&file), &place)?;
-    let layout = FrameLayout::of(&header, &place)?;
+    let layout = FrameLayout::of(header.number, &header.shape, &place)?;
     let needed = header.data_offset.saturating_add(header.bytes());
     let found = file.metadata().map_err(ImportError::io("read", path))?.len();
     if found < needed {
@@ -49,123 +47,13 @@ pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, Im
     }
     let record = |at: FramePosition| at.record(at.frame as f64 / rate, &place);
     let records = layout.positions().map(record).collect();
-    let images = layout.images(path, file, header.data_offset);
+    let images = RawImages {
+        path: path.to_owned(),
+        file: PositionedFile::new(file),
+        start: header.data_offset,
+        layout,
+    };
     Ok(Recording::new(stem(path, "array"), records, images))
-}
-
-/// Which sides of the array are sequences, time, rows and columns.
-pub(super) struct FrameLayout {
-    pub(super) sequences: usize,
-    pub(super) frames: usize,
-    height: usize,
-    width: usize,
-    number: NumberType,
-    is_rgb: bool,
-    time_first: bool,
-    /// The sides before the rows.
-    pub(super) leading: Vec<usize>,
-}
-
-impl FrameLayout {
-    /// Errors: `Record` if the array holds no frames.
-    pub(super) fn of(header: &ArrayHeader, place: &str) -> Result<Self, ImportError> {
-        let wrong = |reason: String| Err(ImportError::record(place, reason));
-        let number = header.number;
-        if matches!(number, NumberType::I32 | NumberType::I64) {
-            let reason = "its values are int32 or int64; frames must be uint8, or float32 or float64 from 0 to 1";
-            return wrong(reason.to_owned());
-        }
-        // Frames of three columns are not worth predicting, so these are colors.
-        let (shape, is_rgb) = match header.shape.as_slice() {
-            [shape @ .., 3] if shape.len() >= 3 && number == NumberType::U8 => (shape, true),
-            shape => (shape, false),
-        };
-        let (sequences, frames, height, width, time_first) = match *shape {
-            [frames, height, width] => (1, frames, height, width, false),
-            [frames, sequences, height, width] if frames <= sequences => (sequences, frames, height, width, true),
-            [sequences, frames, height, width] => (sequences, frames, height, width, false),
-            _ => {
-                return wrong(format!(
-                    "the array's shape is {:?}; it must be T×H×W, T×N×H×W or N×T×H×W, or the same with 3 colors at the end",
-                    header.shape
-                ));
-            }
-        };
-        let sides = 1..=MAX_SIDE_PX as usize;
-        if !sides.contains(&height) || !sides.contains(&width) {
-            return wrong(format!(
-                "its frames are {width}×{height} px; each side must be 1 to {MAX_SIDE_PX} px"
-            ));
-        }
-        if header.bytes() == u64::MAX || sequences.checked_mul(frames).is_none() {
-            return wrong(format!("its shape {:?} is too large", header.shape));
-        }
-        Ok(Self {
-            sequences,
-            frames,
-            height,
-            width,
-            number,
-            is_rgb,
-            time_first,
-            leading: shape[..shape.len() - 2].to_vec(),
-        })
-    }
-
-    /// Every frame, sequence by sequence.
-    pub(super) fn positions(&self) -> impl Iterator<Item = FramePosition> {
-        (0..self.sequences * self.frames).map(|position| {
-            let (sequence, frame) = (position / self.frames, position % self.frames);
-            let index = self.index(sequence, frame);
-            FramePosition { sequence, frame, index }
-        })
-    }
-
-    /// The frame's position in the array, in frames.
-    fn index(&self, sequence: usize, frame: usize) -> usize {
-        if self.time_first {
-            frame * self.sequences + sequence
-        } else {
-            sequence * self.frames + frame
-        }
-    }
-
-    /// The frames of a file whose values begin at `data_offset`, in the order of [`Self::positions`].
-    pub(super) fn images(&self, path: &Path, file: File, data_offset: u64) -> RawImages {
-        let samples = if self.is_rgb { 3 } else { 1 };
-        let frame_bytes = (self.height * self.width * samples * self.number.bytes()) as u64;
-        let offset = |at: FramePosition| data_offset + at.index as u64 * frame_bytes;
-        RawImages {
-            path: path.to_owned(),
-            file: PositionedFile::new(file),
-            width_px: self.width as u32,
-            height_px: self.height as u32,
-            offsets: self.positions().map(offset).collect(),
-            number: self.number,
-            is_rgb: self.is_rgb,
-        }
-    }
-}
-
-/// A frame of an array.
-pub(super) struct FramePosition {
-    pub(super) sequence: usize,
-    pub(super) frame: usize,
-    /// Its position in the array, in frames.
-    pub(super) index: usize,
-}
-
-impl FramePosition {
-    /// Its record without action and state.
-    pub(super) fn record(&self, timestamp_s: f64, place: &str) -> Record {
-        let (sequence, frame) = (self.sequence, self.frame);
-        Record {
-            timestamp_s,
-            session: sequence.to_string(),
-            place: format!("{place} sequence {sequence} frame {frame}"),
-            ..Record::default()
-        }
-    }
 }
 
 impl ArrayHeader {
@@ -253,7 +141,7 @@ mod tests {
 
     fn read(dictionary: &str) -> Result<ArrayHeader, ImportError> {
         let header = ArrayHeader::read(array(dictionary).as_slice(), "a.npy")?;
-        FrameLayout::of(&header, "a.npy").map(|_| header)
+        FrameLayout::of(header.number, &header.shape, "a.npy").map(|_| header)
     }
 
     #[test]
@@ -268,12 +156,6 @@ mod tests {
                 data_offset: 10 + text.len() as u64
             }
         );
-        let layout = FrameLayout::of(&header, "a.npy").unwrap();
-        assert_eq!((layout.sequences, layout.frames), (10000, 20));
-        assert_eq!(layout.index(3, 2), 2 * 10000 + 3);
-        let header = read("{'descr': '|u1', 'fortran_order': False, 'shape': (9, 48, 64, 3), }").unwrap();
-        let layout = FrameLayout::of(&header, "a.npy").unwrap();
-        assert_eq!((layout.frames, layout.width, layout.is_rgb), (9, 64, true));
     }
 
     #[test]

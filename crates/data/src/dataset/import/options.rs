@@ -96,16 +96,12 @@ impl Default for ImportOptions {
     }
 }
 
-/// Width and height in pixels, written as in `64x64`. Errors: `OptionValue`.
-pub fn parse_size(text: &str) -> Result<(u32, u32), ImportError> {
+/// Width and height in pixels, written as in `64x64`. Errors: what would be right.
+pub fn parse_size(text: &str) -> Result<(u32, u32), &'static str> {
     let sides = text
         .split_once('x')
         .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    sides.ok_or_else(|| ImportError::OptionValue {
-        option: "size",
-        value: format!("\"{}\"", text.escape_default()),
-        right: "write WIDTHxHEIGHT, as in 64x64".to_owned(),
-    })
+    sides.ok_or("write WIDTHxHEIGHT, as in 64x64")
 }
 
 impl ImportOptions {

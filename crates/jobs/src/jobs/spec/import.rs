@@ -127,31 +127,27 @@ impl ImportSpec {
         let source = existing(&root, &self.source, "source")?;
         check_links(&root, &source)?;
         let csv = self.csv.as_deref().map(|csv| existing(&root, csv, "csv")).transpose()?;
-        let options = ImportOptions { csv, ..self.options()? };
         Ok(ImportConfig {
             source,
             out: data_dir.join("datasets").join(&self.name),
-            options,
+            options: self.options(csv)?,
             disk_mib: DEFAULT_DISK_MIB,
         })
     }
 
-    /// The options but for the CSV file. Errors: `Invalid`, which names the field.
-    fn options(&self) -> Result<ImportOptions, JobError> {
-        let wrong = |error| match error {
-            ImportError::OptionValue { option, value, right } => {
-                invalid(option, format!("{value} is not valid; {right}"))
-            }
-            other => invalid("source", other.to_string()),
-        };
-        let (frame_width_px, frame_height_px) = parse_size(&self.size).map_err(wrong)?;
+    /// The options. Errors: `Invalid`, which names the field.
+    fn options(&self, csv: Option<PathBuf>) -> Result<ImportOptions, JobError> {
+        let wrong = |option, value: &str, right: &str| invalid(option, format!("{value} is not valid; {right}"));
+        let size = parse_size(&self.size);
+        let (frame_width_px, frame_height_px) =
+            size.map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
         let options = ImportOptions {
             frame_width_px,
             frame_height_px,
             resize: self.resize,
             rate_hz: self.rate,
             every: self.every,
-            csv: None,
+            csv,
             image: self.image.clone(),
             time: self.time.clone(),
             actions: self.action.clone(),
@@ -160,8 +156,11 @@ impl ImportSpec {
             hold_s: self.hold,
             skip_bad: self.skip_bad,
         };
-        options.validate().map_err(wrong)?;
-        Ok(options)
+        match options.validate() {
+            Ok(()) => Ok(options),
+            Err(ImportError::OptionValue { option, value, right }) => Err(wrong(option, &value, &right)),
+            Err(other) => Err(invalid("source", other.to_string())),
+        }
     }
 }
 

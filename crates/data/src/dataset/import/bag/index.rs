@@ -65,9 +65,10 @@ pub(super) struct Field {
 }
 
 /// A message whose values were taken.
-struct ValueMessage {
-    time: MessageTime,
-    number: u64,
+pub(super) struct ValueMessage {
+    pub(super) time: MessageTime,
+    /// Its number in its topic, from 0.
+    pub(super) number: u64,
     /// Where its values end.
     end: usize,
 }
@@ -111,17 +112,13 @@ impl ValueStream {
         Ok(())
     }
 
-    pub(super) fn times(&self) -> impl Iterator<Item = MessageTime> {
-        self.messages.iter().map(|message| message.time)
-    }
-
-    /// Every message: its time, its number in the topic, and its values with the positions of their fields.
-    pub(super) fn messages(&self) -> impl Iterator<Item = (MessageTime, u64, &[(u32, f32)])> {
+    /// Every message, and its values with the positions of their fields.
+    pub(super) fn messages(&self) -> impl Iterator<Item = (&ValueMessage, &[(u32, f32)])> {
         let mut start = 0;
         self.messages.iter().map(move |message| {
             let values = &self.values[start..message.end];
             start = message.end;
-            (message.time, message.number, values)
+            (message, values)
         })
     }
 }

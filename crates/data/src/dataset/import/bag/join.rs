@@ -65,7 +65,7 @@ impl<'a> HeldValues<'a> {
     /// Errors: `Record` if time goes back, unless damage is left out.
     fn new(index: &BagIndex<'_>, chosen: &ChosenValues<'a>, skipped: &mut SkippedList) -> Result<Self, ImportError> {
         let (topic, options) = (&chosen.topic.name, index.options);
-        let clock = Clock::of(chosen.stream.times(), options)?;
+        let clock = Clock::of(chosen.stream.messages().map(|(message, _)| message.time), options)?;
         let mut held = Self {
             topic,
             times_ns: Vec::new(),
@@ -74,10 +74,10 @@ impl<'a> HeldValues<'a> {
             hold_ns: (options.hold_s * 1e9) as i64,
         };
         let mut row = vec![f32::NAN; held.width];
-        for (time, number, values) in chosen.stream.messages() {
-            let time_ns = clock.time(time);
+        for (message, values) in chosen.stream.messages() {
+            let time_ns = clock.time(message.time);
             if let Some(&before) = held.times_ns.last().filter(|&&before| time_ns < before) {
-                let place = format!("{} message {number} of {topic}", index.source.display());
+                let place = format!("{} message {} of {topic}", index.source.display(), message.number);
                 let reason = format!(
                     "its time {} s is before that of the message before, {} s; times must grow",
                     seconds(time_ns),
