@@ -1,5 +1,6 @@
 //! Errors of imports: what they mean for the caller, and which of them are damage that may be left out.
 
+use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -141,7 +142,7 @@ impl ImportError {
         move |source| Self::Image { place, path, source }
     }
 
-    pub(super) fn record(place: impl ToString, reason: impl ToString) -> Self {
+    pub(super) fn record(place: impl Display, reason: impl Display) -> Self {
         Self::Record {
             place: place.to_string(),
             reason: reason.to_string(),

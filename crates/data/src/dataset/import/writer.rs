@@ -211,7 +211,9 @@ impl<'a> Directory<'a> {
 /// How many shards an unfinished import has written; a later run continues after them.
 #[must_use]
 pub fn saved_shards(out: &Path) -> usize {
-    (0..).take_while(|&shard| out.join(shard_path(shard)).is_file()).count()
+    (0..usize::MAX)
+        .take_while(|&shard| out.join(shard_path(shard)).is_file())
+        .count()
 }
 
 fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -217,7 +218,7 @@ impl<'a> BagIndex<'a> {
     }
 
     /// Lists damage, or refuses it. Errors: `Record`.
-    pub(super) fn fault(&mut self, place: String, reason: impl ToString) -> Result<(), ImportError> {
+    pub(super) fn fault(&mut self, place: String, reason: impl Display) -> Result<(), ImportError> {
         ImportError::record(place, reason).leave_out(self.options.skip_bad, &mut self.skipped)
     }
 

@@ -5,6 +5,7 @@
 
 use std::borrow::Cow;
 use std::collections::{HashMap, VecDeque};
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -148,7 +149,7 @@ pub(super) fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportEr
 }
 
 impl McapScan<'_, '_> {
-    fn fault(&mut self, offset: u64, reason: impl ToString) -> Result<(), ImportError> {
+    fn fault(&mut self, offset: u64, reason: impl Display) -> Result<(), ImportError> {
         self.index.fault(self.file.place_at(offset), reason)
     }
 

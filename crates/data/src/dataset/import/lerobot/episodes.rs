@@ -101,13 +101,11 @@ impl Description {
         let of_video = |what: &str| numbers(&format!("videos/{}/{what}", image.name));
         let (indexes, lengths) = (numbers("episode_index")?, numbers("length")?);
         let (chunks, files) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
-        let videos = match image.is_video {
-            true => Some((
-                of_video("chunk_index")?,
-                of_video("file_index")?,
-                of_video("from_timestamp")?,
-            )),
-            false => None,
+        let videos = if image.is_video {
+            let (chunks, files) = (of_video("chunk_index")?, of_video("file_index")?);
+            Some((chunks, files, of_video("from_timestamp")?))
+        } else {
+            None
         };
         let fields = |chunk: f64, file: f64| [("chunk_index", chunk as usize), ("file_index", file as usize)];
         for row in 0..batch.num_rows() {
