@@ -60,13 +60,13 @@ pub(super) struct MessageEntry {
 }
 
 /// A field of a topic.
-pub(super) struct Field {
+pub(super) struct MessageField {
     pub(super) unit: &'static str,
     pub(super) is_ever_other_than_0: bool,
 }
 
 /// A message whose values were taken.
-pub(super) struct ValueMessage {
+pub(super) struct MessageValues {
     pub(super) time: MessageTime,
     /// Its number in its topic, from 0.
     pub(super) number: u64,
@@ -78,8 +78,8 @@ pub(super) struct ValueMessage {
 #[derive(Default)]
 pub(super) struct ValueStream {
     /// All fields, in the order in which they appeared.
-    pub(super) fields: IndexMap<Cow<'static, str>, Field>,
-    messages: Vec<ValueMessage>,
+    pub(super) fields: IndexMap<Cow<'static, str>, MessageField>,
+    messages: Vec<MessageValues>,
     /// Positions of fields and their values.
     values: Vec<(u32, f32)>,
 }
@@ -102,19 +102,19 @@ impl ValueStream {
             let field = self.fields.entry(name);
             self.values.push((field.index() as u32, value as f32));
             let is_ever_other_than_0 = false;
-            let field = field.or_insert(Field {
+            let field = field.or_insert(MessageField {
                 unit,
                 is_ever_other_than_0,
             });
             field.is_ever_other_than_0 |= value != 0.0;
         }
         let end = self.values.len();
-        self.messages.push(ValueMessage { time, number, end });
+        self.messages.push(MessageValues { time, number, end });
         Ok(())
     }
 
     /// Every message, and its values with the positions of their fields.
-    pub(super) fn messages(&self) -> impl Iterator<Item = (&ValueMessage, &[(u32, f32)])> {
+    pub(super) fn messages(&self) -> impl Iterator<Item = (&MessageValues, &[(u32, f32)])> {
         let mut start = 0;
         self.messages.iter().map(move |message| {
             let values = &self.values[start..message.end];
