@@ -9,7 +9,7 @@ use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use foreframe_core::types::DatasetName;
-use foreframe_data::dataset::import::{ImportConfig, ImportError, ImportOptions, import, parse_size};
+use foreframe_data::dataset::import::{ImportConfig, ImportOptions, import, parse_size};
 use foreframe_data::dataset::{DatasetInfo, is_finished};
 
 /// How many left-out items are printed.
@@ -42,20 +42,12 @@ pub(super) struct ImportArgs {
     #[arg(long, value_name = "DIR", conflicts_with = "name")]
     out: Option<PathBuf>,
     /// Width and height of the frames in pixels, as in 64x64
-    #[arg(long, value_name = "WxH", default_value = "64x64", value_parser = size)]
+    #[arg(long, value_name = "WxH", default_value = "64x64", value_parser = parse_size)]
     size: (u32, u32),
     #[command(flatten)]
     options: ImportOptions,
     #[command(flatten)]
     settings: CommonArgs,
-}
-
-fn size(text: &str) -> Result<(u32, u32), String> {
-    // The caller names the option.
-    parse_size(text).map_err(|error| match error {
-        ImportError::OptionValue { right, .. } => right,
-        other => other.to_string(),
-    })
 }
 
 pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
@@ -84,13 +76,12 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
     );
     progress.finish();
     let imported = imported?;
-    let info = &imported.info;
+    let (info, shown) = (&imported.info, out.display());
     if was_complete {
         print_line("already imported before, and not read again; delete the directory to import the source anew")?;
     }
     print_line(format!(
-        "{}: {} episodes, {} frames of {}×{} px, {:.4} s apart, content {}",
-        out.display(),
+        "{shown}: {} episodes, {} frames of {}×{} px, {:.4} s apart, content {}",
         info.episode_count,
         info.frame_count,
         info.frame_width_px,
@@ -104,18 +95,14 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             print_line(format!("  {}: {}", item.place, item.reason))?;
         }
         if imported.skipped.len() > LISTED_ITEMS {
-            print_line(format!(
-                "  … more of them are in {}",
-                out.join("meta/skipped.json").display()
-            ))?;
+            let list = out.join("meta/skipped.json");
+            print_line(format!("  … more of them are in {}", list.display()))?;
         }
     }
-    print_line(format!("next: foreframe inspect {}", out.display()))?;
+    let (name, conditioning) = (&info.name, conditioning(info));
+    print_line(format!("next: foreframe inspect {shown}"))?;
     print_line(format!(
-        "      foreframe train --preset recording --dataset {} --set name={}{}",
-        out.display(),
-        info.name,
-        conditioning(info)
+        "      foreframe train --preset recording --dataset {shown} --set name={name}{conditioning}"
     ))
 }
 

@@ -21,7 +21,7 @@ mod timing;
 mod video;
 mod writer;
 
-use std::path::Path;
+use std::collections::BTreeSet;
 use std::sync::atomic::AtomicBool;
 
 pub use self::error::ImportError;
@@ -30,18 +30,13 @@ pub use self::options::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, parse_siz
 use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
-pub use self::writer::{ImportProgress, Imported};
+pub use self::writer::{ImportProgress, Imported, saved_shards};
+use foreframe_core::types::Channel;
 
 /// Whether a directory can be written by this import: it is unused, holds the same import, or holds another one that has
 /// written no frames yet. Errors: `OutExists`, `Io`.
 pub fn check_out(config: &ImportConfig) -> Result<(), ImportError> {
     writer::Directory::check(config).map(drop)
-}
-
-/// How many shards an unfinished import has written; a later run continues after them.
-#[must_use]
-pub fn saved_shards(out: &Path) -> usize {
-    writer::saved_shards(out)
 }
 
 /// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once
@@ -70,13 +65,11 @@ fn check_channels(recording: &Recording) -> Result<(), ImportError> {
         ("action", &recording.action_channels),
         ("state", &recording.state_channels),
     ] {
-        for (index, channel) in channels.iter().enumerate() {
-            if channels[..index].iter().any(|earlier| earlier.name == channel.name) {
-                return Err(ImportError::Option(format!(
-                    "two components of the {what} are named \"{}\"; choose and name them with --{what}, each once",
-                    channel.name
-                )));
-            }
+        let mut names = BTreeSet::new();
+        if let Some(Channel { name, .. }) = channels.iter().find(|channel| !names.insert(&channel.name)) {
+            return Err(ImportError::Option(format!(
+                "two components of the {what} are named \"{name}\"; choose and name them with --{what}, each once"
+            )));
         }
     }
     Ok(())
@@ -89,11 +82,10 @@ fn check_units(options: &ImportOptions, recording: &Recording) -> Result<(), Imp
     let Some((name, _)) = named.find(|(name, _)| channels().all(|channel| channel.name != *name)) else {
         return Ok(());
     };
-    let known = listed(channels().map(|channel| channel.name.as_str()));
+    let known = listed(channels().map(|channel| &channel.name));
+    let name = name.escape_default();
     Err(ImportError::Option(format!(
-        "--unit names the channel \"{}\", which is not imported; there are: {}",
-        name.escape_default(),
-        known
+        "--unit names the channel \"{name}\", which is not imported; there are: {known}"
     )))
 }
 

@@ -20,15 +20,14 @@ mod rosbag2;
 mod sqlite;
 
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use self::index::{BagIndex, Content, Position};
-use self::mcap::McapFile;
+use self::choice::ChosenValues;
+use self::index::{BagIndex, MessageFile, Position};
 use self::messages::RosType;
-#[cfg(feature = "databases")]
-use self::sqlite::SqliteFile;
 use super::files::{extension, stem};
-use super::recording::{ImageSource, Recording, WantedImage};
+use super::recording::{ImageSource, Record, Recording};
 use super::{ImportError, ImportOptions};
 use foreframe_core::frame::{Frame, codec};
 
@@ -39,107 +38,79 @@ pub(super) fn is_bag(source: &Path) -> bool {
 
 /// The images of a bag, by their position in its files.
 struct BagImages {
-    files: Vec<BagFile>,
+    files: Vec<Arc<dyn MessageFile>>,
     /// File and position of each.
     positions: Vec<(usize, Position)>,
     kind: RosType,
 }
 
-/// A file of messages.
-enum BagFile {
-    Mcap(McapFile),
-    #[cfg(feature = "databases")]
-    Sqlite(SqliteFile),
-}
-
-impl BagFile {
-    fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportError> {
-        match extension(path).as_str() {
-            #[cfg(feature = "databases")]
-            "db3" => sqlite::scan(path, index),
-            #[cfg(not(feature = "databases"))]
-            "db3" => Err(ImportError::Option(format!(
-                "{} is an SQLite database, which is read with the feature \"server\" only",
-                path.display()
-            ))),
-            _ => mcap::scan(path, index),
-        }
-    }
-
-    fn open(path: &Path) -> Result<Self, ImportError> {
-        match extension(path).as_str() {
-            #[cfg(feature = "databases")]
-            "db3" => SqliteFile::open(path).map(Self::Sqlite),
-            _ => McapFile::open(path).map(Self::Mcap),
-        }
-    }
-
-    fn message(&self, position: Position) -> Result<Vec<u8>, ImportError> {
-        match self {
-            Self::Mcap(file) => file.message(position),
-            #[cfg(feature = "databases")]
-            Self::Sqlite(file) => file.message(position),
-        }
+/// Passes every message of a file to the index.
+fn scan(path: &Path, index: &mut BagIndex<'_>) -> Result<(), ImportError> {
+    match extension(path).as_str() {
+        #[cfg(feature = "databases")]
+        "db3" => sqlite::scan(path, index),
+        #[cfg(not(feature = "databases"))]
+        "db3" => Err(ImportError::Option(format!(
+            "{} is an SQLite database, which is read with the feature \"server\" only",
+            path.display()
+        ))),
+        _ => mcap::scan(path, index),
     }
 }
 
 /// Reads everything of a bag but its pixels. Errors: `Option`, `Io`, `Record`, `Stopped`.
 pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     let mut index = BagIndex::new(source, options, cancelled);
-    let paths = rosbag2::files(source)?;
-    for path in &paths {
-        index.file(path.clone());
-        BagFile::scan(path, &mut index)?;
+    for path in rosbag2::files(source)? {
+        scan(&path, &mut index)?;
     }
-    let chosen = choice::choose(&index, options)?;
-    let used = chosen.actions.iter().chain(&chosen.states).map(|values| values.topic);
-    let used: Vec<usize> = [chosen.image].into_iter().chain(used).collect();
     let mut skipped = std::mem::take(&mut index.skipped);
-    for topic in used {
-        let faults = std::mem::take(&mut index.topics[topic].faults);
-        match faults.first().filter(|_| !options.skip_bad) {
-            Some(fault) => return Err(ImportError::record(&fault.place, &fault.reason)),
-            None => skipped.append(faults),
+    let chosen = choice::choose(&index, options)?;
+    let mut used = vec![chosen.image];
+    used.extend(chosen.actions.iter().chain(&chosen.states).map(|values| values.topic));
+    for (position, topic) in used.iter().enumerate() {
+        if used[..position].iter().any(|earlier| std::ptr::eq(*earlier, *topic)) {
+            continue;
         }
+        if let Some(fault) = topic.faults.first().filter(|_| !options.skip_bad) {
+            return Err(ImportError::record(&fault.place, &fault.reason));
+        }
+        skipped.append(topic.faults.clone());
     }
     let joined = join::join(&index, &chosen)?;
     skipped.append(joined.skipped);
-    let topic = &index.topics[chosen.image];
-    let positions = match &topic.content {
-        Content::Images(entries) => joined
-            .images
-            .iter()
-            .map(|&image| (entries[image].file, entries[image].position)),
-        _ => return Err(ImportError::Option(format!("{} holds no images", topic.name))),
-    };
-    let channels = |values: &[choice::ChosenValues]| values.iter().flat_map(|values| values.channels.clone()).collect();
-    let images = BagImages {
-        files: paths.iter().map(|path| BagFile::open(path)).collect::<Result<_, _>>()?,
-        positions: positions.collect(),
-        kind: topic.kind,
-    };
-    let camera = chosen.projection.as_ref();
+    let channels = |values: &[ChosenValues<'_>]| values.iter().flat_map(|values| values.channels.clone()).collect();
+    let camera = |projection| camera::model(projection, &chosen.image.name, options);
+    let kind = chosen.image.kind;
     Ok(Recording {
         action_channels: channels(&chosen.actions),
         state_channels: channels(&chosen.states),
-        camera: camera.and_then(|projection| camera::model(projection, &topic.name, options)),
+        camera: chosen.projection.and_then(camera),
         skipped,
-        ..Recording::of_images(stem(source, "bag"), joined.records, images)
+        ..Recording::new(
+            stem(source, "bag"),
+            joined.records,
+            BagImages {
+                files: index.files,
+                positions: joined.positions,
+                kind,
+            },
+        )
     })
 }
 
 impl ImageSource for BagImages {
-    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
-        let WantedImage { image, place } = *wanted;
-        let (file, position) = self.positions[image];
+    fn read(&self, wanted: &Record, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let Record { image, place, .. } = wanted;
+        let (file, position) = self.positions[*image];
         let message = self.files[file].message(position)?;
-        let wrong = |error: &dyn std::fmt::Display| ImportError::record(place, error.to_string());
-        let message = compression::message(&message).map_err(|error| wrong(&error))?;
+        let wrong = |reason: String| ImportError::record(place, reason);
+        let message = compression::message(&message).map_err(wrong)?;
         if self.kind == RosType::Image {
-            let (_, image) = messages::image(&message).map_err(|error| wrong(&error))?;
-            return image.gray().map_err(|error| wrong(&error));
+            let (_, image) = messages::image(&message).map_err(wrong)?;
+            return image.gray().map_err(wrong);
         }
-        let (_, _, bytes) = messages::compressed_image(&message).map_err(|error| wrong(&error))?;
+        let (_, _, bytes) = messages::compressed_image(&message).map_err(wrong)?;
         codec::decode(bytes).map_err(ImportError::image(place, "its image"))
     }
 }

@@ -1,6 +1,7 @@
 //! Donkeycar tubs, version 2: `manifest.json`, `catalog_*.catalog` and `images/`.
 
 use std::collections::BTreeSet;
+use std::fmt::Display;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
@@ -11,7 +12,6 @@ use super::image_files::ImageFiles;
 use super::recording::{Record, Recording};
 use super::skipped::{SkippedList, listed, shortened};
 use super::{ImportError, ImportOptions};
-use foreframe_core::types::Channel;
 
 const MANIFEST: &str = "manifest.json";
 /// Lines of the manifest: input names, input types, metadata, times, catalogs.
@@ -38,52 +38,45 @@ impl TubManifest {
     fn read(tub: &Path) -> Result<Self, ImportError> {
         let path = tub.join(MANIFEST);
         let text = read_text(&path)?;
-        let wrong = |line: usize, reason: &str| ImportError::Record {
-            place: format!("{} line {line}", path.display()),
-            reason: reason.to_owned(),
-        };
-        let lines: Vec<Value> = text
-            .lines()
-            .enumerate()
-            .map(|(index, line)| serde_json::from_str(line).map_err(|error| wrong(index + 1, &error.to_string())))
-            .collect::<Result<_, _>>()?;
+        let wrong =
+            |line: usize, reason: &dyn Display| ImportError::record(format!("{} line {line}", path.display()), reason);
+        let parse = |(index, line)| serde_json::from_str(line).map_err(|error| wrong(index + 1, &error));
+        let lines: Vec<Value> = text.lines().enumerate().map(parse).collect::<Result<_, _>>()?;
         let [names, types, _, _, catalogs, ..] = lines.as_slice() else {
-            return Err(wrong(
-                lines.len(),
-                &format!("the file has {} lines of {MANIFEST_LINES}", lines.len()),
-            ));
+            let count = lines.len();
+            return Err(wrong(count, &format!("the file has {count} lines of {MANIFEST_LINES}")));
         };
-        let inputs = texts(names)
-            .zip(texts(types))
-            .map(|(names, types)| names.into_iter().zip(types).collect());
-        let inputs: Option<Vec<(String, String)>> = inputs;
-        let paths =
-            texts(&catalogs["paths"]).ok_or_else(|| wrong(MANIFEST_LINES, "\"paths\" is not a list of file names"))?;
+        let inputs = texts(names).zip(texts(types));
+        let (names, types) =
+            inputs.ok_or_else(|| wrong(1, &"the names and types of the inputs are not lists of texts"))?;
         let deleted = catalogs["deleted_indexes"].as_array();
         Ok(Self {
-            inputs: inputs.ok_or_else(|| wrong(1, "the names and types of the inputs are not lists of texts"))?,
-            catalogs: paths,
+            inputs: names.into_iter().zip(types).collect(),
+            catalogs: texts(&catalogs["paths"])
+                .ok_or_else(|| wrong(MANIFEST_LINES, &"\"paths\" is not a list of file names"))?,
             deleted: deleted.into_iter().flatten().filter_map(Value::as_u64).collect(),
         })
     }
 
-    /// The input that holds the image.
-    fn image(&self, options: &ImportOptions) -> Result<String, ImportError> {
-        let found = match &options.image {
-            Some(name) => self.inputs.iter().find(|(input, _)| input == name),
-            None => self.inputs.iter().find(|(_, kind)| kind == "image_array"),
-        };
-        found
-            .map(|(name, _)| name.clone())
-            .ok_or_else(|| self.missing("an image input", "--image"))
+    fn missing(&self, what: &str, option: &str) -> ImportError {
+        let known = listed(self.inputs.iter().map(|(name, kind)| format!("{name} ({kind})")));
+        ImportError::Option(format!("the tub has no {what} ({option}); its inputs are: {known}"))
     }
 
-    fn missing(&self, what: &str, option: &str) -> ImportError {
-        let known = self.inputs.iter().map(|(name, kind)| format!("{name} ({kind})"));
-        ImportError::Option(format!(
-            "the tub has no {what} ({option}); its inputs are: {}",
-            listed(known)
-        ))
+    /// The inputs of which this is true.
+    fn inputs(&self, is_wanted: impl Fn(&str, &str) -> bool) -> Vec<String> {
+        let wanted = self.inputs.iter().filter(|(name, kind)| is_wanted(name, kind));
+        wanted.map(|(name, _)| name.clone()).collect()
+    }
+
+    /// The input that holds the image.
+    fn image(&self, options: &ImportOptions) -> Result<String, ImportError> {
+        let found = self.inputs(|name, kind| match &options.image {
+            Some(wanted) => name == wanted,
+            None => kind == "image_array",
+        });
+        let first = found.into_iter().next();
+        first.ok_or_else(|| self.missing("an image input", "--image"))
     }
 
     /// The named inputs, which must exist.
@@ -97,14 +90,10 @@ impl TubManifest {
 
     /// The inputs of the action: those named, else every number that the driver gives (`user/…`).
     fn actions(&self, options: &ImportOptions) -> Result<Vec<String>, ImportError> {
-        if !options.actions.is_empty() {
-            return self.named(&options.actions, "--action");
+        match options.actions.as_slice() {
+            [] => Ok(self.inputs(|name, kind| kind == "float" && name.starts_with("user/"))),
+            names => self.named(names, "--action"),
         }
-        let numbers = self
-            .inputs
-            .iter()
-            .filter(|(name, kind)| kind == "float" && name.starts_with("user/"));
-        Ok(numbers.map(|(name, _)| name.clone()).collect())
     }
 }
 
@@ -118,13 +107,11 @@ fn texts(value: &Value) -> Option<Vec<String>> {
 pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     let manifest = TubManifest::read(tub)?;
     let reader = Reader {
-        tub,
+        images: tub.join("images"),
         image: manifest.image(options)?,
         actions: manifest.actions(options)?,
         states: manifest.named(&options.states, "--state")?,
     };
-    // `user/angle` becomes `angle`.
-    let channel = |name: &String| Channel::new(name.rsplit('/').next().unwrap_or(name), &options.unit(name));
     let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
@@ -139,21 +126,20 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
             match parsed {
                 Ok((index, _, _)) if manifest.deleted.contains(&index) => {}
                 Ok((_, image, record)) => {
-                    records.push(Record {
-                        image: paths.len(),
-                        ..record
-                    });
+                    records.push(record);
                     paths.push(image);
                 }
                 Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
             }
         }
     }
+    // `user/angle` becomes `angle`.
+    let channel = |name: &String| options.channel(name.rsplit('/').next().unwrap_or(name), "");
     Ok(Recording {
         action_channels: reader.actions.iter().map(channel).collect(),
         state_channels: reader.states.iter().map(channel).collect(),
         skipped,
-        ..Recording::of_images(folder_name(tub, "tub"), records, ImageFiles(paths))
+        ..Recording::new(folder_name(tub, "tub"), records, ImageFiles(paths))
     })
 }
 
@@ -170,50 +156,49 @@ fn next_line(lines: &mut impl BufRead) -> std::io::Result<Option<Result<String, 
     Ok(Some(String::from_utf8(line).map_err(|error| error.to_string())))
 }
 
-struct Reader<'a> {
-    tub: &'a Path,
+/// What is read of each line.
+struct Reader {
+    /// The folder of the images.
+    images: PathBuf,
     image: String,
     actions: Vec<String>,
     states: Vec<String>,
 }
 
-impl Reader<'_> {
+impl Reader {
     /// Index, image and record of a catalog's line.
     fn record(&self, line: &str, place: &str) -> Result<(u64, PathBuf, Record), ImportError> {
         let fields: Map<String, Value> = serde_json::from_str(line)
             .map_err(|error| ImportError::record(place, format!("not a JSON object: {error}")))?;
-        let wrong = |field: &str, right: &str| {
-            let found = fields.get(field).map_or_else(|| "missing".to_owned(), Value::to_string);
+        let field = |name: &str| fields.get(name).unwrap_or(&Value::Null);
+        let wrong = |name: &str, right: &str| {
+            let found = fields.get(name).map_or_else(|| "missing".to_owned(), Value::to_string);
             let found = shortened(&found, QUOTED_BYTES);
-            ImportError::record(place, format!("{field:?} is {found}; it must be {right}"))
+            ImportError::record(place, format!("{name:?} is {found}; it must be {right}"))
         };
-        let index = fields.get("_index").and_then(Value::as_u64);
-        let index = index.ok_or_else(|| wrong("_index", "a whole number"))?;
-        let time_ms = fields.get("_timestamp_ms").and_then(Value::as_f64);
+        let number = |name: &String| {
+            let value = field(name).as_f64().map(|value| value as f32);
+            value
+                .filter(|value| value.is_finite())
+                .ok_or_else(|| wrong(name, "a finite number"))
+        };
+        let numbers = |names: &[String]| names.iter().map(number).collect::<Result<Vec<f32>, _>>();
+        let index = field("_index")
+            .as_u64()
+            .ok_or_else(|| wrong("_index", "a whole number"))?;
+        let time_ms = field("_timestamp_ms").as_f64();
         let time_ms = time_ms.ok_or_else(|| wrong("_timestamp_ms", "a number of milliseconds"))?;
-        let image = fields.get(&self.image).and_then(Value::as_str);
-        let image = image.ok_or_else(|| wrong(&self.image, "a file's name"))?;
-        let numbers = |names: &[String]| -> Result<Vec<f32>, ImportError> {
-            let number = |name: &String| {
-                let value = fields.get(name).and_then(Value::as_f64).map(|value| value as f32);
-                value
-                    .filter(|value| value.is_finite())
-                    .ok_or_else(|| wrong(name, "a finite number"))
-            };
-            names.iter().map(number).collect()
-        };
+        let image = field(&self.image)
+            .as_str()
+            .ok_or_else(|| wrong(&self.image, "a file's name"))?;
         let record = Record {
             timestamp_s: time_ms / 1000.0,
-            session: fields
-                .get("_session_id")
-                .and_then(Value::as_str)
-                .unwrap_or_default()
-                .to_owned(),
+            session: field("_session_id").as_str().unwrap_or_default().to_owned(),
             action: numbers(&self.actions)?,
             state: numbers(&self.states)?,
             place: place.to_owned(),
             ..Record::default()
         };
-        Ok((index, inside(&self.tub.join("images"), image, place)?, record))
+        Ok((index, inside(&self.images, image, place)?, record))
     }
 }

@@ -1,5 +1,6 @@
 //! Errors of imports: what they mean for the caller, and which of them are damage that may be left out.
 
+use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -120,17 +121,12 @@ impl HasErrorKind for ImportError {
         }
         match self {
             Self::Dataset(error) => error.kind(),
-            Self::UnknownSource(_)
-            | Self::Option(_)
-            | Self::OptionValue { .. }
-            | Self::Record { .. }
-            | Self::Image { .. }
-            | Self::Disk { .. }
-            | Self::Empty(_) => ErrorKind::Usage,
             Self::OutExists { .. } => ErrorKind::Conflict,
-            Self::Io { source, .. } if DAMAGED_INPUT.contains(&source.kind()) => ErrorKind::Usage,
             Self::Cancelled { .. } | Self::Stopped => ErrorKind::Cancelled,
-            Self::Io { .. } | Self::Program(_) => ErrorKind::Internal,
+            Self::Program(_) => ErrorKind::Internal,
+            Self::Io { source, .. } if !DAMAGED_INPUT.contains(&source.kind()) => ErrorKind::Internal,
+            // Something is wrong with the recording or an option.
+            _ => ErrorKind::Usage,
         }
     }
 }
@@ -146,33 +142,22 @@ impl ImportError {
         move |source| Self::Image { place, path, source }
     }
 
-    pub(super) fn record(place: impl Into<String>, reason: impl Into<String>) -> Self {
+    pub(super) fn record(place: impl Display, reason: impl Display) -> Self {
         Self::Record {
-            place: place.into(),
-            reason: reason.into(),
+            place: place.to_string(),
+            reason: reason.to_string(),
         }
     }
 
-    /// The item to list when what is damaged is left out; `None` if it is no damage of a single item.
-    pub(super) fn skippable(&self) -> Option<SkippedItem> {
-        match self {
-            Self::Record { place, reason } => Some(SkippedItem::new(place, reason)),
-            Self::Image { place, path, source } => {
-                let reason = format!("{} is damaged: {source}", path.display());
-                Some(SkippedItem::new(place, &reason))
-            }
-            _ => None,
-        }
-    }
-
-    /// Lists what is damaged, if it may be left out. Errors: itself, if not.
+    /// Lists what is damaged, if it may be left out. Errors: itself, if not, or if it is no damage of a single item.
     pub(super) fn leave_out(self, skip_bad: bool, skipped: &mut SkippedList) -> Result<(), Self> {
-        match self.skippable().filter(|_| skip_bad) {
-            Some(item) => {
-                skipped.push(item);
-                Ok(())
+        skipped.push(match &self {
+            Self::Record { place, reason } if skip_bad => SkippedItem::new(place, reason),
+            Self::Image { place, path, source } if skip_bad => {
+                SkippedItem::new(place, &format!("{} is damaged: {source}", path.display()))
             }
-            None => Err(self),
-        }
+            _ => return Err(self),
+        });
+        Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! Reads the files of a recording, with bounds, and finds them in its folders.
 
 use std::fs::File;
-use std::io::Read as _;
+use std::io::{self, ErrorKind, Read as _};
 use std::path::{Component, Path, PathBuf};
 
 use super::error::ImportError;
@@ -14,17 +14,11 @@ const MAX_TEXT_BYTES: u64 = 32 << 20;
 
 /// Opens a file of a recording. Errors: `Io`, also for what is no regular file: reading a named pipe could take forever.
 pub(super) fn open_file(path: &Path) -> Result<File, ImportError> {
-    let opened = std::fs::metadata(path).and_then(|found| {
-        if found.is_file() {
-            File::open(path)
-        } else {
-            Err(std::io::Error::new(
-                std::io::ErrorKind::InvalidInput,
-                "it is not a regular file",
-            ))
-        }
-    });
-    opened.map_err(ImportError::io("read", path))
+    let irregular = || io::Error::new(ErrorKind::InvalidInput, "it is not a regular file");
+    std::fs::metadata(path)
+        .and_then(|found| found.is_file().then_some(()).ok_or_else(irregular))
+        .and_then(|()| File::open(path))
+        .map_err(ImportError::io("read", path))
 }
 
 pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, ImportError> {
@@ -36,18 +30,16 @@ fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, ImportError> {
     let mut file = open_file(path)?.take(most + 1);
     file.read_to_end(&mut bytes).map_err(ImportError::io("read", path))?;
     if bytes.len() as u64 > most {
-        let reason = format!("it has more than {} MiB", most >> 20);
-        let error = std::io::Error::new(std::io::ErrorKind::InvalidData, reason);
+        let error = io::Error::new(ErrorKind::InvalidData, format!("it has more than {} MiB", most >> 20));
         return Err(ImportError::io("read", path)(error));
     }
     Ok(bytes)
 }
 
 pub(super) fn read_text(path: &Path) -> Result<String, ImportError> {
-    let invalid = |_| std::io::Error::new(std::io::ErrorKind::InvalidData, "it is not UTF-8 text");
-    String::from_utf8(read_at_most(path, MAX_TEXT_BYTES)?)
-        .map_err(invalid)
-        .map_err(ImportError::io("read", path))
+    let invalid = |_| io::Error::new(ErrorKind::InvalidData, "it is not UTF-8 text");
+    let text = String::from_utf8(read_at_most(path, MAX_TEXT_BYTES)?).map_err(invalid);
+    text.map_err(ImportError::io("read", path))
 }
 
 /// What is in a folder, in the natural order of the names. Errors: `Io`.
@@ -65,20 +57,16 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
 
 /// A file of the folder. Errors: `Record` if the name leads out of it.
 pub(super) fn inside(folder: &Path, name: &str, place: &str) -> Result<PathBuf, ImportError> {
-    let relative = Path::new(name);
-    let is_inside = relative
-        .components()
-        .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    let mut parts = Path::new(name).components();
+    let is_inside = parts.all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if name.is_empty() || !is_inside {
-        return Err(ImportError::record(
-            place,
-            format!(
-                "the image's name is {name:?}; it must be a file below {}",
-                folder.display()
-            ),
-        ));
+        let reason = format!(
+            "the image's name is {name:?}; it must be a file below {}",
+            folder.display()
+        );
+        return Err(ImportError::record(place, reason));
     }
-    Ok(folder.join(relative))
+    Ok(folder.join(name))
 }
 
 /// The name of a recording: that of its file without the ending.

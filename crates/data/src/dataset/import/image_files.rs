@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use super::error::ImportError;
 use super::files::read_file;
-use super::recording::{ImageSource, WantedImage};
+use super::recording::{ImageSource, Record};
 use foreframe_core::files::is_transient;
 use foreframe_core::frame::{Frame, codec};
 
@@ -13,9 +13,9 @@ use foreframe_core::frame::{Frame, codec};
 pub(super) struct ImageFiles(pub(super) Vec<PathBuf>);
 
 impl ImageSource for ImageFiles {
-    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
-        let WantedImage { image, place } = *wanted;
-        let path = &self.0[image];
+    fn read(&self, wanted: &Record, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let Record { image, place, .. } = wanted;
+        let path = &self.0[*image];
         codec::decode(&read_image(path, place)?).map_err(ImportError::image(place, path))
     }
 }

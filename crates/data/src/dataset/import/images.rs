@@ -12,18 +12,17 @@ use foreframe_core::types::Channel;
 
 /// Names of the column with the image's file, if none is given.
 const FILE_COLUMNS: [&str; 5] = ["file", "filename", "image", "path", "frame"];
-/// Names of the column with the time, if none is given, and its unit in seconds.
-const TIME_COLUMNS: [(&str, f64); 8] = [
-    ("timestamp", 1.0),
-    ("timestamp_s", 1.0),
-    ("time", 1.0),
-    ("time_s", 1.0),
-    ("t", 1.0),
-    ("timestamp_ms", 1e-3),
-    ("timestamp_us", 1e-6),
-    ("timestamp_ns", 1e-9),
+/// Names of the column with the time, if none is given.
+const TIME_COLUMNS: [&str; 8] = [
+    "timestamp",
+    "timestamp_s",
+    "time",
+    "time_s",
+    "t",
+    "timestamp_ms",
+    "timestamp_us",
+    "timestamp_ns",
 ];
-
 /// What can separate the columns of a CSV file.
 const SEPARATORS: [u8; 3] = *b",;\t";
 /// The largest CSV file.
@@ -70,26 +69,16 @@ fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, Impo
     };
     let record = |(index, path): (usize, &PathBuf)| Record {
         timestamp_s: index as f64 / rate,
-        image: index,
         place: path.display().to_string(),
         ..Record::default()
     };
     let records = paths.iter().enumerate().map(record).collect();
-    let name = stem(folder, "recording");
-    Ok(Recording::of_images(name, records, ImageFiles(paths)))
-}
-
-/// The columns that are used, by position.
-struct Columns {
-    file: usize,
-    time: Option<(usize, f64)>,
-    actions: Vec<usize>,
-    states: Vec<usize>,
+    Ok(Recording::new(stem(folder, "recording"), records, ImageFiles(paths)))
 }
 
 fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     let (mut reader, header) = reader(csv, options)?;
-    let columns = Columns::find(&header, csv, options)?;
+    let columns = header.columns()?;
     let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
     let mut lines = reader.records();
     let mut row = 0;
@@ -98,14 +87,15 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         let next = lines.reader().position().line();
         let place = format!("{} line {}", csv.display(), next.saturating_sub(1).max(row as u64 + 2));
         let parsed = line
-            .map_err(|error| ImportError::record(&place, error.to_string()))
-            .and_then(|line| columns.record(&line, row, &place, folder, options));
+            .map_err(|error| ImportError::record(&place, error))
+            .and_then(|line| {
+                let record = columns.record(&line, row, &place)?;
+                let name = line.get(columns.file).unwrap_or_default();
+                Ok((inside(folder, name, &place)?, record))
+            });
         match parsed {
             Ok((path, record)) => {
-                records.push(Record {
-                    image: paths.len(),
-                    ..record
-                });
+                records.push(record);
                 paths.push(path);
             }
             Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
@@ -113,80 +103,50 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         row += 1;
     }
     Ok(Recording {
-        action_channels: channels(&header, &columns.actions, options),
-        state_channels: channels(&header, &columns.states, options),
+        action_channels: header.channels(&columns.actions),
+        state_channels: header.channels(&columns.states),
         skipped,
-        ..Recording::of_images(stem(folder, "recording"), records, ImageFiles(paths))
+        ..Recording::new(stem(folder, "recording"), records, ImageFiles(paths))
     })
 }
 
 /// A CSV file after its header, and the header. Its columns are separated by what gives the images' column, or else the
 /// most columns. Errors: `Option`, `Io`.
-fn reader(csv: &Path, options: &ImportOptions) -> Result<(csv::Reader<File>, Vec<String>), ImportError> {
+fn reader<'a>(csv: &'a Path, options: &'a ImportOptions) -> Result<(csv::Reader<File>, Header<'a>), ImportError> {
     let bytes = open_file(csv)?.metadata().map_err(ImportError::io("read", csv))?.len();
+    let shown = csv.display();
     if bytes > MAX_CSV_BYTES {
         let (size, most) = (bytes >> 20, MAX_CSV_BYTES >> 20);
-        let reason = format!("{} has {size} MiB; at most {most} MiB are possible", csv.display());
-        return Err(ImportError::Option(reason));
+        return Err(ImportError::Option(format!(
+            "{shown} has {size} MiB; at most {most} MiB are possible"
+        )));
     }
-    let mut best: Option<(csv::Reader<File>, Vec<String>)> = None;
+    let mut best: Option<(csv::Reader<File>, Header<'_>)> = None;
     for separator in SEPARATORS {
         let mut reader = csv::ReaderBuilder::new()
             .delimiter(separator)
             .trim(csv::Trim::All)
             .from_reader(open_file(csv)?);
-        let header = reader.headers().map_err(|error| {
-            let reason = format!("the header of {} cannot be read: {error}", csv.display());
-            ImportError::Option(reason)
-        })?;
-        let header: Vec<String> = header.iter().map(str::to_owned).collect();
-        if image_column(&header, options).is_some() {
+        let names = reader
+            .headers()
+            .map_err(|error| ImportError::Option(format!("the header of {shown} cannot be read: {error}")))?;
+        let header = Header {
+            csv,
+            names: names.iter().map(str::to_owned).collect(),
+            options,
+        };
+        if header.image().is_some() {
             return Ok((reader, header));
         }
-        if best.as_ref().is_none_or(|(_, other)| header.len() > other.len()) {
+        if best
+            .as_ref()
+            .is_none_or(|(_, other)| header.names.len() > other.names.len())
+        {
             best = Some((reader, header));
         }
     }
-    best.filter(|(_, header)| !header.is_empty()).ok_or_else(|| {
-        ImportError::Option(format!(
-            "{} is empty; its first line must name the columns",
-            csv.display()
-        ))
-    })
-}
-
-/// The column of that name, with or without its unit.
-fn position(header: &[String], name: &str) -> Option<usize> {
-    header
-        .iter()
-        .position(|text| text == name || name_and_unit(text).0 == name)
-}
-
-/// The column with the images' files.
-fn image_column(header: &[String], options: &ImportOptions) -> Option<usize> {
-    match &options.image {
-        Some(name) => position(header, name),
-        None => FILE_COLUMNS.iter().find_map(|name| position(header, name)),
-    }
-}
-
-/// The column with the times and its unit in seconds: the unit in the header, or else the one that the name says.
-/// Errors: `Option` for another unit.
-fn time_column(header: &[String], column: usize, by_name_s: f64) -> Result<(usize, f64), ImportError> {
-    let unit_s = match name_and_unit(&header[column]).1 {
-        "" => by_name_s,
-        "s" => 1.0,
-        "ms" => 1e-3,
-        "us" | "µs" | "μs" => 1e-6,
-        "ns" => 1e-9,
-        _ => {
-            return Err(ImportError::Option(format!(
-                "the column of times is {:?}; its unit must be s, ms, us or ns",
-                header[column]
-            )));
-        }
-    };
-    Ok((column, unit_s))
+    best.filter(|(_, header)| !header.names.is_empty())
+        .ok_or_else(|| ImportError::Option(format!("{shown} is empty; its first line must name the columns")))
 }
 
 /// Splits `speed [m/s]` or `speed (m/s)` into name and unit.
@@ -199,94 +159,133 @@ fn name_and_unit(header: &str) -> (&str, &str) {
     (header, "")
 }
 
-fn channels(header: &[String], columns: &[usize], options: &ImportOptions) -> Vec<Channel> {
-    let channel = |&column: &usize| {
-        let (name, unit) = name_and_unit(&header[column]);
-        let given = options.unit(name);
-        Channel::new(name, if given.is_empty() { unit } else { &given })
-    };
-    columns.iter().map(channel).collect()
+/// The first line of a CSV file.
+struct Header<'a> {
+    csv: &'a Path,
+    names: Vec<String>,
+    options: &'a ImportOptions,
 }
 
-impl Columns {
-    fn find(header: &[String], csv: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
-        let columns = || listed(header.iter().map(|name| name.escape_debug().to_string()));
-        let position = |name: &str| position(header, name);
-        let missing = |name: &str, option: &str| {
-            ImportError::Option(format!(
-                "{} has no column \"{name}\" ({option}); its columns are: {}",
-                csv.display(),
-                columns()
-            ))
-        };
-        let wanted = |names: &[String], option: &str| -> Result<Vec<usize>, ImportError> {
-            let find = |name: &String| position(name).ok_or_else(|| missing(name, option));
-            names.iter().map(find).collect()
-        };
-        let prefixed = |prefix: &str| -> Vec<usize> {
-            let is_of = |text: &String| {
-                text.strip_prefix(prefix)
-                    .is_some_and(|rest| rest.starts_with(['.', '_', '/']))
-            };
-            (0..header.len()).filter(|&column| is_of(&header[column])).collect()
-        };
-        let file = image_column(header, options).ok_or_else(|| match &options.image {
-            Some(name) => missing(name, "--image"),
-            None => missing("file", "name the images' column with --image"),
-        })?;
-        let time = match &options.time {
-            Some(name) => Some((
-                position(name).ok_or_else(|| missing(name, "--time"))?,
-                seconds_per_unit(name_and_unit(name).0),
-            )),
-            None => TIME_COLUMNS
-                .iter()
-                .find_map(|(name, unit_s)| position(name).map(|column| (column, *unit_s))),
-        };
-        let time = time
-            .map(|(column, unit_s)| time_column(header, column, unit_s))
-            .transpose()?;
-        if time.is_none() && options.rate_hz.is_none() {
-            return Err(ImportError::Option(format!(
-                "{} has no column of times (its columns are: {}); name it with --time, or give --rate",
-                csv.display(),
-                columns()
-            )));
+impl Header<'_> {
+    /// The column of that name, with or without its unit.
+    fn position(&self, name: &str) -> Option<usize> {
+        let is_named = |text: &String| text == name || name_and_unit(text).0 == name;
+        self.names.iter().position(is_named)
+    }
+
+    /// The column of a name that was given. Errors: `Option`.
+    fn named(&self, name: &str, option: &str) -> Result<usize, ImportError> {
+        self.position(name).ok_or_else(|| self.missing(name, option))
+    }
+
+    fn missing(&self, name: &str, option: &str) -> ImportError {
+        let (csv, names) = (self.csv.display(), self.listed());
+        ImportError::Option(format!(
+            "{csv} has no column \"{name}\" ({option}); its columns are: {names}"
+        ))
+    }
+
+    fn listed(&self) -> String {
+        listed(self.names.iter().map(|name| name.escape_debug().to_string()))
+    }
+
+    /// The column with the images' files.
+    fn image(&self) -> Option<usize> {
+        match &self.options.image {
+            Some(name) => self.position(name),
+            None => FILE_COLUMNS.iter().find_map(|name| self.position(name)),
         }
-        let chosen = |names: &[String], prefix: &str| match names {
-            [] => Ok(prefixed(prefix)),
-            names => wanted(names, &format!("--{prefix}")),
+    }
+
+    /// The column with the times and its unit in seconds: the unit in the header, or else the one that the name says. `None`
+    /// if the frames come at a known rate instead. Errors: `Option` without times, or for another unit.
+    fn time(&self) -> Result<Option<(usize, f64)>, ImportError> {
+        let usual = || TIME_COLUMNS.iter().find_map(|name| self.position(name));
+        let column = match &self.options.time {
+            Some(name) => Some(self.named(name, "--time")?),
+            None => usual(),
         };
-        Ok(Self {
-            file,
-            time,
-            actions: chosen(&options.actions, "action")?,
-            states: chosen(&options.states, "state")?,
+        let Some(column) = column else {
+            if self.options.rate_hz.is_some() {
+                return Ok(None);
+            }
+            let (csv, names) = (self.csv.display(), self.listed());
+            return Err(ImportError::Option(format!(
+                "{csv} has no column of times (its columns are: {names}); name it with --time, or give --rate"
+            )));
+        };
+        let (name, unit) = name_and_unit(&self.names[column]);
+        let unit_s = match unit {
+            "" => seconds_per_unit(name),
+            "s" => 1.0,
+            "ms" => 1e-3,
+            "us" | "µs" | "μs" => 1e-6,
+            "ns" => 1e-9,
+            _ => {
+                return Err(ImportError::Option(format!(
+                    "the column of times is {:?}; its unit must be s, ms, us or ns",
+                    self.names[column]
+                )));
+            }
+        };
+        Ok(Some((column, unit_s)))
+    }
+
+    /// The columns named, else those whose names begin with the prefix. Errors: `Option`.
+    fn chosen(&self, names: &[String], prefix: &str) -> Result<Vec<usize>, ImportError> {
+        if !names.is_empty() {
+            let option = format!("--{prefix}");
+            return names.iter().map(|name| self.named(name, &option)).collect();
+        }
+        let is_of = |&column: &usize| {
+            let rest = self.names[column].strip_prefix(prefix);
+            rest.is_some_and(|rest| rest.starts_with(['.', '_', '/']))
+        };
+        Ok((0..self.names.len()).filter(is_of).collect())
+    }
+
+    /// The columns that are used. Errors: `Option`.
+    fn columns(&self) -> Result<Columns, ImportError> {
+        let options = self.options;
+        Ok(Columns {
+            file: self.image().ok_or_else(|| match &options.image {
+                Some(name) => self.missing(name, "--image"),
+                None => self.missing("file", "name the images' column with --image"),
+            })?,
+            time: self.time()?,
+            period_s: options.rate_hz.map_or(1.0, f64::recip),
+            actions: self.chosen(&options.actions, "action")?,
+            states: self.chosen(&options.states, "state")?,
         })
     }
 
-    #[expect(clippy::too_many_arguments, reason = "a line, its place and what it refers to")]
-    fn record(
-        &self,
-        line: &csv::StringRecord,
-        row: usize,
-        place: &str,
-        folder: &Path,
-        options: &ImportOptions,
-    ) -> Result<(PathBuf, Record), ImportError> {
-        let text = |column: usize| line.get(column).unwrap_or_default();
-        let number = |column: usize| -> Result<f64, ImportError> {
+    fn channels(&self, columns: &[usize]) -> Vec<Channel> {
+        let names = columns.iter().map(|&column| name_and_unit(&self.names[column]));
+        names.map(|(name, unit)| self.options.channel(name, unit)).collect()
+    }
+}
+
+/// The columns that are used, by position.
+struct Columns {
+    file: usize,
+    /// The times and their unit in seconds.
+    time: Option<(usize, f64)>,
+    /// From one row to the next, without times.
+    period_s: f64,
+    actions: Vec<usize>,
+    states: Vec<usize>,
+}
+
+impl Columns {
+    /// The record of a line. Errors: `Record`.
+    fn record(&self, line: &csv::StringRecord, row: usize, place: &str) -> Result<Record, ImportError> {
+        let number = |column: usize| {
+            let text = line.get(column).unwrap_or_default();
             // Data sets hold 32 bits.
-            let value = text(column)
-                .parse::<f64>()
-                .ok()
-                .filter(|value| (*value as f32).is_finite());
+            let value = text.parse().ok().filter(|value: &f64| (*value as f32).is_finite());
             value.ok_or_else(|| {
-                let reason = format!(
-                    "column {} is {:?}; it must be a finite number, as in 0.5",
-                    column + 1,
-                    text(column)
-                );
+                let column = column + 1;
+                let reason = format!("column {column} is {text:?}; it must be a finite number, as in 0.5");
                 ImportError::record(place, reason)
             })
         };
@@ -296,18 +295,16 @@ impl Columns {
                 .map(|&column| number(column).map(|value| value as f32))
                 .collect()
         };
-        let timestamp_s = match self.time {
-            Some((column, unit_s)) => number(column)? * unit_s,
-            None => row as f64 * options.rate_hz.map_or(1.0, f64::recip),
-        };
-        let record = Record {
-            timestamp_s,
+        Ok(Record {
+            timestamp_s: match self.time {
+                Some((column, unit_s)) => number(column)? * unit_s,
+                None => row as f64 * self.period_s,
+            },
             action: numbers(&self.actions)?,
             state: numbers(&self.states)?,
             place: place.to_owned(),
             ..Record::default()
-        };
-        Ok((inside(folder, text(self.file), place)?, record))
+        })
     }
 }
 

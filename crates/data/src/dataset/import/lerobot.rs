@@ -9,16 +9,17 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use indexmap::IndexMap;
+
 use self::description::{Component, Description, INFO};
 use self::episodes::{EpisodeEntry, VideoPart};
 use self::images::ImageTable;
 use self::rows::{Row, read_rows};
 use super::files::folder_name;
-use super::recording::{ImageSource, Record, Recording};
+use super::recording::{Record, Recording};
 use super::skipped::SkippedList;
 use super::video::{ListedFrames, VideoFrames, frames_of};
 use super::{ImportError, ImportOptions};
-use foreframe_core::types::Channel;
 
 /// Whether a directory holds a data set of `LeRobot`.
 pub(super) fn is_lerobot(source: &Path) -> bool {
@@ -36,109 +37,54 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
     let mut reader = EpisodeReader {
         source,
         skip_bad: options.skip_bad,
-        is_video: image.is_video,
         action_count: actions.len(),
         records: Vec::new(),
         skipped: SkippedList::default(),
         places: Vec::new(),
-        videos: VideoTimes::default(),
+        videos: IndexMap::new(),
         cancelled,
     };
     let mut tables: Vec<PathBuf> = Vec::new();
     for of_table in episodes.chunk_by(|a, b| a.table == b.table) {
-        let Some(first) = of_table.first() else { continue };
-        let path = source.join(&first.table);
-        let rows = read_rows(&path, &first.table, &columns)?;
+        let table = &of_table[0].table;
+        let path = source.join(table);
+        let rows = read_rows(&path, table, &columns)?;
         reader.take(tables.len(), &rows, of_table)?;
         tables.push(path);
     }
-    let channel = |component: &Component| Channel::new(&component.name, &options.unit(&component.name));
-    let images: Box<dyn ImageSource> = if image.is_video {
-        Box::new(VideoFrames::new(reader.videos.paths(), reader.places))
+    let name = folder_name(source, "lerobot");
+    let EpisodeReader {
+        records,
+        places,
+        videos,
+        ..
+    } = reader;
+    let recording = if image.is_video {
+        let videos = videos.into_iter().map(|(path, times_s)| (path, times_s.len()));
+        Recording::new(name, records, VideoFrames::new(videos.collect(), places))
     } else {
-        Box::new(ImageTable::new(source, &image.name, tables, reader.places))
+        Recording::new(name, records, ImageTable::new(source, &image.name, tables, places))
     };
+    let channel = |component: &Component| options.channel(&component.name, "");
     Ok(Recording {
-        name: folder_name(source, "lerobot"),
         action_channels: actions.iter().map(channel).collect(),
         state_channels: states.iter().map(channel).collect(),
-        camera: None,
-        records: reader.records,
-        images,
         skipped: reader.skipped,
+        ..recording
     })
-}
-
-/// The presentation times of the videos' frames, each video probed once.
-#[derive(Default)]
-struct VideoTimes {
-    files: Vec<(PathBuf, Vec<f64>)>,
-    by_path: BTreeMap<PathBuf, usize>,
-}
-
-impl VideoTimes {
-    /// The video's number and, when it is probed, what is wrong with it.
-    fn probe(&mut self, path: &Path, cancelled: &AtomicBool) -> Result<(usize, Option<ImportError>), ImportError> {
-        if let Some(&number) = self.by_path.get(path) {
-            return Ok((number, None));
-        }
-        if !path.is_file() {
-            return Err(ImportError::record(path.display().to_string(), "the video is missing"));
-        }
-        let ListedFrames { times_s, damage } = frames_of(path, cancelled)?;
-        if !times_s.is_sorted() {
-            return Err(ImportError::record(
-                path.display().to_string(),
-                "its frames are not in the order of their times",
-            ));
-        }
-        self.files.push((path.to_owned(), times_s));
-        self.by_path.insert(path.to_owned(), self.files.len() - 1);
-        Ok((self.files.len() - 1, damage))
-    }
-
-    /// The frame nearest to a time, if one is within half a frame.
-    fn frame_at(&self, number: usize, time_s: f64) -> Option<usize> {
-        let (_, times_s) = self.files.get(number)?;
-        let last = times_s.len().checked_sub(1)?;
-        let period_s = (times_s.last()? - times_s.first()?) / last.max(1) as f64;
-        let after = times_s.partition_point(|&frame_s| frame_s < time_s);
-        let distance = |frame: &usize| {
-            times_s
-                .get(*frame)
-                .map_or(f64::INFINITY, |frame_s| (frame_s - time_s).abs())
-        };
-        let nearest = [after.saturating_sub(1), after]
-            .into_iter()
-            .min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
-        // Times of the table are 32-bit floats.
-        (distance(&nearest) <= 0.5 * period_s + 1e-3).then_some(nearest)
-    }
-
-    fn end_s(&self, number: usize) -> f64 {
-        let last = self.files.get(number).and_then(|(_, times_s)| times_s.last());
-        last.copied().unwrap_or_default()
-    }
-
-    fn paths(&self) -> Vec<(PathBuf, usize)> {
-        self.files
-            .iter()
-            .map(|(path, times_s)| (path.clone(), times_s.len()))
-            .collect()
-    }
 }
 
 /// Collects the records of all tables.
 struct EpisodeReader<'a> {
     source: &'a Path,
     skip_bad: bool,
-    is_video: bool,
     action_count: usize,
     records: Vec<Record>,
     skipped: SkippedList,
     /// Where each image is: table or video, and row or frame.
     places: Vec<(usize, usize)>,
-    videos: VideoTimes,
+    /// The presentation times of the videos' frames.
+    videos: IndexMap<PathBuf, Vec<f64>>,
     cancelled: &'a AtomicBool,
 }
 
@@ -151,20 +97,15 @@ impl EpisodeReader<'_> {
         }
         for episode in episodes {
             let own = by_episode.remove(&episode.index).unwrap_or_default();
-            if own.len() != episode.length {
-                let error = ImportError::record(
-                    format!(
-                        "{} episode {}",
-                        self.source.join(&episode.table).display(),
-                        episode.index
-                    ),
-                    format!(
-                        "the table has {} rows of this episode; the metadata states {}",
-                        own.len(),
-                        episode.length
-                    ),
+            let (found, stated) = (own.len(), episode.length);
+            if found != stated {
+                let place = format!(
+                    "{} episode {}",
+                    self.source.join(&episode.table).display(),
+                    episode.index
                 );
-                self.leave_out(error)?;
+                let reason = format!("the table has {found} rows of this episode; the metadata states {stated}");
+                self.leave_out(ImportError::record(place, reason))?;
             }
             if let Err(error) = self.take_episode(table, &own, episode) {
                 self.leave_out(error)?;
@@ -181,55 +122,78 @@ impl EpisodeReader<'_> {
         episode: &EpisodeEntry,
     ) -> Result<(), ImportError> {
         let video = match &episode.video {
-            Some(part) if self.is_video => {
-                let (number, damage) = self.videos.probe(&self.source.join(&part.path), self.cancelled)?;
-                damage.map_or(Ok(()), |damage| self.leave_out(damage))?;
-                Some((number, part))
-            }
-            _ => None,
+            Some(part) => Some((self.probe(self.source.join(&part.path))?, part)),
+            None => None,
         };
         for &(index, row) in rows {
             let place = format!("{} row {index}", self.source.join(&episode.table).display());
             if let Some(column) = &row.bad {
-                return Err(ImportError::record(
-                    place,
-                    format!("{column} is not a finite number in every component"),
-                ));
+                let reason = format!("{column} is not a finite number in every component");
+                return Err(ImportError::record(place, reason));
             }
-            let image = match video {
-                Some((number, part)) => (number, self.frame_of(number, part, row, &place)?),
+            self.places.push(match video {
+                Some((number, part)) => (number, frame_at(&self.videos[number], part, row, &place)?),
                 None => (table, index),
-            };
-            let (action, state) = row.values.split_at(self.action_count.min(row.values.len()));
+            });
+            let (action, state) = row.values.split_at(self.action_count);
             self.records.push(Record {
                 timestamp_s: row.timestamp_s,
                 session: episode.index.to_string(),
                 action: action.to_vec(),
                 state: state.to_vec(),
-                image: self.places.len(),
                 place,
+                ..Record::default()
             });
-            self.places.push(image);
         }
         Ok(())
     }
 
-    fn frame_of(&self, video: usize, part: &VideoPart, row: &Row, place: &str) -> Result<usize, ImportError> {
-        let time_s = part.from_s + row.timestamp_s;
-        self.videos.frame_at(video, time_s).ok_or_else(|| {
-            ImportError::record(
-                place,
-                format!(
-                    "{} has no frame at {time_s:.3} s, it ends at {:.3} s: the video is shorter than its table",
-                    part.path.display(),
-                    self.videos.end_s(video)
-                ),
-            )
-        })
+    /// The number of a video, whose frames are listed when it is needed first.
+    fn probe(&mut self, path: PathBuf) -> Result<usize, ImportError> {
+        if let Some(number) = self.videos.get_index_of(&path) {
+            return Ok(number);
+        }
+        let wrong = |reason: &str| Err(ImportError::record(path.display(), reason));
+        if !path.is_file() {
+            return wrong("the video is missing");
+        }
+        let ListedFrames { times_s, damage } = frames_of(&path, self.cancelled)?;
+        if !times_s.is_sorted() {
+            return wrong("its frames are not in the order of their times");
+        }
+        damage.map_or(Ok(()), |damage| self.leave_out(damage))?;
+        Ok(self.videos.insert_full(path, times_s).0)
     }
 
     /// Lists what is damaged, if it may be left out.
     fn leave_out(&mut self, error: ImportError) -> Result<(), ImportError> {
         error.leave_out(self.skip_bad, &mut self.skipped)
     }
+}
+
+/// The frame nearest to a row's time. Errors: `Record` if none is within half a frame.
+fn frame_at(times_s: &[f64], part: &VideoPart, row: &Row, place: &str) -> Result<usize, ImportError> {
+    let time_s = part.from_s + row.timestamp_s;
+    let (start_s, end_s) = (times_s[0], times_s[times_s.len() - 1]);
+    let period_s = (end_s - start_s) / (times_s.len() - 1).max(1) as f64;
+    let distance = |frame: usize| {
+        times_s
+            .get(frame)
+            .map_or(f64::INFINITY, |frame_s| (frame_s - time_s).abs())
+    };
+    let after = times_s.partition_point(|&frame_s| frame_s < time_s);
+    let before = after.saturating_sub(1);
+    let nearest = if distance(before) <= distance(after) {
+        before
+    } else {
+        after
+    };
+    // Times of the table are 32-bit floats.
+    if distance(nearest) <= 0.5 * period_s + 1e-3 {
+        return Ok(nearest);
+    }
+    let path = part.path.display();
+    let reason =
+        format!("{path} has no frame at {time_s:.3} s, it ends at {end_s:.3} s: the video is shorter than its table");
+    Err(ImportError::record(place, reason))
 }

@@ -7,31 +7,30 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use zip::read::ZipFile;
-use zip::result::ZipError;
 use zip::{CompressionMethod, ZipArchive};
 
 use super::files::{open_file, stem};
-use super::numpy::{ArrayHeader, FrameLayout, FramePosition};
+use super::numpy::ArrayHeader;
+use super::raw_images::{FrameLayout, FramePosition, RawImages};
 use super::recording::{Record, Recording, seconds_per_unit};
 use super::skipped::listed;
 use super::{ImportConfig, ImportError, ImportOptions};
-use foreframe_core::files::partial_path;
+use foreframe_core::files::{PositionedFile, partial_path};
 use foreframe_core::types::Channel;
 
 /// Names of the arrays if none are given.
 const FRAMES: [&str; 6] = ["frames", "images", "image", "observations", "obs", "video"];
 const ACTIONS: [&str; 2] = ["actions", "action"];
 const STATES: [&str; 2] = ["states", "state"];
-/// Names of times, and their unit in seconds.
-const TIMES: [(&str, f64); 8] = [
-    ("timestamps", 1.0),
-    ("timestamp", 1.0),
-    ("times", 1.0),
-    ("time", 1.0),
-    ("timestamps_s", 1.0),
-    ("timestamps_ms", 1e-3),
-    ("timestamps_us", 1e-6),
-    ("timestamps_ns", 1e-9),
+const TIMES: [&str; 8] = [
+    "timestamps",
+    "timestamp",
+    "times",
+    "time",
+    "timestamps_s",
+    "timestamps_ms",
+    "timestamps_us",
+    "timestamps_ns",
 ];
 /// One byte of a deflated array becomes at most this many.
 const MAX_COMPRESSION: u64 = 1033;
@@ -47,78 +46,63 @@ pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Reco
     let (path, options) = (config.source.as_path(), &config.options);
     let mut npz = Npz::open(path)?;
     let frames = npz.frames(options)?;
-    let header = npz.header(&frames)?;
-    let layout = FrameLayout::of(&header, &npz.place(&frames))?;
-    npz.check_size(&frames, &header)?;
-    let mut read = |given: &[String], usual: &[&str], what: &'static str| {
-        let names = npz.chosen(given, usual, what)?;
-        let rows = names.iter().map(|name| npz.rows(name, &layout));
-        Ok::<_, ImportError>((rows.collect::<Result<Vec<_>, _>>()?, names))
-    };
-    let (actions, action_names) = read(&options.actions, &ACTIONS, "--action")?;
-    let (states, state_names) = read(&options.states, &STATES, "--state")?;
-    let times = npz.times(options, &layout)?;
     let place = npz.place(&frames);
-    let mut records = Vec::new();
-    for at in layout.positions() {
+    let header = ArrayHeader::read(npz.entry(&frames)?, &place)?;
+    let layout = FrameLayout::of(header.number, &header.shape, &place)?;
+    npz.check_size(&frames, &header)?;
+    let actions = npz.chosen(&options.actions, &ACTIONS, "--action", &layout)?;
+    let states = npz.chosen(&options.states, &STATES, "--state", &layout)?;
+    let times = npz.times(options, &layout)?;
+    // Without times, there is a rate.
+    let period_s = options.rate_hz.map_or(1.0, f64::recip);
+    let record = |at: FramePosition| {
         let of = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.at(at.index)).collect();
-        records.push(Record {
+        let time_s = times.as_ref().map_or(at.frame as f64 * period_s, |(rows, unit_s)| {
+            rows.values[at.index] * unit_s
+        });
+        Record {
             action: of(&actions),
             state: of(&states),
-            ..at.record(records.len(), times.at(&at), &place)
-        });
-    }
-    let (pixels, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
-    let images = layout.images(&pixels, file, start);
+            ..at.record(time_s, &place)
+        }
+    };
+    let records = layout.positions().map(record).collect();
+    let (path_of_frames, file, start) = npz.pixels(&frames, &header, config, cancelled)?;
+    let images = RawImages {
+        path: path_of_frames,
+        file: PositionedFile::new(file),
+        start,
+        layout,
+    };
+    let channels = |arrays: &[ArrayRows]| arrays.iter().flat_map(|rows| rows.channels(options)).collect();
     Ok(Recording {
-        action_channels: channels(&action_names, &actions, options),
-        state_channels: channels(&state_names, &states, options),
-        ..Recording::of_images(stem(path, "array"), records, images)
+        action_channels: channels(&actions),
+        state_channels: channels(&states),
+        ..Recording::new(stem(path, "array"), records, images)
     })
 }
 
 /// An array of one row of numbers per frame.
 struct ArrayRows {
+    name: String,
     values: Vec<f64>,
     width: usize,
 }
 
 impl ArrayRows {
-    fn at(&self, frame: usize) -> Vec<f32> {
+    fn at(&self, frame: usize) -> impl Iterator<Item = f32> {
         let row = &self.values[frame * self.width..(frame + 1) * self.width];
-        row.iter().map(|&value| value as f32).collect()
+        row.iter().map(|&value| value as f32)
     }
-}
 
-/// When each frame was taken.
-enum FrameTimes {
-    /// An array, and its unit in seconds.
-    Array(ArrayRows, f64),
-    /// Frames per second.
-    Rate(f64),
-}
-
-impl FrameTimes {
-    fn at(&self, at: &FramePosition) -> f64 {
-        match self {
-            Self::Array(rows, unit_s) => rows.values[at.index] * unit_s,
-            Self::Rate(rate) => at.frame as f64 / rate,
+    fn channels(&self, options: &ImportOptions) -> Vec<Channel> {
+        match self.width {
+            1 => vec![options.channel(&self.name, "")],
+            width => (0..width)
+                .map(|component| options.channel(&format!("{}.{component}", self.name), ""))
+                .collect(),
         }
     }
-}
-
-fn channels(names: &[String], arrays: &[ArrayRows], options: &ImportOptions) -> Vec<Channel> {
-    let mut channels = Vec::new();
-    for (name, rows) in names.iter().zip(arrays) {
-        for component in 0..rows.width {
-            let name = match rows.width {
-                1 => name.clone(),
-                _ => format!("{name}.{component}"),
-            };
-            channels.push(Channel::new(&name, &options.unit(&name)));
-        }
-    }
-    channels
 }
 
 /// An open archive.
@@ -131,20 +115,16 @@ struct Npz {
 
 impl Npz {
     fn open(path: &Path) -> Result<Self, ImportError> {
-        let file = open_file(path)?;
-        let wrong = |error: ZipError| {
+        let archive = ZipArchive::new(open_file(path)?).map_err(|error| {
             let reason = format!("this is not a .npz file of numpy.savez, or it was cut off: {error}");
-            ImportError::record(path.display().to_string(), reason)
-        };
-        let archive = ZipArchive::new(file).map_err(wrong)?;
+            ImportError::record(path.display(), reason)
+        })?;
         let names = archive.file_names().filter_map(Result::ok);
-        let names = names
-            .filter_map(|name| name.strip_suffix(".npy").map(str::to_owned))
-            .collect();
+        let names = names.filter_map(|name| name.strip_suffix(".npy").map(str::to_owned));
         Ok(Self {
             path: path.to_owned(),
+            names: names.collect(),
             archive,
-            names,
         })
     }
 
@@ -153,53 +133,77 @@ impl Npz {
     }
 
     fn missing(&self, what: &str, option: &str) -> ImportError {
-        ImportError::Option(format!(
-            "{} has no {what} ({option}); its arrays are: {}",
-            self.path.display(),
-            listed(&self.names)
-        ))
+        let (path, names) = (self.path.display(), listed(&self.names));
+        ImportError::Option(format!("{path} has no {what} ({option}); its arrays are: {names}"))
     }
 
     fn has(&self, name: &str) -> bool {
         self.names.iter().any(|known| known == name)
     }
 
+    /// The array that was named, else the first of the usual names. Errors: `Option` if there is none of the name given.
+    fn find(&self, given: Option<&String>, usual: &[&str], option: &str) -> Result<Option<String>, ImportError> {
+        match given {
+            Some(name) if self.has(name) => Ok(Some(name.clone())),
+            Some(name) => Err(self.missing(&format!("array \"{name}\""), option)),
+            None => Ok(usual.iter().find(|name| self.has(name)).map(|name| (*name).to_owned())),
+        }
+    }
+
     /// The array of the frames: the one named, one of the usual names, or the only one.
     fn frames(&self, options: &ImportOptions) -> Result<String, ImportError> {
-        if let Some(name) = &options.image {
-            let known = self.has(name).then(|| name.clone());
-            return known.ok_or_else(|| self.missing(&format!("array \"{name}\""), "--image"));
-        }
-        if let Some(name) = FRAMES.iter().find(|name| self.has(name)) {
-            return Ok((*name).to_owned());
-        }
-        match self.names.as_slice() {
-            [only] => Ok(only.clone()),
-            _ => Err(self.missing(&format!("array named {}", FRAMES.join(", ")), "--image")),
+        let found = self.find(options.image.as_ref(), &FRAMES, "--image")?;
+        match (found, self.names.as_slice()) {
+            (Some(name), _) => Ok(name),
+            (None, [only]) => Ok(only.clone()),
+            (None, _) => Err(self.missing(&format!("array named {}", FRAMES.join(", ")), "--image")),
         }
     }
 
     /// The arrays named, or the one of the usual names.
-    fn chosen(&self, given: &[String], usual: &[&str], option: &str) -> Result<Vec<String>, ImportError> {
-        if let Some(name) = given.iter().find(|name| !self.has(name)) {
-            return Err(self.missing(&format!("array \"{name}\""), option));
+    fn chosen(
+        &mut self,
+        given: &[String],
+        usual: &[&str],
+        option: &str,
+        layout: &FrameLayout,
+    ) -> Result<Vec<ArrayRows>, ImportError> {
+        let mut names = Vec::new();
+        for name in given {
+            names.extend(self.find(Some(name), &[], option)?);
         }
-        let found = usual.iter().find(|name| self.has(name));
-        let found = found.map(|name| (*name).to_owned()).into_iter().collect();
-        Ok(if given.is_empty() { found } else { given.to_vec() })
+        if given.is_empty() {
+            names.extend(self.find(None, usual, option)?);
+        }
+        names.iter().map(|name| self.rows(name, layout)).collect()
+    }
+
+    fn times(
+        &mut self,
+        options: &ImportOptions,
+        layout: &FrameLayout,
+    ) -> Result<Option<(ArrayRows, f64)>, ImportError> {
+        let Some(name) = self.find(options.time.as_ref(), &TIMES, "--time")? else {
+            if options.rate_hz.is_some() {
+                return Ok(None);
+            }
+            return Err(self.missing("array of timestamps, nor a rate", "--time, --rate"));
+        };
+        let rows = self.rows(&name, layout)?;
+        match rows.width {
+            1 => Ok(Some((rows, seconds_per_unit(&name)))),
+            width => {
+                let reason = format!("it has {width} numbers per frame; timestamps have one");
+                Err(ImportError::record(self.place(&name), reason))
+            }
+        }
     }
 
     /// An array's file in the archive. Errors: `Record`.
     fn entry(&mut self, name: &str) -> Result<ZipFile<'_, File>, ImportError> {
         let place = self.place(name);
         let entry = self.archive.by_name(&format!("{name}.npy"));
-        entry.map_err(|error| ImportError::record(place, error.to_string()))
-    }
-
-    /// Reads an array's beginning. Errors: `Record`, `Io`.
-    fn header(&mut self, name: &str) -> Result<ArrayHeader, ImportError> {
-        let place = self.place(name);
-        ArrayHeader::read(self.entry(name)?, &place)
+        entry.map_err(|error| ImportError::record(place, error))
     }
 
     /// Checks that the archive can hold an array of this shape. Errors: `Record`.
@@ -212,10 +216,8 @@ impl Npz {
             .size()
             .min(entry.compressed_size().saturating_mul(MAX_COMPRESSION));
         if found < needed {
-            let reason = format!(
-                "it has {found} bytes at most; its shape {:?} needs {needed}",
-                header.shape
-            );
+            let shape = &header.shape;
+            let reason = format!("it has {found} bytes at most; its shape {shape:?} needs {needed}");
             return Err(ImportError::record(place, reason));
         }
         Ok(())
@@ -227,28 +229,22 @@ impl Npz {
         let wrong = |reason: String| ImportError::record(&place, reason);
         let mut entry = self.entry(name)?;
         let header = ArrayHeader::read(&mut entry, &place)?;
-        let Some(rest) = header.shape.strip_prefix(layout.leading.as_slice()) else {
+        let (shape, leading) = (&header.shape, &layout.leading);
+        let Some(rest) = shape.strip_prefix(leading.as_slice()) else {
             return Err(wrong(format!(
-                "its shape is {:?}; it must begin with {:?}, as that of the frames",
-                header.shape, layout.leading
+                "its shape is {shape:?}; it must begin with {leading:?}, as that of the frames"
             )));
         };
-        let width = rest.iter().try_fold(1usize, |width, &side| width.checked_mul(side));
-        let count = width.and_then(|width| width.checked_mul(layout.sequences * layout.frames));
-        let bytes = count.and_then(|count| (count as u64).checked_mul(header.number.bytes() as u64));
-        let (Some(width), Some(bytes)) = (width, bytes.filter(|bytes| *bytes <= MAX_VALUES_BYTES)) else {
-            return Err(wrong(format!("its shape {:?} is too large", header.shape)));
-        };
+        let bytes = header.bytes();
+        let width = rest.iter().fold(1, |width: usize, side| width.saturating_mul(*side));
+        if bytes.max(width as u64) > MAX_VALUES_BYTES {
+            return Err(wrong(format!("its shape {shape:?} is too large")));
+        }
         let mut content = Vec::new();
-        entry
-            .take(bytes)
-            .read_to_end(&mut content)
-            .map_err(|error| wrong(format!("it cannot be decompressed: {error}")))?;
-        if content.len() as u64 != bytes {
-            return Err(wrong(format!(
-                "it has {} bytes; its shape needs {bytes}",
-                content.len()
-            )));
+        let read = entry.take(bytes).read_to_end(&mut content);
+        let found = read.map_err(|error| wrong(format!("it cannot be decompressed: {error}")))? as u64;
+        if found != bytes {
+            return Err(wrong(format!("it has {found} bytes; its shape needs {bytes}")));
         }
         let values = header.number.values(&content);
         match values.iter().position(|value| !(*value as f32).is_finite()) {
@@ -256,30 +252,11 @@ impl Npz {
                 "value {at} is {}; it must be a finite number",
                 values[at]
             ))),
-            None => Ok(ArrayRows { values, width }),
-        }
-    }
-
-    fn times(&mut self, options: &ImportOptions, layout: &FrameLayout) -> Result<FrameTimes, ImportError> {
-        let usual = TIMES.iter().find(|(name, _)| self.has(name));
-        let (name, unit_s) = match (&options.time, usual) {
-            (Some(name), _) if !self.has(name) => {
-                return Err(self.missing(&format!("array \"{name}\""), "--time"));
-            }
-            (Some(name), _) => (name.clone(), seconds_per_unit(name)),
-            (None, Some((name, unit_s))) => ((*name).to_owned(), *unit_s),
-            (None, None) => {
-                let rate = options.rate_hz.map(FrameTimes::Rate);
-                return rate.ok_or_else(|| self.missing("array of timestamps, nor a rate", "--time, --rate"));
-            }
-        };
-        let rows = self.rows(&name, layout)?;
-        match rows.width {
-            1 => Ok(FrameTimes::Array(rows, unit_s)),
-            width => Err(ImportError::record(
-                self.place(&name),
-                format!("it has {width} numbers per frame; timestamps have one"),
-            )),
+            None => Ok(ArrayRows {
+                name: name.to_owned(),
+                values,
+                width,
+            }),
         }
     }
 

@@ -1,6 +1,5 @@
 //! What is imported, and how a recording is read.
 
-use std::fmt::Display;
 use std::path::PathBuf;
 
 use serde::Serialize;
@@ -8,6 +7,7 @@ use serde::Serialize;
 use super::error::ImportError;
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::types::Channel;
 
 /// The largest [`ImportOptions::every`].
 const MAX_EVERY: usize = 1_000_000;
@@ -96,54 +96,50 @@ impl Default for ImportOptions {
     }
 }
 
-/// Width and height in pixels, written as in `64x64`. Errors: `OptionValue`.
-pub fn parse_size(text: &str) -> Result<(u32, u32), ImportError> {
+/// Width and height in pixels, written as in `64x64`. Errors: what would be right.
+pub fn parse_size(text: &str) -> Result<(u32, u32), &'static str> {
     let sides = text
         .split_once('x')
         .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    sides.ok_or_else(|| ImportError::OptionValue {
-        option: "size",
-        value: format!("\"{}\"", text.escape_default()),
-        right: "write WIDTHxHEIGHT, as in 64x64".to_owned(),
-    })
+    sides.ok_or("write WIDTHxHEIGHT, as in 64x64")
 }
 
 impl ImportOptions {
     /// Checks what can be checked without the source. Errors: `OptionValue`.
     pub fn validate(&self) -> Result<(), ImportError> {
-        let wrong = |option, value: &dyn Display, right: &str| {
-            Err(ImportError::OptionValue {
-                option,
-                value: value.to_string(),
-                right: right.to_owned(),
-            })
-        };
-        if !(1..=MAX_EVERY).contains(&self.every) {
-            return wrong("every", &self.every, &format!("it must be 1 to {MAX_EVERY}"));
-        }
-        if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
-            return wrong("rate", &rate, "it must be 0.01 to 1000 frames per second");
-        }
-        if !(0.0..=3600.0).contains(&self.hold_s) {
-            return wrong("hold", &self.hold_s, "it must be 0 to 3600 seconds");
-        }
         let (width, height) = (self.frame_width_px, self.frame_height_px);
         let sides = 1..=MAX_SIDE_PX;
-        if !(sides.contains(&width) && sides.contains(&height)) {
+        let bad_unit = self.units.iter().find(|unit| !unit.contains('='));
+        let (option, value, right) = if !(1..=MAX_EVERY).contains(&self.every) {
+            ("every", self.every.to_string(), format!("it must be 1 to {MAX_EVERY}"))
+        } else if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
+            (
+                "rate",
+                rate.to_string(),
+                "it must be 0.01 to 1000 frames per second".to_owned(),
+            )
+        } else if !(0.0..=3600.0).contains(&self.hold_s) {
+            (
+                "hold",
+                self.hold_s.to_string(),
+                "it must be 0 to 3600 seconds".to_owned(),
+            )
+        } else if !sides.contains(&width) || !sides.contains(&height) {
             let right = format!("each side must be 1 to {MAX_SIDE_PX} px");
-            return wrong("size", &format!("{width}x{height}"), &right);
-        }
-        if let Some(unit) = self.units.iter().find(|unit| !unit.contains('=')) {
+            ("size", format!("{width}x{height}"), right)
+        } else if let Some(unit) = bad_unit {
             let given = format!("\"{}\"", unit.escape_default());
-            return wrong("unit", &given, "write NAME=UNIT, as in speed=m/s");
-        }
-        Ok(())
+            ("unit", given, "write NAME=UNIT, as in speed=m/s".to_owned())
+        } else {
+            return Ok(());
+        };
+        Err(ImportError::OptionValue { option, value, right })
     }
 
-    /// The unit that `--unit NAME=UNIT` gives a channel; empty if none does.
-    pub(super) fn unit(&self, name: &str) -> String {
+    /// A channel with the unit that `--unit NAME=UNIT` gives it, or else with that of the source.
+    pub(super) fn channel(&self, name: &str, unit: &str) -> Channel {
         let mut given = self.units.iter().filter_map(|unit| unit.split_once('='));
-        let found = given.find(|(channel, _)| *channel == name);
-        found.map_or_else(String::new, |(_, unit)| unit.to_owned())
+        let given = given.find(|(channel, unit)| *channel == name && !unit.is_empty());
+        Channel::new(name, given.map_or(unit, |(_, unit)| unit))
     }
 }

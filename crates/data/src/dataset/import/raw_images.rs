@@ -1,82 +1,196 @@
-//! Images without compression, one after another in a file.
+//! The frames of an array, in a file without compression.
 
-use std::fs::File;
-use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
-use std::sync::{Mutex, PoisonError};
 
 use super::error::ImportError;
-use super::recording::{ImageSource, WantedImage};
-use foreframe_core::frame::{Frame, codec};
+use super::recording::{ImageSource, Record};
+use foreframe_core::files::PositionedFile;
+use foreframe_core::frame::{Frame, MAX_SIDE_PX, codec};
 
-/// Gray frames of one size in a file. A frame can lie in one piece or, for a `NumPy` array of another layout, at any stride.
-pub(super) struct RawImages {
-    pub(super) path: PathBuf,
-    pub(super) file: Mutex<File>,
-    pub(super) width_px: u32,
-    pub(super) height_px: u32,
-    /// The position of a frame's first byte, by image number.
-    pub(super) offsets: Vec<u64>,
-    pub(super) pixel: PixelType,
-}
-
-/// How a pixel is stored.
+/// How a number is stored: little endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum PixelType {
+pub(super) enum NumberType {
     U8,
-    /// Red, green and blue.
-    Rgb8,
-    /// Little endian, 0 to 1.
+    I32,
+    I64,
     F32,
-    /// Little endian, 0 to 1.
     F64,
 }
 
-impl PixelType {
+impl NumberType {
     pub(super) fn bytes(self) -> usize {
         match self {
             Self::U8 => 1,
-            Self::Rgb8 => 3,
-            Self::F32 => 4,
-            Self::F64 => 8,
+            Self::I32 | Self::F32 => 4,
+            Self::I64 | Self::F64 => 8,
         }
     }
+
+    pub(super) fn values(self, bytes: &[u8]) -> Vec<f64> {
+        let (fours, eights) = (bytes.as_chunks::<4>().0.iter(), bytes.as_chunks::<8>().0.iter());
+        match self {
+            Self::U8 => bytes.iter().map(|&value| f64::from(value)).collect(),
+            Self::I32 => fours.map(|bytes| f64::from(i32::from_le_bytes(*bytes))).collect(),
+            Self::F32 => fours.map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect(),
+            Self::I64 => eights.map(|bytes| i64::from_le_bytes(*bytes) as f64).collect(),
+            Self::F64 => eights.map(|bytes| f64::from_le_bytes(*bytes)).collect(),
+        }
+    }
+}
+
+/// Which sides of an array are sequences, time, rows and columns.
+pub(super) struct FrameLayout {
+    sequences: usize,
+    frames: usize,
+    height: usize,
+    width: usize,
+    number: NumberType,
+    is_rgb: bool,
+    time_first: bool,
+    /// The sides before the rows.
+    pub(super) leading: Vec<usize>,
+}
+
+impl FrameLayout {
+    /// Errors: `Record` if the array holds no frames.
+    pub(super) fn of(number: NumberType, shape: &[usize], place: &str) -> Result<Self, ImportError> {
+        let wrong = |reason: String| Err(ImportError::record(place, reason));
+        if matches!(number, NumberType::I32 | NumberType::I64) {
+            let reason = "its values are int32 or int64; frames must be uint8, or float32 or float64 from 0 to 1";
+            return wrong(reason.to_owned());
+        }
+        // Frames of three columns are not worth predicting, so these are colors.
+        let (sides, is_rgb) = match shape {
+            [sides @ .., 3] if sides.len() >= 3 && number == NumberType::U8 => (sides, true),
+            sides => (sides, false),
+        };
+        let (sequences, frames, height, width, time_first) = match *sides {
+            [frames, height, width] => (1, frames, height, width, false),
+            [frames, sequences, height, width] if frames <= sequences => (sequences, frames, height, width, true),
+            [sequences, frames, height, width] => (sequences, frames, height, width, false),
+            _ => {
+                return wrong(format!(
+                    "the array's shape is {shape:?}; it must be T×H×W, T×N×H×W or N×T×H×W, or the same with 3 colors at the end"
+                ));
+            }
+        };
+        let possible = 1..=MAX_SIDE_PX as usize;
+        if !possible.contains(&height) || !possible.contains(&width) {
+            return wrong(format!(
+                "its frames are {width}×{height} px; each side must be 1 to {MAX_SIDE_PX} px"
+            ));
+        }
+        let layout = Self {
+            sequences,
+            frames,
+            height,
+            width,
+            number,
+            is_rgb,
+            time_first,
+            leading: sides[..sides.len() - 2].to_vec(),
+        };
+        let count = sequences.checked_mul(frames);
+        match count.and_then(|count| count.checked_mul(layout.frame_bytes())) {
+            Some(_) => Ok(layout),
+            None => wrong(format!("its shape {shape:?} is too large")),
+        }
+    }
+
+    /// The bytes of a frame.
+    fn frame_bytes(&self) -> usize {
+        let samples = if self.is_rgb { 3 } else { 1 };
+        self.height * self.width * samples * self.number.bytes()
+    }
+
+    /// Every frame, sequence by sequence.
+    pub(super) fn positions(&self) -> impl Iterator<Item = FramePosition> {
+        (0..self.sequences * self.frames).map(|image| self.position(image))
+    }
+
+    fn position(&self, image: usize) -> FramePosition {
+        let (sequence, frame) = (image / self.frames, image % self.frames);
+        let index = if self.time_first {
+            frame * self.sequences + sequence
+        } else {
+            image
+        };
+        FramePosition { sequence, frame, index }
+    }
+}
+
+/// A frame of an array.
+pub(super) struct FramePosition {
+    pub(super) sequence: usize,
+    pub(super) frame: usize,
+    /// Its position in the array, in frames.
+    pub(super) index: usize,
+}
+
+impl FramePosition {
+    /// Its record without action and state.
+    pub(super) fn record(&self, timestamp_s: f64, place: &str) -> Record {
+        let (sequence, frame) = (self.sequence, self.frame);
+        Record {
+            timestamp_s,
+            session: sequence.to_string(),
+            place: format!("{place} sequence {sequence} frame {frame}"),
+            ..Record::default()
+        }
+    }
+}
+
+/// The frames of an array that begins at `start` in a file, in the order of [`FrameLayout::positions`].
+pub(super) struct RawImages {
+    pub(super) path: PathBuf,
+    pub(super) file: PositionedFile,
+    pub(super) start: u64,
+    pub(super) layout: FrameLayout,
 }
 
 impl ImageSource for RawImages {
-    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
-        let WantedImage { image, place } = *wanted;
-        let count = self.width_px as usize * self.height_px as usize;
-        let mut bytes = vec![0; count * self.pixel.bytes()];
-        {
-            let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-            file.seek(SeekFrom::Start(self.offsets[image]))
-                .and_then(|_| file.read_exact(&mut bytes))
-                .map_err(ImportError::io("read", &self.path))?;
-        }
-        let pixels = match self.pixel {
-            PixelType::U8 => bytes,
-            PixelType::Rgb8 => codec::gray_from_rgb(&bytes),
-            PixelType::F32 => {
-                let values = bytes.as_chunks::<4>().0.iter();
-                gray_levels(values.map(|bytes| f64::from(f32::from_le_bytes(*bytes))), place)?
+    fn read(&self, wanted: &Record, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let (layout, place) = (&self.layout, &wanted.place);
+        let mut bytes = vec![0; layout.frame_bytes()];
+        let start = self.start + (layout.position(wanted.image).index * bytes.len()) as u64;
+        let read = self.file.read_at(&mut bytes, start);
+        read.map_err(ImportError::io("read", &self.path))?;
+        let pixels = match layout.number {
+            NumberType::U8 if layout.is_rgb => codec::gray_from_rgb(&bytes),
+            NumberType::U8 => bytes,
+            number => {
+                let levels = number.values(&bytes).into_iter().map(|value| gray_level(value, place));
+                levels.collect::<Result<_, _>>()?
             }
-            PixelType::F64 => gray_levels(bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)), place)?,
         };
-        Frame::new(self.width_px, self.height_px, pixels).map_err(ImportError::image(place, &self.path))
+        let frame = Frame::new(layout.width as u32, layout.height as u32, pixels);
+        frame.map_err(ImportError::image(place, &self.path))
     }
 }
 
-/// 8-bit gray levels of intensities 0…1. Errors: `Record` if one is not in that range.
-fn gray_levels(values: impl Iterator<Item = f64>, place: &str) -> Result<Vec<u8>, ImportError> {
-    values
-        .map(|value| match value {
-            0.0..=1.0 => Ok((value * 255.0).round() as u8),
-            _ => Err(ImportError::record(
-                place,
-                format!("a pixel is {value}; floating-point pixels must be 0 to 1"),
-            )),
-        })
-        .collect()
+/// The 8-bit gray level of an intensity 0…1. Errors: `Record` if it is not in that range.
+fn gray_level(value: f64, place: &str) -> Result<u8, ImportError> {
+    if (0.0..=1.0).contains(&value) {
+        return Ok((value * 255.0).round() as u8);
+    }
+    let reason = format!("a pixel is {value}; floating-point pixels must be 0 to 1");
+    Err(ImportError::record(place, reason))
+}
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn layout(number: NumberType, shape: &[usize]) -> FrameLayout {
+        FrameLayout::of(number, shape, "a.npy").unwrap()
+    }
+
+    #[test]
+    fn time_is_the_shorter_of_the_first_sides() {
+        let of_digits = layout(NumberType::U8, &[20, 10000, 64, 64]);
+        assert_eq!((of_digits.sequences, of_digits.frames), (10000, 20));
+        assert_eq!(of_digits.position(3 * 20 + 2).index, 2 * 10000 + 3);
+        let colors = layout(NumberType::U8, &[9, 48, 64, 3]);
+        assert_eq!((colors.frames, colors.width, colors.is_rgb), (9, 64, true));
+    }
 }

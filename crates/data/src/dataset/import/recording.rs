@@ -18,7 +18,7 @@ pub(super) struct Record {
     pub(super) session: String,
     pub(super) action: Vec<f32>,
     pub(super) state: Vec<f32>,
-    /// Where [`Recording::images`] has the image.
+    /// Which of [`Recording::images`] it is; [`Recording::new`] sets it.
     pub(super) image: usize,
     /// File and line, frame or position, for messages.
     pub(super) place: String,
@@ -37,8 +37,11 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Images without actions and states.
-    pub(super) fn of_images(name: String, records: Vec<Record>, images: impl ImageSource + 'static) -> Self {
+    /// Images without actions and states, one for each record.
+    pub(super) fn new(name: String, mut records: Vec<Record>, images: impl ImageSource + 'static) -> Self {
+        for (image, record) in records.iter_mut().enumerate() {
+            record.image = image;
+        }
         Self {
             name,
             action_channels: Vec::new(),
@@ -53,32 +56,25 @@ impl Recording {
 
 /// Where the images of a recording are.
 pub(super) trait ImageSource: Send + Sync {
-    /// Decodes images as gray and passes each to `resize`, in parallel. They are wanted in the order of the recording. Errors, for
+    /// Decodes the images of records as gray and passes each to `resize`, in parallel. They are wanted in the order of the recording. Errors, for
     /// each image: `Image`, `Io`, `Record`, `Program`, `Stopped`, and those of `resize`.
     fn read_all(
         &self,
-        wanted: &[WantedImage<'_>],
+        wanted: &[&Record],
         resize: ResizeImage<'_>,
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
-        let resized = |wanted: &WantedImage<'_>| {
+        let resized = |wanted: &&Record| {
             if cancelled.load(Ordering::Relaxed) {
                 return Err(ImportError::Stopped);
             }
-            resize(&self.read(wanted, cancelled)?, wanted.place)
+            resize(&self.read(wanted, cancelled)?, &wanted.place)
         };
         wanted.par_iter().map(resized).collect()
     }
 
     /// Decodes one image as gray. Errors: as [`Self::read_all`].
-    fn read(&self, wanted: &WantedImage<'_>, cancelled: &AtomicBool) -> Result<Frame, ImportError>;
-}
-
-/// An image that is needed next.
-pub(super) struct WantedImage<'a> {
-    pub(super) image: usize,
-    /// File and line, frame or position, for messages.
-    pub(super) place: &'a str,
+    fn read(&self, wanted: &Record, cancelled: &AtomicBool) -> Result<Frame, ImportError>;
 }
 
 /// Resizes an image; the second argument is its place.
@@ -86,11 +82,8 @@ pub(super) type ResizeImage<'a> = &'a (dyn Fn(&Frame, &str) -> Result<Frame, Imp
 
 /// Seconds per unit of a time column, by its name's ending.
 pub(super) fn seconds_per_unit(name: &str) -> f64 {
-    let unit = |ending: &str| name.ends_with(ending);
-    match () {
-        () if unit("_ms") => 1e-3,
-        () if unit("_us") => 1e-6,
-        () if unit("_ns") => 1e-9,
-        () => 1.0,
-    }
+    let mut units = [("_ms", 1e-3), ("_us", 1e-6), ("_ns", 1e-9)].into_iter();
+    units
+        .find(|(ending, _)| name.ends_with(ending))
+        .map_or(1.0, |(_, unit_s)| unit_s)
 }

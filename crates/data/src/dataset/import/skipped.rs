@@ -39,17 +39,6 @@ impl SkippedItem {
             count: 1,
         }
     }
-
-    /// An entry for items that are only counted.
-    pub(super) fn not_listed(count: u64) -> Self {
-        Self {
-            count,
-            ..Self::new(
-                "after these",
-                &format!("{count} more items were left out; they are not listed"),
-            )
-        }
-    }
 }
 
 /// The beginning of a text, with `…` if something is missing.
@@ -105,10 +94,18 @@ impl SkippedList {
         self.items.is_empty()
     }
 
-    /// The listed items, and one for all others.
-    pub(super) fn items(&self) -> Vec<SkippedItem> {
-        let others = (self.more > 0).then(|| SkippedItem::not_listed(self.more));
-        self.items.iter().cloned().chain(others).collect()
+    /// At most `most` items, and one for all others.
+    pub(super) fn items(&self, most: usize) -> Vec<SkippedItem> {
+        let (listed, others) = self.items.split_at(most.min(self.items.len()));
+        let count = self.more + others.iter().map(|item| item.count).sum::<u64>();
+        let others = (count > 0).then(|| SkippedItem {
+            count,
+            ..SkippedItem::new(
+                "after these",
+                &format!("{count} more items were left out; they are not listed"),
+            )
+        });
+        listed.iter().cloned().chain(others).collect()
     }
 }
 
@@ -121,7 +118,7 @@ mod tests {
         let mut list = SkippedList::default();
         let long = "ä".repeat(2000);
         (0..MAX_ITEMS + 5).for_each(|_| list.push(SkippedItem::new("line 1", &long)));
-        let items = list.items();
+        let items = list.items(MAX_ITEMS);
         assert_eq!(items.len(), MAX_ITEMS + 1);
         assert_eq!(items.iter().map(|item| item.count).sum::<u64>(), MAX_ITEMS as u64 + 5);
         assert!(

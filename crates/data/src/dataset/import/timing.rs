@@ -5,13 +5,15 @@
 //! its start + k / rate, if one lies within half a period; if none does, the episode ends. The action of a frame is the mean
 //! of the records' actions from this frame up to the next one. Its state is that of its record. Very long episodes are cut.
 
-use std::ops::RangeInclusive;
+use std::cmp::Ordering;
+use std::ops::{Range, RangeInclusive};
+use std::path::Path;
 
 use super::recording::{Record, Recording};
 use super::{ImportError, ImportOptions, SkippedItem};
 
 /// A jump of time by more than this many median periods ends an episode.
-const GAP_PERIODS: f64 = 3.0;
+pub(super) const GAP_PERIODS: u32 = 3;
 /// The median time from one record to the next: the reach of `--rate`.
 const PERIODS_S: RangeInclusive<f64> = 0.001..=100.0;
 /// Longer episodes are cut, if their frames are more than `MIN_LONGEST_FRAMES`.
@@ -40,11 +42,9 @@ pub(super) struct PlannedFrame {
 pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<ImportPlan, ImportError> {
     drop_backward_times(&mut recording, options)?;
     let records = &recording.records;
-    let Some(period_s) = median_period(records) else {
-        return Err(ImportError::Empty(
-            options.csv.clone().unwrap_or_else(|| recording.name.clone().into()),
-        ));
-    };
+    let empty = |name: &Path| ImportError::Empty(name.to_owned());
+    let name = Path::new(&recording.name);
+    let period_s = median_period(records).ok_or_else(|| empty(options.csv.as_deref().unwrap_or(name)))?;
     if !PERIODS_S.contains(&period_s) {
         return Err(ImportError::Option(format!(
             "the times of {:?} are {period_s} s apart (median); {} to {} s are possible. Times are in seconds unless their name \
@@ -61,7 +61,7 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     };
     let longest = longest_episode(options);
     let mut episodes = Vec::new();
-    for segment in segments(records, GAP_PERIODS * period_s) {
+    for segment in segments(records, f64::from(GAP_PERIODS) * period_s) {
         let picked = if resampled {
             nearest(records, segment, frame_period_s)
         } else {
@@ -80,7 +80,7 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
         }
     }
     if episodes.is_empty() {
-        return Err(ImportError::Empty(recording.name.clone().into()));
+        return Err(empty(name));
     }
     Ok(ImportPlan {
         recording,
@@ -130,14 +130,11 @@ fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Re
             kept.push(record);
             continue;
         }
-        let error = ImportError::record(
-            record.place.clone(),
-            format!(
-                "its time {} s is not after the one before, {} s; times must grow",
-                record.timestamp_s, last.timestamp_s
-            ),
+        let reason = format!(
+            "its time {} s is not after the one before, {} s; times must grow",
+            record.timestamp_s, last.timestamp_s
         );
-        error.leave_out(options.skip_bad, &mut recording.skipped)?;
+        ImportError::record(record.place, reason).leave_out(options.skip_bad, &mut recording.skipped)?;
     }
     recording.records = kept;
     Ok(())
@@ -150,12 +147,14 @@ fn fits_after(before: Option<&Record>, record: &Record) -> bool {
 
 fn median_period(records: &[Record]) -> Option<f64> {
     let pairs = records.windows(2).filter(|pair| pair[0].session == pair[1].session);
-    let mut steps: Vec<f64> = pairs.map(|pair| pair[1].timestamp_s - pair[0].timestamp_s).collect();
-    if steps.is_empty() {
-        return None;
-    }
-    let middle = steps.len() / 2;
-    Some(*steps.select_nth_unstable_by(middle, f64::total_cmp).1)
+    let steps = pairs.map(|pair| pair[1].timestamp_s - pair[0].timestamp_s);
+    median(steps.collect(), f64::total_cmp)
+}
+
+/// The median; of an even number of values, the upper one of the two in the middle.
+pub(super) fn median<T: Copy>(mut values: Vec<T>, order: impl Fn(&T, &T) -> Ordering) -> Option<T> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, order).1)
 }
 
 /// The period of the nearest whole rate where it is near, else the period itself.
@@ -170,24 +169,20 @@ fn whole_rate(period_s: f64) -> f64 {
 }
 
 /// Ranges of records without a gap.
-fn segments(records: &[Record], max_step_s: f64) -> Vec<std::ops::Range<usize>> {
-    let mut segments = Vec::new();
+fn segments(records: &[Record], max_step_s: f64) -> impl Iterator<Item = Range<usize>> {
+    let follows = move |before: &Record, now: &Record| {
+        before.session == now.session && now.timestamp_s - before.timestamp_s <= max_step_s
+    };
     let mut start = 0;
-    for index in 1..=records.len() {
-        let ends = index == records.len() || {
-            let (before, now) = (&records[index - 1], &records[index]);
-            before.session != now.session || now.timestamp_s - before.timestamp_s > max_step_s
-        };
-        if ends {
-            segments.push(start..index);
-            start = index;
-        }
-    }
-    segments
+    records.chunk_by(follows).map(move |segment| {
+        let range = start..start + segment.len();
+        start = range.end;
+        range
+    })
 }
 
 /// The records nearest to a regular grid of times; a grid time without a record near it starts a new list.
-fn nearest(records: &[Record], segment: std::ops::Range<usize>, period_s: f64) -> Vec<Vec<usize>> {
+fn nearest(records: &[Record], segment: Range<usize>, period_s: f64) -> Vec<Vec<usize>> {
     let start_s = records[segment.start].timestamp_s;
     let end_s = records[segment.end - 1].timestamp_s;
     let (mut lists, mut list, mut index) = (Vec::new(), Vec::new(), segment.start);
@@ -218,10 +213,8 @@ fn nearest(records: &[Record], segment: std::ops::Range<usize>, period_s: f64) -
 fn with_actions(records: &[Record], kept: &[usize]) -> Vec<PlannedFrame> {
     let frame = |(place, &record): (usize, &usize)| {
         let next = kept.get(place + 1).copied().unwrap_or(record + 1);
-        PlannedFrame {
-            record,
-            action: mean_action(&records[record..next]),
-        }
+        let action = mean_action(&records[record..next]);
+        PlannedFrame { record, action }
     };
     kept.iter().enumerate().map(frame).collect()
 }
@@ -246,14 +239,13 @@ mod tests {
         let record = |(index, &timestamp_s): (usize, &f64)| Record {
             timestamp_s,
             action: vec![index as f32],
-            image: index,
             place: format!("line {}", index + 1),
             ..Record::default()
         };
         let records = times_s.iter().enumerate().map(record).collect();
         Recording {
             action_channels: vec![Channel::new("turn", "")],
-            ..Recording::of_images("test".to_owned(), records, ImageFiles(Vec::new()))
+            ..Recording::new("test".to_owned(), records, ImageFiles(Vec::new()))
         }
     }
 
@@ -307,7 +299,7 @@ mod tests {
             ..ImportOptions::default()
         };
         let plan = plan(recording(&times), &options).unwrap();
-        assert_eq!((plan.recording.skipped.items().len(), plan.episodes[0].len()), (1, 4));
+        assert_eq!((plan.recording.skipped.items(9).len(), plan.episodes[0].len()), (1, 4));
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::files::stem;
-use super::recording::{ImageSource, Record, Recording, ResizeImage, WantedImage};
+use super::recording::{ImageSource, Record, Recording, ResizeImage};
 use super::skipped::SkippedList;
 use super::{ImportError, ImportOptions};
 use crate::dataset::program::{ProgramError, ProgramOutput};
@@ -31,22 +31,24 @@ pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool
     }
     let ListedFrames { times_s, damage } = frames_of(video, cancelled)?;
     let mut skipped = SkippedList::default();
-    if let Some(damage) = damage {
-        damage.leave_out(options.skip_bad, &mut skipped)?;
-    }
-    let record = |(index, &timestamp_s): (usize, &f64)| Record {
+    damage.map_or(Ok(()), |damage| damage.leave_out(options.skip_bad, &mut skipped))?;
+    let count = times_s.len();
+    let record = |(frame, timestamp_s): (usize, f64)| Record {
         timestamp_s,
-        image: index,
-        place: format!("{} frame {index}", video.display()),
+        place: place(video, frame),
         ..Record::default()
     };
-    let records = times_s.iter().enumerate().map(record).collect();
-    let places = (0..times_s.len()).map(|frame| (0, frame)).collect();
-    let images = VideoFrames::new(vec![(video.to_owned(), times_s.len())], places);
+    let records = times_s.into_iter().enumerate().map(record).collect();
+    let places = (0..count).map(|frame| (0, frame)).collect();
+    let images = VideoFrames::new(vec![(video.to_owned(), count)], places);
     Ok(Recording {
         skipped,
-        ..Recording::of_images(stem(video, "video"), records, images)
+        ..Recording::new(stem(video, "video"), records, images)
     })
+}
+
+fn place(video: &Path, frame: usize) -> String {
+    format!("{} frame {frame}", video.display())
 }
 
 /// The frames of a video.
@@ -59,50 +61,34 @@ pub(super) struct ListedFrames {
 
 /// Lists the frames by decoding the video: not every packet of a file becomes a frame. Errors: `Program`, `Record`, `Stopped`.
 pub(super) fn frames_of(video: &Path, cancelled: &AtomicBool) -> Result<ListedFrames, ImportError> {
+    let failed = |error| failure("ffprobe", video, error);
+    let mut command = Command::new("ffprobe");
+    command.args(ALLOWED).args(["-v", "error", "-select_streams", "v:0"]);
+    command.args(["-of", "compact=print_section=0", "-show_entries"]);
+    command
+        .arg("frame=pts_time,best_effort_timestamp_time")
+        .arg(argument(video));
+    let mut output = ProgramOutput::start(&mut command).map_err(failed)?;
     let mut times_s = Vec::new();
-    let complaint = probe(
-        video,
-        "frame=pts_time,best_effort_timestamp_time",
-        cancelled,
-        |fields| {
-            let time = number(fields, "pts_time").or_else(|| number(fields, "best_effort_timestamp_time"));
-            let place = || format!("{} frame {}", video.display(), times_s.len());
-            times_s.push(time.ok_or_else(|| ImportError::record(place(), "the frame has no time"))?);
-            Ok(())
-        },
-    )?;
+    // Each line is one frame, as in `pts_time=0.1|best_effort_timestamp_time=0.1`.
+    while let Some(line) = output.line(cancelled).map_err(failed)? {
+        if line.is_empty() {
+            continue;
+        }
+        let time = number(&line, "pts_time").or_else(|| number(&line, "best_effort_timestamp_time"));
+        let wrong = || ImportError::record(place(video, times_s.len()), "the frame has no time");
+        times_s.push(time.ok_or_else(wrong)?);
+    }
+    let complaint = output.finish(cancelled).map_err(failed)?;
     if times_s.is_empty() {
-        return Err(ImportError::record(
-            video.display().to_string(),
-            "it holds no video stream",
-        ));
+        return Err(ImportError::record(video.display(), "it holds no video stream"));
     }
     let damage = (!complaint.is_empty()).then(|| {
         let (count, complaint) = (times_s.len(), without_sender(&complaint));
         let reason = format!("the video is damaged; {count} frames can be read: {complaint}");
-        ImportError::record(video.display().to_string(), reason)
+        ImportError::record(video.display(), reason)
     });
     Ok(ListedFrames { times_s, damage })
-}
-
-/// Passes each entry of the first video stream on, as `name=value|name=value`. Returns what ffprobe says is wrong with the video.
-fn probe(
-    video: &Path,
-    entries: &str,
-    cancelled: &AtomicBool,
-    mut take: impl FnMut(&str) -> Result<(), ImportError>,
-) -> Result<String, ImportError> {
-    let failed = |error| failure("ffprobe", video, error);
-    let mut command = Command::new("ffprobe");
-    command.args(ALLOWED).args(["-v", "error", "-select_streams", "v:0"]);
-    command.args(["-of", "compact=print_section=0", "-show_entries", entries]);
-    let mut output = ProgramOutput::start(command.arg(argument(video))).map_err(failed)?;
-    while let Some(line) = output.line(cancelled).map_err(failed)? {
-        if !line.is_empty() {
-            take(&line)?;
-        }
-    }
-    output.finish(cancelled).map_err(failed)
 }
 
 /// A number among the fields of an entry.
@@ -112,13 +98,9 @@ fn number(fields: &str, name: &str) -> Option<f64> {
     value.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
-/// A path that ffmpeg cannot take for an option or a protocol.
+/// A path that ffmpeg cannot take for an option or a protocol; an absolute one stays as it is.
 fn argument(video: &Path) -> PathBuf {
-    if video.is_absolute() {
-        video.to_owned()
-    } else {
-        Path::new(".").join(video)
-    }
+    Path::new(".").join(video)
 }
 
 /// A message of ffmpeg or ffprobe without the part of the program that wrote it, as in `[matroska,webm @ 0x55fc6ae96800]`.
@@ -134,10 +116,10 @@ fn failure(program: &str, video: &Path, error: ProgramError) -> ImportError {
         )),
         ProgramError::Start(_) => ImportError::Program(format!("{program}: {error}")),
         ProgramError::Cancelled => ImportError::Stopped,
-        ProgramError::Failed(reason) => ImportError::record(
-            video.display().to_string(),
-            format!("{program} cannot read the video: {}", without_sender(&reason)),
-        ),
+        ProgramError::Failed(reason) => {
+            let reason = without_sender(&reason);
+            ImportError::record(video.display(), format!("{program} cannot read the video: {reason}"))
+        }
     }
 }
 
@@ -164,26 +146,26 @@ impl ImageSource for VideoFrames {
     /// Decodes the frames one after the other and resizes some of them together.
     fn read_all(
         &self,
-        wanted: &[WantedImage<'_>],
+        wanted: &[&Record],
         resize: ResizeImage<'_>,
         cancelled: &AtomicBool,
     ) -> Vec<Result<Frame, ImportError>> {
         let mut resized = Vec::with_capacity(wanted.len());
         for some in wanted.chunks(DECODED_FRAMES) {
             let decoded: Vec<_> = some.iter().map(|wanted| self.read(wanted, cancelled)).collect();
-            let resize =
-                |(decoded, wanted): (Result<Frame, ImportError>, &WantedImage<'_>)| resize(&decoded?, wanted.place);
+            let resize = |(decoded, wanted): (Result<Frame, _>, &&Record)| resize(&decoded?, &wanted.place);
             resized.par_extend(decoded.into_par_iter().zip(some).map(resize));
         }
         resized
     }
 
-    fn read(&self, wanted: &WantedImage<'_>, cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+    fn read(&self, wanted: &Record, cancelled: &AtomicBool) -> Result<Frame, ImportError> {
         let (video, frame) = self.places[wanted.image];
         let (path, frames) = &self.videos[video];
         let mut stream = self.stream.lock().unwrap_or_else(PoisonError::into_inner);
         let stream = match &mut *stream {
-            Some(open) if open.video == video && open.can_give(frame) => open,
+            // The frame comes later or is the last one that came.
+            Some(open) if open.video == video && open.next <= frame + 1 => open,
             other => other.insert(FrameStream::start(video, path)?),
         };
         stream.frame(frame, *frames, path, cancelled)
@@ -225,12 +207,8 @@ impl FrameStream {
         })
     }
 
-    /// Whether a frame is the last one or has not come yet.
-    fn can_give(&self, frame: usize) -> bool {
-        self.next <= frame || (self.next == frame + 1 && self.last.is_some())
-    }
-
-    /// Frame `wanted`, which can be given, of a video that announced `frames` frames. Errors: `Record`, `Program`, `Stopped`.
+    /// Frame `wanted`, which is the last one or comes later, of a video that announced `frames` frames. Errors: `Record`, `Program`,
+    /// `Stopped`.
     fn frame(
         &mut self,
         wanted: usize,
@@ -238,40 +216,31 @@ impl FrameStream {
         path: &Path,
         cancelled: &AtomicBool,
     ) -> Result<Frame, ImportError> {
-        if let Some(last) = self.last.as_ref().filter(|_| wanted < self.next) {
-            return Ok(last.clone());
-        }
-        let Some(output) = &mut self.output else {
-            return Err(ImportError::record(
-                format!("{} frame {wanted}", path.display()),
-                &self.fault,
-            ));
-        };
-        loop {
-            match read_pgm(output, cancelled) {
+        while self.next <= wanted {
+            let Some(output) = &mut self.output else {
+                return Err(ImportError::record(place(path, wanted), &self.fault));
+            };
+            let ended = match read_pgm(output, cancelled) {
                 Ok(Some(frame)) => {
-                    self.next += 1;
-                    if self.next > wanted {
-                        self.last = Some(frame.clone());
-                        return Ok(frame);
-                    }
+                    (self.next, self.last) = (self.next + 1, Some(frame));
+                    continue;
                 }
+                Ok(None) => Ok(()),
+                Err(error) => Err(error),
+            };
+            let output = self.output.take();
+            self.fault = match ended.and_then(|()| output.map_or(Ok(String::new()), |output| output.finish(cancelled)))
+            {
                 Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
-                ended => {
-                    let result = match (ended, self.output.take()) {
-                        (Ok(_), Some(output)) => output.finish(cancelled).map(drop),
-                        (ended, _) => ended.map(drop),
-                    };
-                    self.fault = match result {
-                        Err(ProgramError::Cancelled) => return Err(ImportError::Stopped),
-                        Err(error) => format!("ffmpeg cannot read the video: {}", without_sender(&error.to_string())),
-                        Ok(()) => format!("the video ends here; it announces {frames} frames"),
-                    };
-                    let place = format!("{} frame {}", path.display(), self.next);
-                    return Err(ImportError::record(place, &self.fault));
-                }
-            }
+                Err(error) => format!("ffmpeg cannot read the video: {}", without_sender(&error.to_string())),
+                Ok(_) => format!("the video ends here; it announces {frames} frames"),
+            };
+            return Err(ImportError::record(place(path, self.next), &self.fault));
         }
+        Ok(self
+            .last
+            .clone()
+            .expect("a video at a frame before its first one is a bug"))
     }
 }
 
@@ -320,7 +289,12 @@ mod tests {
         let places = [0, 0, 1, 1, 2, 2].map(|frame| (0, frame));
         let frames = VideoFrames::new(vec![(path.clone(), 3)], places.to_vec());
         let read = |images: std::ops::Range<usize>| -> Vec<Vec<u8>> {
-            let wanted: Vec<_> = images.map(|image| WantedImage { image, place: "" }).collect();
+            let of = |image| Record {
+                image,
+                ..Record::default()
+            };
+            let records: Vec<Record> = images.map(of).collect();
+            let wanted: Vec<&Record> = records.iter().collect();
             let whole: ResizeImage<'_> = &|frame, _| Ok(frame.clone());
             let read = frames.read_all(&wanted, whole, &AtomicBool::new(false));
             read.into_iter().map(|frame| frame.unwrap().pixels().to_vec()).collect()

@@ -9,9 +9,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::recording::{Record, Recording, WantedImage};
-use super::skipped::{MAX_ITEMS, SkippedItem};
-use super::timing::{ImportPlan, PlannedFrame};
+use super::recording::{Record, Recording};
+use super::skipped::{MAX_ITEMS, SkippedItem, SkippedList};
+use super::timing::ImportPlan;
 use super::{ImportConfig, ImportError, ImportOptions};
 use crate::dataset::info::{DatasetInfo, EpisodeData};
 use crate::dataset::store::arguments::lock_file;
@@ -19,7 +19,7 @@ use crate::dataset::store::files::{is_unused, write_atomically};
 use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::{ShardWriter, shard_ranges};
-use foreframe_core::files::remove_partials;
+use foreframe_core::files::{none_if_missing, remove_partials};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::resize;
 
@@ -74,11 +74,7 @@ impl<'a> Directory<'a> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
         // The file may be replaced, so the old one is locked first: another import may still use it.
-        let old = if path.is_file() {
-            Some(lock_file(&path, out)?)
-        } else {
-            None
-        };
+        let old = path.is_file().then(|| lock_file(&path, out)).transpose()?;
         let lock = match (Self::check(config)?, old) {
             (None, Some(lock)) => lock,
             (text, _) => {
@@ -97,12 +93,10 @@ impl<'a> Directory<'a> {
     pub(super) fn check(config: &ImportConfig) -> Result<Option<String>, ImportError> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
+        let source = config.source.canonicalize();
         let arguments = ImportArguments {
             program_version: env!("CARGO_PKG_VERSION"),
-            source: &config
-                .source
-                .canonicalize()
-                .map_err(ImportError::io("read", &config.source))?,
+            source: &source.map_err(ImportError::io("read", &config.source))?,
             options: &config.options,
         };
         let text = serde_json::to_string_pretty(&arguments)
@@ -119,11 +113,8 @@ impl<'a> Directory<'a> {
                 "an import with another source or other options; delete it to import again",
             )),
             Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-                if is_unused(out, IMPORT_ARGUMENTS)? {
-                    Ok(Some(text))
-                } else {
-                    Err(occupied("other files"))
-                }
+                let is_unused = is_unused(out, IMPORT_ARGUMENTS)?;
+                is_unused.then_some(Some(text)).ok_or_else(|| occupied("other files"))
             }
             Err(error) => Err(ImportError::io("read", &path)(error)),
         }
@@ -131,11 +122,12 @@ impl<'a> Directory<'a> {
 
     /// The data set, if it is complete. Errors: `Dataset`, `Io`.
     pub(super) fn finished(&self) -> Result<Option<Imported>, ImportError> {
-        if !self.config.out.join(INFO).exists() {
+        let out = &self.config.out;
+        if !out.join(INFO).exists() {
             return Ok(None);
         }
         Ok(Some(Imported {
-            info: DatasetMetadata::read(&self.config.out)?.info_in(&self.config.out)?,
+            info: DatasetMetadata::read(out)?.info_in(out)?,
             skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
         }))
     }
@@ -146,11 +138,9 @@ impl<'a> Directory<'a> {
 
     fn read_skipped(&self) -> Result<Vec<(Option<usize>, SkippedItem)>, ImportError> {
         let path = self.skipped_path();
-        match fs::read(&path) {
-            Ok(text) => serde_json::from_slice(&text)
-                .map_err(|error| ImportError::record(path.display().to_string(), error.to_string())),
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-            Err(error) => Err(ImportError::io("read", &path)(error)),
+        match none_if_missing(fs::read(&path)).map_err(ImportError::io("read", &path))? {
+            Some(text) => serde_json::from_slice(&text).map_err(|error| ImportError::record(path.display(), error)),
+            None => Ok(Vec::new()),
         }
     }
 
@@ -180,21 +170,17 @@ impl<'a> Directory<'a> {
                     options: &self.config.options,
                     writer: &writer,
                 };
-                let (encoded, bad) = encoder.encode(episodes, cancelled, &|frames| {
-                    on_progress(ImportProgress {
-                        done: done + frames as u64,
-                        total,
-                    });
-                })?;
-                let Some(encoded) = encoded else {
-                    return Err(ImportError::Cancelled { done, total });
+                let on_frames = |frames: usize| {
+                    let done = done + frames as u64;
+                    on_progress(ImportProgress { done, total });
                 };
+                let encoded = encoder.encode(episodes, cancelled, &on_frames);
+                let (encoded, bad) = encoded.map_err(|error| match error {
+                    ImportError::Stopped => ImportError::Cancelled { done, total },
+                    other => other,
+                })?;
                 let room = MAX_ITEMS.saturating_sub(skipped.len());
-                let not_listed = bad.len().saturating_sub(room) as u64;
-                skipped.extend(bad.into_iter().take(room).map(|item| (Some(shard), item)));
-                if not_listed > 0 {
-                    skipped.push((Some(shard), SkippedItem::not_listed(not_listed)));
-                }
+                skipped.extend(bad.items(room).into_iter().map(|item| (Some(shard), item)));
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }
@@ -204,7 +190,7 @@ impl<'a> Directory<'a> {
         if writer.episode_count() == 0 {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
-        let listed = plan.recording.skipped.items().into_iter();
+        let listed = plan.recording.skipped.items(MAX_ITEMS).into_iter();
         let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
@@ -217,19 +203,17 @@ impl<'a> Directory<'a> {
     }
 
     fn write_skipped(&self, skipped: &[(Option<usize>, SkippedItem)]) -> Result<(), ImportError> {
-        let text = serde_json::to_vec_pretty(skipped)
-            .map_err(|error| ImportError::Option(format!("the list of skipped items cannot be written: {error}")))?;
+        let text = serde_json::to_vec_pretty(skipped).expect("a list of texts that JSON cannot hold is a bug");
         Ok(write_atomically(&self.skipped_path(), &text)?)
     }
 }
 
-/// How many shards an unfinished import has written.
-pub(super) fn saved_shards(out: &Path) -> usize {
-    let mut shards = 0;
-    while out.join(shard_path(shards)).is_file() {
-        shards += 1;
-    }
-    shards
+/// How many shards an unfinished import has written; a later run continues after them.
+#[must_use]
+pub fn saved_shards(out: &Path) -> usize {
+    (0..usize::MAX)
+        .take_while(|&shard| out.join(shard_path(shard)).is_file())
+        .count()
 }
 
 fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
@@ -253,16 +237,16 @@ struct EpisodeEncoder<'a> {
 }
 
 impl EpisodeEncoder<'_> {
-    /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. No episodes
-    /// are returned if the import was cancelled.
+    /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. Errors: those of
+    /// the images, `Stopped`, `Dataset`.
     fn encode(
         &self,
         episodes: Range<usize>,
         cancelled: &AtomicBool,
         on_frames: &dyn Fn(usize),
-    ) -> Result<(Option<Vec<EncodedEpisode>>, Vec<SkippedItem>), ImportError> {
+    ) -> Result<(Vec<EncodedEpisode>, SkippedList), ImportError> {
         let Recording { records, images, .. } = &self.plan.recording;
-        let (mut encoded, mut bad, mut count) = (Vec::new(), Vec::new(), 0);
+        let (mut encoded, mut bad, mut count) = (Vec::new(), SkippedList::default(), 0);
         let resize = |image: &Frame, place: &str| {
             let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
             resize(image, width, height, self.options.resize).map_err(ImportError::image(place, place))
@@ -270,27 +254,20 @@ impl EpisodeEncoder<'_> {
         for episode in &self.plan.episodes[episodes] {
             let mut data = EpisodeData::default();
             for chunk in episode.chunks(CHUNK_FRAMES) {
-                if cancelled.load(Ordering::Relaxed) {
-                    return Ok((None, bad));
-                }
-                let wanted = chunk.iter().map(|frame| WantedImage {
-                    image: records[frame.record].image,
-                    place: &records[frame.record].place,
-                });
-                let frames = images.read_all(&wanted.collect::<Vec<_>>(), &resize, cancelled);
-                if cancelled.load(Ordering::Relaxed) {
-                    return Ok((None, bad));
-                }
-                for (planned, frame) in chunk.iter().zip(frames) {
+                let wanted: Vec<&Record> = chunk.iter().map(|frame| &records[frame.record]).collect();
+                let frames = images.read_all(&wanted, &resize, cancelled);
+                for ((planned, record), frame) in chunk.iter().zip(wanted).zip(frames) {
                     match frame {
-                        Ok(frame) => push(&mut data, planned, &records[planned.record], frame.pixels()),
-                        Err(error) => match error.skippable().filter(|_| self.options.skip_bad) {
-                            Some(item) => {
-                                bad.push(item);
-                                self.close(&mut data, &mut encoded)?;
-                            }
-                            None => return Err(error),
-                        },
+                        Ok(frame) => {
+                            data.timestamps_s.push(record.timestamp_s);
+                            data.pixels.extend_from_slice(frame.pixels());
+                            data.actions.extend_from_slice(&planned.action);
+                            data.states.extend_from_slice(&record.state);
+                        }
+                        Err(error) => {
+                            error.leave_out(self.options.skip_bad, &mut bad)?;
+                            self.close(&mut data, &mut encoded)?;
+                        }
                     }
                 }
                 count += chunk.len();
@@ -298,30 +275,17 @@ impl EpisodeEncoder<'_> {
             }
             self.close(&mut data, &mut encoded)?;
         }
-        Ok((Some(encoded), bad))
+        Ok((encoded, bad))
     }
 
-    /// Ends an episode; one of a single frame is of no use and left out.
+    /// Ends an episode; one of a single frame is of no use and left out. Its times count from its start.
     fn close(&self, data: &mut EpisodeData, encoded: &mut Vec<EncodedEpisode>) -> Result<(), ImportError> {
-        let data = std::mem::take(data);
-        if data.timestamps_s.len() > 1 {
+        let mut data = std::mem::take(data);
+        if let [start_s, _, ..] = data.timestamps_s[..] {
+            data.timestamps_s.iter_mut().for_each(|time_s| *time_s -= start_s);
             let episode = self.writer.episode_count() + encoded.len();
-            encoded.push(EncodedEpisode::new(self.writer.info(), episode, relative(data))?);
+            encoded.push(EncodedEpisode::new(self.writer.info(), episode, data)?);
         }
         Ok(())
     }
-}
-
-fn push(data: &mut EpisodeData, planned: &PlannedFrame, record: &Record, pixels: &[u8]) {
-    data.timestamps_s.push(record.timestamp_s);
-    data.pixels.extend_from_slice(pixels);
-    data.actions.extend_from_slice(&planned.action);
-    data.states.extend_from_slice(&record.state);
-}
-
-/// The same with times from the episode's start.
-fn relative(mut data: EpisodeData) -> EpisodeData {
-    let start_s = data.timestamps_s[0];
-    data.timestamps_s.iter_mut().for_each(|time_s| *time_s -= start_s);
-    data
 }

@@ -127,31 +127,27 @@ impl ImportSpec {
         let source = existing(&root, &self.source, "source")?;
         check_links(&root, &source)?;
         let csv = self.csv.as_deref().map(|csv| existing(&root, csv, "csv")).transpose()?;
-        let options = ImportOptions { csv, ..self.options()? };
         Ok(ImportConfig {
             source,
             out: data_dir.join("datasets").join(&self.name),
-            options,
+            options: self.options(csv)?,
             disk_mib: DEFAULT_DISK_MIB,
         })
     }
 
-    /// The options but for the CSV file. Errors: `Invalid`, which names the field.
-    fn options(&self) -> Result<ImportOptions, JobError> {
-        let wrong = |error: ImportError| match error {
-            ImportError::OptionValue { option, value, right } => {
-                invalid(option, format!("{value} is not valid; {right}"))
-            }
-            other => invalid("source", other.to_string()),
-        };
-        let (frame_width_px, frame_height_px) = parse_size(&self.size).map_err(wrong)?;
+    /// The options. Errors: `Invalid`, which names the field.
+    fn options(&self, csv: Option<PathBuf>) -> Result<ImportOptions, JobError> {
+        let wrong = |option, value: &str, right: &str| invalid(option, format!("{value} is not valid; {right}"));
+        let size = parse_size(&self.size);
+        let (frame_width_px, frame_height_px) =
+            size.map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
         let options = ImportOptions {
             frame_width_px,
             frame_height_px,
             resize: self.resize,
             rate_hz: self.rate,
             every: self.every,
-            csv: None,
+            csv,
             image: self.image.clone(),
             time: self.time.clone(),
             actions: self.action.clone(),
@@ -160,8 +156,11 @@ impl ImportSpec {
             hold_s: self.hold,
             skip_bad: self.skip_bad,
         };
-        options.validate().map_err(wrong)?;
-        Ok(options)
+        match options.validate() {
+            Ok(()) => Ok(options),
+            Err(ImportError::OptionValue { option, value, right }) => Err(wrong(option, &value, &right)),
+            Err(other) => Err(invalid("source", other.to_string())),
+        }
     }
 }
 
@@ -170,29 +169,22 @@ fn invalid(field: &'static str, reason: String) -> JobError {
 }
 
 fn wrong_path(field: &'static str, path: &str, what: &str) -> JobError {
-    let shown = path.escape_default();
-    invalid(
-        field,
-        format!("\"{shown}\" {what}; give the path of a recording below the server's import_dir, as in mycar/data"),
-    )
+    let path = path.escape_default();
+    let right = "give the path of a recording below the server's import_dir, as in mycar/data";
+    invalid(field, format!("\"{path}\" {what}; {right}"))
 }
 
 /// The real path of a file or folder below `root`, which is a real path itself. Errors: `Invalid`.
 fn existing(root: &Path, path: &str, field: &'static str) -> Result<PathBuf, JobError> {
-    let is_plain = Path::new(path)
-        .components()
-        .all(|part| matches!(part, Component::Normal(_)));
+    let mut parts = Path::new(path).components();
+    let is_plain = parts.all(|part| matches!(part, Component::Normal(_)));
     if path.is_empty() || !is_plain || path.contains(['\0', '\\']) {
         return Err(wrong_path(field, path, "is not a relative path without .."));
     }
-    let real = root
-        .join(path)
-        .canonicalize()
-        .map_err(|_| wrong_path(field, path, "does not exist"))?;
-    if real.starts_with(root) {
-        Ok(real)
-    } else {
-        Err(wrong_path(field, path, "is a link that leads out of import_dir"))
+    match root.join(path).canonicalize() {
+        Ok(real) if real.starts_with(root) => Ok(real),
+        Ok(_) => Err(wrong_path(field, path, "is a link that leads out of import_dir")),
+        Err(_) => Err(wrong_path(field, path, "does not exist")),
     }
 }
 
@@ -208,19 +200,18 @@ fn check_links(root: &Path, source: &Path) -> Result<(), JobError> {
         for entry in fs::read_dir(&folder).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let kind = entry.file_type().map_err(unreadable)?;
-            if !kind.is_symlink() {
-                folders.extend(kind.is_dir().then(|| entry.path()));
+            if kind.is_dir() {
+                folders.push(entry.path());
+            }
+            // A link to nothing is as good as a missing file, which the import reports.
+            let Some(real) = kind.is_symlink().then(|| entry.path().canonicalize().ok()).flatten() else {
                 continue;
+            };
+            if !real.starts_with(root) {
+                let what = "is a link that leads out of import_dir";
+                return Err(wrong_path("source", &shown(root, &entry.path()), what));
             }
-            match entry.path().canonicalize() {
-                Ok(real) if real.starts_with(root) => folders.push(real),
-                Ok(_) => {
-                    let what = "is a link that leads out of import_dir";
-                    return Err(wrong_path("source", &shown(root, &entry.path()), what));
-                }
-                // A link to nothing is as good as a missing file, which the import reports.
-                Err(_) => {}
-            }
+            folders.push(real);
         }
     }
     Ok(())

@@ -1,24 +1,8 @@
 //! Reads CDR (OMG's Common Data Representation, version 1), the encoding of ROS 2 messages, in both byte orders. No input
-//! makes it panic or allocate more than the message's own size.
+//! makes it panic or allocate more than the message's own size. Errors: why the message cannot be read.
 
 /// Two bytes for the encoding, two for options.
 const HEADER_BYTES: usize = 4;
-
-/// Why a message cannot be read.
-#[derive(Debug, thiserror::Error, PartialEq)]
-pub(super) enum CdrError {
-    #[error("its encoding is {0:?}; it must be CDR, [0, 0] (big endian) or [0, 1] (little endian)")]
-    Encoding(Vec<u8>),
-    #[error("its field {field} needs {needed} bytes at byte {offset}; the message has {length} bytes")]
-    Ends {
-        field: &'static str,
-        offset: usize,
-        needed: u64,
-        length: usize,
-    },
-    #[error("its field {field} is no UTF-8 text")]
-    Text { field: &'static str },
-}
 
 /// A position in a message. Fields are read one after the other; each starts at a multiple of its size.
 pub(super) struct CdrReader<'a> {
@@ -27,39 +11,18 @@ pub(super) struct CdrReader<'a> {
     big_endian: bool,
 }
 
-macro_rules! number {
-    ($name:ident, $type:ty) => {
-        /// The next number. Errors: `Ends`.
-        pub(super) fn $name(&mut self, field: &'static str) -> Result<$type, CdrError> {
-            const BYTES: usize = size_of::<$type>();
-            let bytes = self.take(BYTES as u64, BYTES, field)?;
-            let bytes = *bytes
-                .first_chunk::<BYTES>()
-                .expect("a number of other size is a bug");
-            Ok(if self.big_endian {
-                <$type>::from_be_bytes(bytes)
-            } else {
-                <$type>::from_le_bytes(bytes)
-            })
-        }
-    };
-}
-
 impl<'a> CdrReader<'a> {
-    /// Reads the message's header. Errors: `Encoding`, `Ends`.
-    pub(super) fn new(message: &'a [u8]) -> Result<Self, CdrError> {
-        let Some(header) = message.get(..HEADER_BYTES) else {
-            return Err(CdrError::Ends {
-                field: "header of the encoding",
-                offset: 0,
-                needed: HEADER_BYTES as u64,
-                length: message.len(),
-            });
-        };
-        let big_endian = match header {
-            [0, 0, ..] => true,
-            [0, 1, ..] => false,
-            _ => return Err(CdrError::Encoding(header[..2].to_vec())),
+    /// Reads the message's header.
+    pub(super) fn new(message: &'a [u8]) -> Result<Self, String> {
+        let big_endian = match message.first_chunk::<HEADER_BYTES>() {
+            Some([0, 0, ..]) => true,
+            Some([0, 1, ..]) => false,
+            Some([first, second, ..]) => {
+                return Err(format!(
+                    "its encoding is [{first}, {second}]; it must be CDR, [0, 0] (big endian) or [0, 1] (little endian)"
+                ));
+            }
+            None => return Err(ends("header of the encoding", 0, HEADER_BYTES, message)),
         };
         Ok(Self {
             message,
@@ -68,57 +31,77 @@ impl<'a> CdrReader<'a> {
         })
     }
 
-    number!(u8, u8);
-    number!(u32, u32);
-    number!(i32, i32);
-    number!(f64, f64);
-
     /// `count` bytes that start at a multiple of `align`, which is counted from the end of the header.
-    fn take(&mut self, count: u64, align: usize, field: &'static str) -> Result<&'a [u8], CdrError> {
+    fn take(&mut self, count: usize, align: usize, field: &'static str) -> Result<&'a [u8], String> {
         let offset = HEADER_BYTES + (self.offset - HEADER_BYTES).next_multiple_of(align);
-        let end = usize::try_from(count).ok().and_then(|count| offset.checked_add(count));
-        let found = end.and_then(|end| self.message.get(offset..end));
-        let bytes = found.ok_or(CdrError::Ends {
-            field,
-            offset,
-            needed: count,
-            length: self.message.len(),
-        })?;
+        let end = offset.checked_add(count);
+        let bytes = end.and_then(|end| self.message.get(offset..end));
+        let bytes = bytes.ok_or_else(|| ends(field, offset, count, self.message))?;
         self.offset = offset + bytes.len();
         Ok(bytes)
     }
 
-    /// A text; its length counts a closing NUL. Errors: `Ends`, `Text`.
-    pub(super) fn text(&mut self, field: &'static str) -> Result<&'a str, CdrError> {
-        let length = self.u32(field)?;
-        let bytes = self.take(length.into(), 1, field)?;
-        let bytes = bytes.strip_suffix(&[0]).unwrap_or(bytes);
-        std::str::from_utf8(bytes).map_err(|_| CdrError::Text { field })
+    /// The bytes of the next number, little endian.
+    fn number<const BYTES: usize>(&mut self, field: &'static str) -> Result<[u8; BYTES], String> {
+        let mut bytes = [0; BYTES];
+        bytes.copy_from_slice(self.take(BYTES, BYTES, field)?);
+        if self.big_endian {
+            bytes.reverse();
+        }
+        Ok(bytes)
     }
 
-    /// A sequence of bytes. Errors: `Ends`.
-    pub(super) fn bytes(&mut self, field: &'static str) -> Result<&'a [u8], CdrError> {
-        let length = self.u32(field)?;
-        self.take(length.into(), 1, field)
+    pub(super) fn u8(&mut self, field: &'static str) -> Result<u8, String> {
+        self.number(field).map(u8::from_le_bytes)
     }
 
-    /// A sequence of texts. Errors: `Ends`, `Text`.
-    pub(super) fn texts(&mut self, field: &'static str) -> Result<Vec<&'a str>, CdrError> {
+    pub(super) fn u32(&mut self, field: &'static str) -> Result<u32, String> {
+        self.number(field).map(u32::from_le_bytes)
+    }
+
+    pub(super) fn i32(&mut self, field: &'static str) -> Result<i32, String> {
+        self.number(field).map(i32::from_le_bytes)
+    }
+
+    pub(super) fn f64(&mut self, field: &'static str) -> Result<f64, String> {
+        self.number(field).map(f64::from_le_bytes)
+    }
+
+    /// A sequence of bytes.
+    pub(super) fn bytes(&mut self, field: &'static str) -> Result<&'a [u8], String> {
+        let length = self.u32(field)?;
+        self.take(length as usize, 1, field)
+    }
+
+    /// A text; its length counts a closing NUL.
+    pub(super) fn text(&mut self, field: &'static str) -> Result<&'a str, String> {
+        let bytes = self.bytes(field)?;
+        let text = std::str::from_utf8(bytes.strip_suffix(&[0]).unwrap_or(bytes));
+        text.map_err(|_| format!("its field {field} is no UTF-8 text"))
+    }
+
+    /// A sequence of texts.
+    pub(super) fn texts(&mut self, field: &'static str) -> Result<Vec<&'a str>, String> {
         let count = self.u32(field)?;
         // Each has a length of 4 bytes, so a false count ends with the message.
         (0..count).map(|_| self.text(field)).collect()
     }
 
-    /// `count` numbers. Errors: `Ends`.
-    pub(super) fn f64_array(&mut self, count: u32, field: &'static str) -> Result<Vec<f64>, CdrError> {
+    /// `count` numbers.
+    pub(super) fn f64_array(&mut self, count: u32, field: &'static str) -> Result<Vec<f64>, String> {
         (0..count).map(|_| self.f64(field)).collect()
     }
 
-    /// A sequence of numbers. Errors: `Ends`.
-    pub(super) fn f64_sequence(&mut self, field: &'static str) -> Result<Vec<f64>, CdrError> {
+    /// A sequence of numbers.
+    pub(super) fn f64_sequence(&mut self, field: &'static str) -> Result<Vec<f64>, String> {
         let count = self.u32(field)?;
         self.f64_array(count, field)
     }
+}
+
+fn ends(field: &str, offset: usize, needed: usize, message: &[u8]) -> String {
+    let length = message.len();
+    format!("its field {field} needs {needed} bytes at byte {offset}; the message has {length} bytes")
 }
 
 #[cfg(test)]
@@ -143,20 +126,13 @@ mod tests {
         assert_eq!(read(&big), (7, "ab".to_owned(), Ok(1.0)));
         // The number starts at a multiple of 8 after the header, which this message does not reach.
         let (_, _, ended) = read(&little);
-        assert_eq!(
-            ended,
-            Err(CdrError::Ends {
-                field: "value",
-                offset: 20,
-                needed: 8,
-                length: 24
-            })
-        );
+        let reason = "its field value needs 8 bytes at byte 20; the message has 24 bytes";
+        assert_eq!(ended, Err(reason.to_owned()));
     }
 
     #[test]
     fn another_encoding_is_named() {
-        let error = CdrReader::new(&[0, 3, 0, 0]).err().unwrap().to_string();
+        let error = CdrReader::new(&[0, 3, 0, 0]).err().unwrap();
         assert!(error.starts_with("its encoding is [0, 3]; it must be CDR"), "{error}");
     }
 
@@ -165,7 +141,7 @@ mod tests {
         fn no_bytes_make_the_reader_panic(message in proptest::collection::vec(any::<u8>(), 0..64), order in 0u8..2) {
             let message = [&[0, order, 0, 0][..], &message].concat();
             for read in [
-                (|reader| reader.text("a").map(drop)) as fn(&mut CdrReader<'_>) -> Result<(), CdrError>,
+                (|reader| reader.text("a").map(drop)) as fn(&mut CdrReader<'_>) -> Result<(), String>,
                 |reader| reader.bytes("a").map(drop),
                 |reader| reader.texts("a").map(drop),
                 |reader| reader.f64_sequence("a").map(drop),

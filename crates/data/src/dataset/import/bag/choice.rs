@@ -1,6 +1,6 @@
 //! Which topics become image, action and state: those named by the options, else the only one of its type.
 
-use super::index::{BagIndex, Content, Topic, ValueStream};
+use super::index::{BagIndex, Content, MessageEntry, Topic, ValueStream};
 use super::messages::{Projection, RosType};
 use crate::dataset::import::skipped::listed;
 use crate::dataset::import::{ImportError, ImportOptions};
@@ -10,53 +10,72 @@ use foreframe_core::types::Channel;
 const NONE: &str = "none";
 
 /// A topic of values, and which of its fields are used.
-pub(super) struct ChosenValues {
-    /// Position of the topic.
-    pub(super) topic: usize,
+pub(super) struct ChosenValues<'a> {
+    pub(super) topic: &'a Topic,
+    pub(super) stream: &'a ValueStream,
     /// Positions of the fields.
     pub(super) fields: Vec<usize>,
     pub(super) channels: Vec<Channel>,
 }
 
-/// The topics of a data set, by position.
-pub(super) struct ChosenTopics {
-    pub(super) image: usize,
-    pub(super) actions: Vec<ChosenValues>,
-    pub(super) states: Vec<ChosenValues>,
-    pub(super) projection: Option<Projection>,
+/// The topics of a data set.
+pub(super) struct ChosenTopics<'a> {
+    pub(super) image: &'a Topic,
+    pub(super) images: &'a [MessageEntry],
+    pub(super) actions: Vec<ChosenValues<'a>>,
+    pub(super) states: Vec<ChosenValues<'a>>,
+    pub(super) projection: Option<&'a Projection>,
 }
 
 /// What topics are used for.
-struct Role {
+struct Role<T> {
     what: &'static str,
     option: &'static str,
     types: &'static str,
     is_of: fn(RosType) -> bool,
+    /// What the role needs of a topic; `None` if the topic cannot have the role.
+    content: fn(&Topic) -> Option<&T>,
 }
 
-const IMAGE: Role = Role {
+const IMAGE: Role<Vec<MessageEntry>> = Role {
     what: "image",
     option: "--image",
     types: "sensor_msgs/msg/Image or CompressedImage",
     is_of: RosType::is_image,
+    content: |topic| match &topic.content {
+        Content::Images(images) => Some(images),
+        _ => None,
+    },
 };
-const ACTION: Role = Role {
+const ACTION: Role<ValueStream> = Role {
     what: "action",
     option: "--action",
     types: "geometry_msgs/msg/Twist, TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState",
     is_of: RosType::is_command,
+    content: values,
 };
-const STATE: Role = Role {
+const STATE: Role<ValueStream> = Role {
     what: "state",
     option: "--state",
     types: "nav_msgs/msg/Odometry, sensor_msgs/msg/JointState, geometry_msgs/msg/Twist or TwistStamped",
     is_of: RosType::is_measurement,
+    content: values,
 };
 
+fn values(topic: &Topic) -> Option<&ValueStream> {
+    match &topic.content {
+        Content::Values(stream) => Some(stream),
+        _ => None,
+    }
+}
+
 /// Chooses the topics. Errors: `Option`; it lists the topics that there are.
-pub(super) fn choose(index: &BagIndex<'_>, options: &ImportOptions) -> Result<ChosenTopics, ImportError> {
-    let choice = Choice { index, options };
-    let image = match &options.image {
+pub(super) fn choose<'a>(index: &'a BagIndex<'_>, options: &'a ImportOptions) -> Result<ChosenTopics<'a>, ImportError> {
+    let choice = Choice {
+        topics: &index.topics,
+        options,
+    };
+    let (image, images) = match &options.image {
         Some(name) => choice.named(name, &IMAGE)?,
         None => choice
             .only(&IMAGE)?
@@ -64,66 +83,61 @@ pub(super) fn choose(index: &BagIndex<'_>, options: &ImportOptions) -> Result<Ch
     };
     Ok(ChosenTopics {
         image,
+        images,
         actions: choice.values(&options.actions, &ACTION)?,
         states: choice.values(&options.states, &STATE)?,
-        projection: choice.projection(image),
+        projection: choice.projection(&image.name),
     })
 }
 
 struct Choice<'a> {
-    index: &'a BagIndex<'a>,
+    topics: &'a [Topic],
     options: &'a ImportOptions,
 }
 
-impl Choice<'_> {
-    fn topics(&self) -> &[Topic] {
-        &self.index.topics
-    }
-
-    fn wrong(&self, what: &str, role: &Role) -> ImportError {
+impl<'a> Choice<'a> {
+    fn wrong<T>(&self, what: &str, role: &Role<T>) -> ImportError {
         let describe = |topic: &Topic| {
-            let encoding = match topic.encoding.as_str() {
+            let Topic {
+                name,
+                type_name,
+                messages,
+                encoding,
+                ..
+            } = topic;
+            let encoding = match encoding.as_str() {
                 "cdr" => String::new(),
                 other => format!(", encoded as {other} instead of cdr"),
             };
-            format!(
-                "{} ({}, {} messages{encoding})",
-                topic.name, topic.type_name, topic.messages
-            )
+            format!("{name} ({type_name}, {messages} messages{encoding})")
         };
         // Those that are read come first.
-        let is_read = |topic: &&Topic| !matches!(topic.content, Content::Unused);
-        let read = self.topics().iter().filter(is_read);
-        let others = self.topics().iter().filter(|topic| !is_read(topic));
-        let known = listed(read.chain(others).map(describe));
+        let (unused, read): (Vec<_>, Vec<_>) = self.topics.iter().partition(|topic| topic.is_unused());
+        let known = listed(read.into_iter().chain(unused).map(describe));
         ImportError::Option(format!(
             "the bag has {what}; name one of type {} with {}; its topics are: {known}",
             role.types, role.option
         ))
     }
 
-    /// The topic of that name. Errors: `Option`.
-    fn named(&self, name: &str, role: &Role) -> Result<usize, ImportError> {
-        let of_name = || self.topics().iter().enumerate().filter(|(_, topic)| topic.name == name);
-        if of_name().next().is_none() {
-            return Err(self.wrong(&format!("no topic \"{name}\""), role));
-        }
-        let is_right = |topic: &Topic| match topic.content {
-            Content::Images(_) => role.option == IMAGE.option,
-            Content::Values(_) => role.option != IMAGE.option,
-            _ => false,
+    /// The topic of that name, and what the role needs of it. Errors: `Option`.
+    fn named<T>(&self, name: &str, role: &Role<T>) -> Result<(&'a Topic, &'a T), ImportError> {
+        let mut of_name = self.topics.iter().filter(|topic| topic.name == name).peekable();
+        let what = match of_name.peek() {
+            None => format!("no topic \"{name}\""),
+            Some(_) => format!("a topic \"{name}\" that cannot be the {}", role.what),
         };
-        let right = of_name().find(|(_, topic)| is_right(topic));
-        right
-            .map(|(position, _)| position)
-            .ok_or_else(|| self.wrong(&format!("a topic \"{name}\" that cannot be the {}", role.what), role))
+        let found = of_name.find_map(|topic| Some((topic, (role.content)(topic)?)));
+        found.ok_or_else(|| self.wrong(&what, role))
     }
 
     /// The only topic of the role's types that has messages. Errors: `Option` if there are more.
-    fn only(&self, role: &Role) -> Result<Option<usize>, ImportError> {
-        let is_of =
-            |topic: &Topic| (role.is_of)(topic.kind) && topic.messages > 0 && !matches!(topic.content, Content::Unused);
-        let mut found = (0..self.topics().len()).filter(|&position| is_of(&self.topics()[position]));
+    fn only<T>(&self, role: &Role<T>) -> Result<Option<(&'a Topic, &'a T)>, ImportError> {
+        let of_type = self
+            .topics
+            .iter()
+            .filter(|topic| (role.is_of)(topic.kind) && topic.messages > 0);
+        let mut found = of_type.filter_map(|topic| Some((topic, (role.content)(topic)?)));
         let first = found.next();
         if found.next().is_some() {
             let none = if role.option == IMAGE.option { "" } else { " (or none)" };
@@ -132,11 +146,11 @@ impl Choice<'_> {
         Ok(first)
     }
 
-    fn values(&self, given: &[String], role: &Role) -> Result<Vec<ChosenValues>, ImportError> {
+    fn values(&self, given: &[String], role: &Role<ValueStream>) -> Result<Vec<ChosenValues<'a>>, ImportError> {
         match given {
             [] => {
                 let only = self.only(role)?.into_iter();
-                only.map(|topic| self.fields(topic, None, false, role)).collect()
+                only.map(|found| self.fields(found, None, false)).collect()
             }
             [one] if one == NONE => Ok(Vec::new()),
             many => {
@@ -145,7 +159,7 @@ impl Choice<'_> {
                         Some((name, fields)) => (name, Some(fields)),
                         None => (text.as_str(), None),
                     };
-                    self.fields(self.named(name, role)?, fields, many.len() > 1, role)
+                    self.fields(self.named(name, role)?, fields, many.len() > 1)
                 };
                 many.iter().map(choose).collect()
             }
@@ -155,64 +169,53 @@ impl Choice<'_> {
     /// The fields of a topic: those of `TOPIC:FIELD,FIELD`, else those that its type has by default.
     fn fields(
         &self,
-        position: usize,
+        (topic, stream): (&'a Topic, &'a ValueStream),
         given: Option<&str>,
         with_topic: bool,
-        role: &Role,
-    ) -> Result<ChosenValues, ImportError> {
-        let topic = &self.topics()[position];
-        let Content::Values(stream) = &topic.content else {
-            return Err(self.wrong(&format!("no values in \"{}\"", topic.name), role));
+    ) -> Result<ChosenValues<'a>, ImportError> {
+        let position = |name: &str| {
+            stream.fields.get_index_of(name).ok_or_else(|| {
+                let known = listed(stream.fields.keys());
+                ImportError::Option(format!(
+                    "{} has no field \"{name}\"; its fields are: {known}",
+                    topic.name
+                ))
+            })
         };
-        let fields = match given {
-            Some(given) => given
-                .split(',')
-                .map(|name| field_position(stream, topic, name))
-                .collect::<Result<Vec<_>, _>>()?,
-            None => (0..stream.fields.len())
-                .filter(|&field| {
-                    let (name, changed) = (&stream.fields[field].0, stream.is_ever_other_than_0[field]);
-                    topic.kind.is_default_field(name, changed)
-                })
-                .collect(),
+        let names = stream.fields.keys();
+        let is_default = |&field: &usize| {
+            let is_ever_other_than_0 = stream.fields[field].is_ever_other_than_0;
+            topic.kind.is_default_field(&names[field], is_ever_other_than_0)
+        };
+        let fields: Vec<usize> = match given {
+            Some(given) => given.split(',').map(position).collect::<Result<_, _>>()?,
+            None => (0..names.len()).filter(is_default).collect(),
         };
         let channel = |&field: &usize| {
-            let (name, unit) = &stream.fields[field];
-            let name = if with_topic {
-                format!("{}.{name}", topic.name.trim_start_matches('/'))
+            let (name, unit) = (&*names[field], stream.fields[field].unit);
+            if with_topic {
+                let name = format!("{}.{name}", topic.name.trim_start_matches('/'));
+                self.options.channel(&name, unit)
             } else {
-                name.clone()
-            };
-            let given = self.options.unit(&name);
-            Channel::new(&name, if given.is_empty() { unit } else { &given })
+                self.options.channel(name, unit)
+            }
         };
         Ok(ChosenValues {
-            topic: position,
+            topic,
+            stream,
             channels: fields.iter().map(channel).collect(),
             fields,
         })
     }
 
     /// What the camera's `camera_info` says: the one beside the image's topic.
-    fn projection(&self, image: usize) -> Option<Projection> {
-        let image = &self.topics()[image].name;
-        self.topics().iter().find_map(|topic| match &topic.content {
+    fn projection(&self, image: &str) -> Option<&'a Projection> {
+        self.topics.iter().find_map(|topic| match &topic.content {
             Content::Camera(found) => {
                 let folder = topic.name.strip_suffix("camera_info")?;
-                found.filter(|_| image.starts_with(folder))
+                found.as_ref().filter(|_| image.starts_with(folder))
             }
             _ => None,
         })
     }
-}
-
-fn field_position(stream: &ValueStream, topic: &Topic, name: &str) -> Result<usize, ImportError> {
-    let found = stream.fields.iter().position(|(field, _)| field == name);
-    found.ok_or_else(|| {
-        ImportError::Option(format!(
-            "{} has no field \"{name}\"; its fields are: {}",
-            topic.name,
-            listed(stream.fields.iter().map(|(field, _)| field))
-        ))
-    })
 }

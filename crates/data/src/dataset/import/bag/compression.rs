@@ -14,28 +14,26 @@ const EXPECTED_RATIO: usize = 256;
 pub(super) fn decompress(name: &str, compressed: &[u8], limit: u64) -> (Vec<u8>, Option<String>) {
     let mut bytes = Vec::with_capacity((limit as usize).min(compressed.len().saturating_mul(EXPECTED_RATIO)));
     let read = match name {
-        "lz4" => lz4_flex::frame::FrameDecoder::new(compressed)
-            .take(limit)
-            .read_to_end(&mut bytes)
-            .map_err(|error| error.to_string()),
+        "lz4" => {
+            let mut decoder = lz4_flex::frame::FrameDecoder::new(compressed).take(limit);
+            decoder.read_to_end(&mut bytes).map_err(|error| error.to_string())
+        }
         "zstd" => ruzstd::decoding::StreamingDecoder::new(compressed)
             .map_err(|error| error.to_string())
             .and_then(|decoder| {
-                let read = decoder.take(limit).read_to_end(&mut bytes);
-                read.map_err(|error| error.to_string())
+                decoder
+                    .take(limit)
+                    .read_to_end(&mut bytes)
+                    .map_err(|error| error.to_string())
             }),
         other => {
             let other: String = other.chars().take(40).collect();
-            return (
-                bytes,
-                Some(format!("has the compression {other:?}; it must be zstd, lz4 or none")),
-            );
+            let reason = format!("has the compression {other:?}; it must be zstd, lz4 or none");
+            return (bytes, Some(reason));
         }
     };
-    (
-        bytes,
-        read.err().map(|error| format!("cannot be decompressed: {error}")),
-    )
+    let error = read.err().map(|error| format!("cannot be decompressed: {error}"));
+    (bytes, error)
 }
 
 /// A message without the compression that rosbag2 gives single messages in its mode `message`. Errors: the reason.

@@ -149,7 +149,7 @@ pub(super) fn unreadable(path: &Path, error: &rusqlite::Error) -> ImportError {
         _ => error.to_string(),
     };
     ImportError::record(
-        path.display().to_string(),
+        path.display(),
         format!("this is not a bag in an SQLite database, or it is damaged: {reason}"),
     )
 }

@@ -1,8 +1,13 @@
 //! The index of a bag, made by one pass over its files: where the images are, and the values and times of everything else that may be used.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::fmt::Display;
+use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+
+use indexmap::IndexMap;
 
 use super::compression;
 use super::messages::{self, FieldValue, Projection, RosType};
@@ -16,16 +21,23 @@ const MAX_FIELDS: usize = 4096;
 /// The longest name of a topic, a type or a field, in bytes.
 pub(super) const MAX_NAME_BYTES: usize = 1024;
 
+/// A file of messages.
+pub(super) trait MessageFile: Send + Sync {
+    /// The message at a position that was found by the pass over the file. Errors: `Io`, `Record`.
+    fn message(&self, position: Position) -> Result<Vec<u8>, ImportError>;
+
+    /// File and position, for people.
+    fn place(&self, position: Position) -> String;
+}
+
 /// Where a message lies in its file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Position {
-    /// In the file itself.
-    File { offset: u64, bytes: usize },
-    /// In a compressed chunk, whose record starts at `chunk`.
-    Chunk { chunk: u64, start: usize, bytes: usize },
-    /// In a database's row of this number.
-    #[cfg(feature = "databases")]
-    Row(i64),
+pub(super) struct Position {
+    /// The start of the compressed chunk that it lies in.
+    pub(super) chunk: Option<u64>,
+    /// Its first byte in the file or in the decompressed chunk; in a database, the number of its row.
+    pub(super) start: u64,
+    pub(super) bytes: usize,
 }
 
 /// When a message was recorded and, by its header, when it was made; in nanoseconds.
@@ -36,8 +48,9 @@ pub(super) struct MessageTime {
     pub(super) stamp_ns: Option<i64>,
 }
 
-/// A message with an image.
-pub(super) struct ImageEntry {
+/// Which message it is.
+#[derive(Clone, Copy)]
+pub(super) struct MessageEntry {
     pub(super) time: MessageTime,
     /// Its number in its topic, from 0.
     pub(super) number: u64,
@@ -46,27 +59,37 @@ pub(super) struct ImageEntry {
     pub(super) position: Position,
 }
 
+/// A field of a topic.
+pub(super) struct MessageField {
+    pub(super) unit: &'static str,
+    pub(super) is_ever_other_than_0: bool,
+}
+
+/// A message whose values were taken.
+pub(super) struct MessageValues {
+    pub(super) time: MessageTime,
+    /// Its number in its topic, from 0.
+    pub(super) number: u64,
+    /// Where its values end.
+    end: usize,
+}
+
 /// The values of a topic. A message need not have all fields (a `JointState` may have some joints only).
 #[derive(Default)]
 pub(super) struct ValueStream {
-    /// Names and units of all fields, in the order in which they appeared.
-    pub(super) fields: Vec<(String, &'static str)>,
-    positions: HashMap<String, u32>,
-    /// Which fields were ever other than 0.
-    pub(super) is_ever_other_than_0: Vec<bool>,
-    pub(super) times: Vec<MessageTime>,
-    pub(super) numbers: Vec<u64>,
-    /// For each message, where its values end.
-    ends: Vec<usize>,
+    /// All fields, in the order in which they appeared.
+    pub(super) fields: IndexMap<Cow<'static, str>, MessageField>,
+    messages: Vec<MessageValues>,
+    /// Positions of fields and their values.
     values: Vec<(u32, f32)>,
 }
 
 impl ValueStream {
     /// Errors: why the message is refused.
     fn push(&mut self, time: MessageTime, number: u64, fields: Vec<FieldValue>) -> Result<(), String> {
-        let is_new = |field: &&FieldValue| !self.positions.contains_key(&*field.name);
+        let new = fields.iter().filter(|field| !self.fields.contains_key(&field.name));
         let (mut count, mut longest) = (self.fields.len(), 0);
-        for field in fields.iter().filter(is_new) {
+        for field in new {
             (count, longest) = (count + 1, longest.max(field.name.len()));
         }
         if count > MAX_FIELDS || longest > MAX_NAME_BYTES {
@@ -76,38 +99,34 @@ impl ValueStream {
             ));
         }
         for FieldValue { name, unit, value } in fields {
-            let field = self.field(&name, unit);
-            self.is_ever_other_than_0[field as usize] |= value != 0.0;
-            self.values.push((field, value as f32));
+            let field = self.fields.entry(name);
+            self.values.push((field.index() as u32, value as f32));
+            let is_ever_other_than_0 = false;
+            let field = field.or_insert(MessageField {
+                unit,
+                is_ever_other_than_0,
+            });
+            field.is_ever_other_than_0 |= value != 0.0;
         }
-        self.times.push(time);
-        self.numbers.push(number);
-        self.ends.push(self.values.len());
+        let end = self.values.len();
+        self.messages.push(MessageValues { time, number, end });
         Ok(())
     }
 
-    /// The position of a field, which is new or known.
-    fn field(&mut self, name: &str, unit: &'static str) -> u32 {
-        if let Some(&known) = self.positions.get(name) {
-            return known;
-        }
-        let field = self.fields.len() as u32;
-        self.positions.insert(name.to_owned(), field);
-        self.fields.push((name.to_owned(), unit));
-        self.is_ever_other_than_0.push(false);
-        field
-    }
-
-    /// Fields and values of a message.
-    pub(super) fn values(&self, message: usize) -> &[(u32, f32)] {
-        let start = message.checked_sub(1).map_or(0, |before| self.ends[before]);
-        &self.values[start..self.ends[message]]
+    /// Every message, and its values with the positions of their fields.
+    pub(super) fn messages(&self) -> impl Iterator<Item = (&MessageValues, &[(u32, f32)])> {
+        let mut start = 0;
+        self.messages.iter().map(move |message| {
+            let values = &self.values[start..message.end];
+            start = message.end;
+            (message, values)
+        })
     }
 }
 
 /// What is kept of a topic's messages.
 pub(super) enum Content {
-    Images(Vec<ImageEntry>),
+    Images(Vec<MessageEntry>),
     Values(ValueStream),
     Camera(Option<Projection>),
     Unused,
@@ -126,6 +145,44 @@ pub(super) struct Topic {
     pub(super) faults: SkippedList,
 }
 
+impl Topic {
+    pub(super) fn is_unused(&self) -> bool {
+        matches!(self.content, Content::Unused)
+    }
+
+    /// Adds a message, whose time in its header is not known yet. Errors: why it cannot be read.
+    fn take(&mut self, mut entry: MessageEntry, message: &[u8]) -> Result<(), String> {
+        let header_time = |stamp: i64| Some(stamp).filter(|&stamp| stamp != 0);
+        match &mut self.content {
+            // Cameras seldom change; the first description counts.
+            Content::Unused | Content::Camera(Some(_)) => {}
+            Content::Camera(found) => *found = Some(messages::camera_info(message)?),
+            Content::Images(images) => {
+                let stamp = if self.kind == RosType::Image {
+                    let (stamp, image) = messages::image(message)?;
+                    image.check()?;
+                    stamp
+                } else {
+                    let (stamp, format, _) = messages::compressed_image(message)?;
+                    check_format(format)?;
+                    stamp
+                };
+                entry.time.stamp_ns = header_time(stamp);
+                images.push(entry);
+            }
+            Content::Values(stream) => {
+                let (stamp, values) = messages::values(self.kind, message)?;
+                if let Some(wrong) = values.iter().find(|field| !(field.value as f32).is_finite()) {
+                    return Err(format!("{} is {}; it must be a finite number", wrong.name, wrong.value));
+                }
+                entry.time.stamp_ns = stamp.and_then(header_time);
+                stream.push(entry.time, entry.number, values)?;
+            }
+        }
+        Ok(())
+    }
+}
+
 /// The index of a bag. It receives the messages of the bag's files, one file after the other.
 pub(super) struct BagIndex<'a> {
     pub(super) source: &'a Path,
@@ -133,9 +190,8 @@ pub(super) struct BagIndex<'a> {
     cancelled: &'a AtomicBool,
     pub(super) topics: Vec<Topic>,
     by_name: HashMap<(String, String), usize>,
-    used_topics: usize,
-    unused_topics: usize,
-    pub(super) files: Vec<PathBuf>,
+    /// The files; the messages that follow are in the last one.
+    pub(super) files: Vec<Arc<dyn MessageFile>>,
     /// Damage that belongs to no topic.
     pub(super) skipped: SkippedList,
 }
@@ -148,8 +204,6 @@ impl<'a> BagIndex<'a> {
             cancelled,
             topics: Vec::new(),
             by_name: HashMap::new(),
-            used_topics: 0,
-            unused_topics: 0,
             files: Vec::new(),
             skipped: SkippedList::default(),
         }
@@ -163,13 +217,8 @@ impl<'a> BagIndex<'a> {
         Ok(())
     }
 
-    /// The messages that follow are in this file.
-    pub(super) fn file(&mut self, path: PathBuf) {
-        self.files.push(path);
-    }
-
     /// Lists damage, or refuses it. Errors: `Record`.
-    pub(super) fn fault(&mut self, place: String, reason: String) -> Result<(), ImportError> {
+    pub(super) fn fault(&mut self, place: String, reason: impl Display) -> Result<(), ImportError> {
         ImportError::record(place, reason).leave_out(self.options.skip_bad, &mut self.skipped)
     }
 
@@ -187,129 +236,89 @@ impl<'a> BagIndex<'a> {
         }
         let (name, type_name) = key.clone();
         let kind = RosType::of(&type_name);
-        let is_wanted = |names: &[String], by_default: bool| match names {
-            [] => by_default,
-            names => names.iter().any(|given| given.split(':').next() == Some(&name)),
-        };
-        let options = self.options;
-        let is_value =
-            is_wanted(&options.actions, kind.is_command()) || is_wanted(&options.states, kind.is_measurement());
-        let content = match kind {
-            _ if encoding != "cdr" => Content::Unused,
-            RosType::CameraInfo => Content::Camera(None),
-            _ if kind.is_image() && options.image.as_ref().is_none_or(|image| *image == name) => {
-                Content::Images(Vec::new())
-            }
-            _ if is_value && (kind.is_command() || kind.is_measurement()) => Content::Values(ValueStream::default()),
-            _ => Content::Unused,
-        };
-        let is_unused = matches!(content, Content::Unused);
-        let count = if is_unused {
-            &mut self.unused_topics
-        } else {
-            &mut self.used_topics
-        };
-        if *count == MAX_TOPICS {
-            let what = if is_unused {
-                "topics that are not imported"
-            } else {
-                "topics"
-            };
-            return Err(format!("the bag has more than {MAX_TOPICS} {what}; record fewer"));
-        }
-        *count += 1;
-        self.by_name.insert(key, self.topics.len());
-        self.topics.push(Topic {
+        let topic = Topic {
+            messages: 0,
+            content: self.content(kind, &name, &encoding),
+            faults: SkippedList::default(),
             name,
             type_name,
             kind,
             encoding,
-            messages: 0,
-            content,
-            faults: SkippedList::default(),
-        });
+        };
+        let is_unused = topic.is_unused();
+        if self
+            .topics
+            .iter()
+            .filter(|other| other.is_unused() == is_unused)
+            .count()
+            == MAX_TOPICS
+        {
+            let which = if is_unused { " that are not imported" } else { "" };
+            return Err(format!(
+                "the bag has more than {MAX_TOPICS} topics{which}; record fewer"
+            ));
+        }
+        self.by_name.insert(key, self.topics.len());
+        self.topics.push(topic);
         Ok(self.topics.len() - 1)
     }
 
-    /// Where a message is, for people.
-    pub(super) fn place(&self, file: usize, topic: &Topic, number: u64, position: Position) -> String {
-        let path = self.files[file].display();
-        let at = match position {
-            Position::File { offset, .. } => format!("byte {offset}"),
-            Position::Chunk { chunk, start, .. } => format!("byte {start} of the chunk at byte {chunk}"),
-            #[cfg(feature = "databases")]
-            Position::Row(row) => format!("row {row} of the messages"),
+    /// What the options want of a topic.
+    fn content(&self, kind: RosType, name: &str, encoding: &str) -> Content {
+        let is_wanted = |names: &[String], by_default: bool| match names {
+            [] => by_default,
+            names => names.iter().any(|given| given.split(':').next() == Some(name)),
         };
-        format!("{path} {at}: message {number} of {}", topic.name)
+        let (is_command, is_measurement) = (kind.is_command(), kind.is_measurement());
+        let ImportOptions {
+            image, actions, states, ..
+        } = self.options;
+        if encoding != "cdr" {
+            Content::Unused
+        } else if kind == RosType::CameraInfo {
+            Content::Camera(None)
+        } else if kind.is_image() && image.as_ref().is_none_or(|image| image == name) {
+            Content::Images(Vec::new())
+        } else if (is_command || is_measurement)
+            && (is_wanted(actions, is_command) || is_wanted(states, is_measurement))
+        {
+            Content::Values(ValueStream::default())
+        } else {
+            Content::Unused
+        }
     }
 
-    /// Takes a message of the latest file.
+    /// Where a message is, for people.
+    pub(super) fn place(&self, topic: &Topic, entry: &MessageEntry) -> String {
+        let place = self.files[entry.file].place(entry.position);
+        format!("{place}: message {} of {}", entry.number, topic.name)
+    }
+
+    /// Takes a message of the last file.
     pub(super) fn message(&mut self, topic: usize, log_ns: i64, position: Position, message: &[u8]) {
         let file = self.files.len() - 1;
         let of = &mut self.topics[topic];
         let number = of.messages;
         of.messages += 1;
-        let entry = |time| ImageEntry {
+        if of.is_unused() {
+            return;
+        }
+        let stamp_ns = None;
+        let time = MessageTime { log_ns, stamp_ns };
+        let entry = MessageEntry {
             time,
             number,
             file,
             position,
         };
-        let read = match of.content {
-            Content::Unused => Ok(()),
-            _ => compression::message(message).and_then(|message| take(of, number, log_ns, &message, entry)),
-        };
-        if let Err(reason) = read {
-            let of = &self.topics[topic];
-            if self.options.skip_bad || of.faults.is_empty() {
-                let place = self.place(file, of, number, position);
-                self.topics[topic].faults.push(SkippedItem::new(&place, &reason));
-            }
+        let taken = compression::message(message).and_then(|message| of.take(entry, &message));
+        if let Err(reason) = taken
+            && (self.options.skip_bad || of.faults.is_empty())
+        {
+            let place = self.place(&self.topics[topic], &entry);
+            self.topics[topic].faults.push(SkippedItem::new(&place, &reason));
         }
     }
-}
-
-/// Adds a message to its topic. Errors: why it cannot be read.
-fn take(
-    topic: &mut Topic,
-    number: u64,
-    log_ns: i64,
-    message: &[u8],
-    entry: impl FnOnce(MessageTime) -> ImageEntry,
-) -> Result<(), String> {
-    let at = |stamp_ns: Option<i64>| MessageTime {
-        log_ns,
-        stamp_ns: stamp_ns.filter(|&stamp| stamp != 0),
-    };
-    match &mut topic.content {
-        Content::Unused => {}
-        Content::Camera(found) => {
-            // Cameras seldom change; the first description counts.
-            if found.is_none() {
-                *found = Some(messages::camera_info(message).map_err(|error| error.to_string())?);
-            }
-        }
-        Content::Images(images) => {
-            let stamp = if topic.kind == RosType::Image {
-                let (stamp, image) = messages::image(message).map_err(|error| error.to_string())?;
-                image.check().map_err(|error| error.to_string())?;
-                stamp
-            } else {
-                let (stamp, format, _) = messages::compressed_image(message).map_err(|error| error.to_string())?;
-                check_format(format)?;
-                stamp
-            };
-            images.push(entry(at(Some(stamp))));
-        }
-        Content::Values(stream) => {
-            let (stamp, values) = messages::values(topic.kind, message).map_err(|error| error.to_string())?;
-            if let Some(wrong) = values.iter().find(|field| !(field.value as f32).is_finite()) {
-                return Err(format!("{} is {}; it must be a finite number", wrong.name, wrong.value));
-            }
-            stream.push(at(stamp), number, values)?;
-        }
-    }
-    Ok(())
 }
 
 /// Errors: why images of this format cannot be read. Without a format, the image itself says what it is.

@@ -5,16 +5,17 @@
 //! that holds at its time. Its action is the mean of what holds from its time until the next image, each value weighted by
 //! how long it holds. An image without an action or a state is left out.
 
+use std::ops::Range;
+
 use super::choice::{ChosenTopics, ChosenValues};
-use super::index::{BagIndex, Content, ImageEntry, MessageTime, ValueStream};
+use super::index::{BagIndex, MessageTime, Position};
 use crate::dataset::import::recording::Record;
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
+use crate::dataset::import::timing::{GAP_PERIODS, median};
 use crate::dataset::import::{ImportError, ImportOptions};
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
-const SAME_CLOCK_NS: i64 = 1_000_000_000;
-/// Number of median periods beyond which a jump of the images' time is a gap.
-const GAP_PERIODS: i64 = 3;
+const SAME_CLOCK_NS: u64 = 1_000_000_000;
 
 /// Which of a message's times counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,7 +26,7 @@ enum Clock {
 
 impl Clock {
     /// The clock of a topic: the one given as `--time`, else by the rule above. Errors: `Option` for another word.
-    fn of(times: &[MessageTime], options: &ImportOptions) -> Result<Self, ImportError> {
+    fn of(times: impl Iterator<Item = MessageTime>, options: &ImportOptions) -> Result<Self, ImportError> {
         match options.time.as_deref() {
             Some("header") => return Ok(Self::Header),
             Some("log") => return Ok(Self::Log),
@@ -36,21 +37,10 @@ impl Clock {
             }
             None => {}
         }
-        let difference = |time: &MessageTime| match time.stamp_ns {
-            Some(stamp) => time.log_ns.abs_diff(stamp),
-            None => u64::MAX,
-        };
-        let mut differences: Vec<u64> = times.iter().map(difference).collect();
-        if differences.is_empty() {
-            return Ok(Self::Log);
-        }
-        let middle = differences.len() / 2;
-        let median = *differences.select_nth_unstable(middle).1;
-        Ok(if median <= SAME_CLOCK_NS as u64 {
-            Self::Header
-        } else {
-            Self::Log
-        })
+        let difference = |time: MessageTime| time.stamp_ns.map_or(u64::MAX, |stamp| time.log_ns.abs_diff(stamp));
+        let median = median(times.map(difference).collect(), u64::cmp);
+        let is_same = median.is_some_and(|median| median <= SAME_CLOCK_NS);
+        Ok(if is_same { Self::Header } else { Self::Log })
     }
 
     fn time(self, time: MessageTime) -> i64 {
@@ -73,43 +63,31 @@ struct HeldValues<'a> {
 
 impl<'a> HeldValues<'a> {
     /// Errors: `Record` if time goes back, unless damage is left out.
-    fn new(index: &'a BagIndex<'_>, chosen: &ChosenValues, skipped: &mut SkippedList) -> Result<Self, ImportError> {
-        let (topic, options) = (&index.topics[chosen.topic], index.options);
-        let empty = ValueStream::default();
-        let stream = match &topic.content {
-            Content::Values(stream) => stream,
-            _ => &empty,
-        };
-        let clock = Clock::of(&stream.times, options)?;
+    fn new(index: &BagIndex<'_>, chosen: &ChosenValues<'a>, skipped: &mut SkippedList) -> Result<Self, ImportError> {
+        let (topic, options) = (&chosen.topic.name, index.options);
+        let clock = Clock::of(chosen.stream.messages().map(|(message, _)| message.time), options)?;
         let mut held = Self {
-            topic: &topic.name,
-            times_ns: Vec::with_capacity(stream.times.len()),
+            topic,
+            times_ns: Vec::new(),
             rows: Vec::new(),
             width: chosen.fields.len(),
             hold_ns: (options.hold_s * 1e9) as i64,
         };
         let mut row = vec![f32::NAN; held.width];
-        for (message, &time) in stream.times.iter().enumerate() {
-            let time_ns = clock.time(time);
+        for (message, values) in chosen.stream.messages() {
+            let time_ns = clock.time(message.time);
             if let Some(&before) = held.times_ns.last().filter(|&&before| time_ns < before) {
-                let error = ImportError::record(
-                    format!(
-                        "{} message {} of {}",
-                        index.source.display(),
-                        stream.numbers[message],
-                        topic.name
-                    ),
-                    format!(
-                        "its time {} s is before that of the message before, {} s; times must grow",
-                        seconds(time_ns),
-                        seconds(before)
-                    ),
+                let place = format!("{} message {} of {topic}", index.source.display(), message.number);
+                let reason = format!(
+                    "its time {} s is before that of the message before, {} s; times must grow",
+                    seconds(time_ns),
+                    seconds(before)
                 );
-                error.leave_out(options.skip_bad, skipped)?;
+                ImportError::record(place, reason).leave_out(options.skip_bad, skipped)?;
                 continue;
             }
             let mut changed = false;
-            for &(field, value) in stream.values(message) {
+            for &(field, value) in values {
                 if let Some(column) = chosen.fields.iter().position(|&of| of == field as usize) {
                     (row[column], changed) = (value, true);
                 }
@@ -156,114 +134,72 @@ fn seconds(time_ns: i64) -> f64 {
 }
 
 /// The images with what belongs to them.
+#[derive(Default)]
 pub(super) struct JoinedImages {
     pub(super) records: Vec<Record>,
-    /// For each record, which image it is.
-    pub(super) images: Vec<usize>,
+    /// File and position of each record's image.
+    pub(super) positions: Vec<(usize, Position)>,
     pub(super) skipped: SkippedList,
 }
 
 /// Joins the chosen topics. Errors: `Option`, `Record`.
-pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics) -> Result<JoinedImages, ImportError> {
-    let (topic, options) = (&index.topics[chosen.image], index.options);
-    let empty = Vec::new();
-    let entries = match &topic.content {
-        Content::Images(entries) => entries,
-        _ => &empty,
-    };
-    let times: Vec<MessageTime> = entries.iter().map(|entry| entry.time).collect();
-    let clock = Clock::of(&times, options)?;
-    let times_ns: Vec<i64> = times.into_iter().map(|time| clock.time(time)).collect();
-    let mut skipped = SkippedList::default();
-    let mut held = |values: &[ChosenValues]| -> Result<Vec<HeldValues<'_>>, ImportError> {
-        let one = |chosen: &ChosenValues| HeldValues::new(index, chosen, &mut skipped);
-        values.iter().map(one).collect()
-    };
-    let (actions, states) = (held(&chosen.actions)?, held(&chosen.states)?);
-    let period_ns = median_period(&times_ns);
-    let (mut joined, mut left_out) = (Vec::new(), LeftOut::default());
-    let mut images = Vec::new();
-    for (image, entry) in entries.iter().enumerate() {
+pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<JoinedImages, ImportError> {
+    let images = chosen.images;
+    let clock = Clock::of(images.iter().map(|image| image.time), index.options)?;
+    let times_ns: Vec<i64> = images.iter().map(|image| clock.time(image.time)).collect();
+    let steps = times_ns.windows(2).map(|pair| pair[1].saturating_sub(pair[0]));
+    let period_ns = median(steps.collect(), i64::cmp).map_or(1, |period| period.max(1));
+    let mut joined = JoinedImages::default();
+    let mut held = |chosen| HeldValues::new(index, chosen, &mut joined.skipped);
+    let actions = chosen.actions.iter().map(&mut held).collect::<Result<Vec<_>, _>>()?;
+    let states = chosen.states.iter().map(&mut held).collect::<Result<Vec<_>, _>>()?;
+    // Runs of images without an action or a state, with the topic that has no value.
+    let mut left_out: Vec<(&str, Range<u64>)> = Vec::new();
+    for (image, entry) in images.iter().enumerate() {
         let start_ns = times_ns[image];
         let next_ns = times_ns.get(image + 1).copied().unwrap_or(i64::MAX);
-        let is_next = next_ns > start_ns && next_ns.saturating_sub(start_ns) <= period_ns.saturating_mul(GAP_PERIODS);
+        let longest_ns = period_ns.saturating_mul(GAP_PERIODS.into());
+        let is_next = next_ns > start_ns && next_ns.saturating_sub(start_ns) <= longest_ns;
         let end_ns = if is_next {
             next_ns
         } else {
             start_ns.saturating_add(period_ns)
         };
-        let values = actions
-            .iter()
-            .chain(&states)
-            .map(|held| held.at(start_ns).ok_or(held.topic));
-        let messages = match values.collect::<Result<Vec<usize>, &str>>() {
+        let values = actions.iter().chain(&states);
+        let messages = values.map(|held| held.at(start_ns).ok_or(held.topic));
+        let messages = match messages.collect::<Result<Vec<usize>, &str>>() {
             Ok(messages) => messages,
             Err(missing) => {
-                left_out.add(missing, entry);
+                match left_out.last_mut() {
+                    Some((topic, run)) if *topic == missing && run.end == entry.number => run.end += 1,
+                    _ => left_out.push((missing, entry.number..entry.number + 1)),
+                }
                 continue;
             }
         };
         let (of_actions, of_states) = messages.split_at(actions.len());
         let action = actions.iter().zip(of_actions);
         let state = states.iter().zip(of_states);
-        joined.push(Record {
+        joined.records.push(Record {
             timestamp_s: seconds(start_ns),
             action: action
                 .flat_map(|(held, &first)| held.mean(first, start_ns, end_ns))
                 .collect(),
             state: state.flat_map(|(held, &at)| held.row(at).iter().copied()).collect(),
-            image: images.len(),
-            place: index.place(entry.file, topic, entry.number, entry.position),
+            place: index.place(chosen.image, entry),
             ..Record::default()
         });
-        images.push(image);
+        joined.positions.push((entry.file, entry.position));
     }
-    left_out
-        .items(index, &topic.name)
-        .into_iter()
-        .for_each(|item| skipped.push(item));
-    Ok(JoinedImages {
-        records: joined,
-        images,
-        skipped,
-    })
-}
-
-/// The median distance of two images in time, at least 1 ns.
-fn median_period(times_ns: &[i64]) -> i64 {
-    let mut steps: Vec<i64> = times_ns
-        .windows(2)
-        .map(|pair| pair[1].saturating_sub(pair[0]))
-        .collect();
-    if steps.is_empty() {
-        return 1;
+    let (source, hold_s) = (index.source.display(), index.options.hold_s);
+    for (topic, run) in left_out {
+        let (first, last) = (run.start, run.end - 1);
+        joined.skipped.push(SkippedItem::new(
+            &format!("{source} messages {first} to {last} of {}", chosen.image.name),
+            &format!("{topic} has no value in the {hold_s} s before them (--hold)"),
+        ));
     }
-    let middle = steps.len() / 2;
-    (*steps.select_nth_unstable(middle).1).max(1)
-}
-
-/// Images without an action or a state, in runs: the topic that has no value, first and last image.
-#[derive(Default)]
-struct LeftOut<'a>(Vec<(&'a str, u64, u64)>);
-
-impl<'a> LeftOut<'a> {
-    fn add(&mut self, missing: &'a str, image: &ImageEntry) {
-        match self.0.last_mut() {
-            Some((topic, _, last)) if *topic == missing && *last + 1 == image.number => *last = image.number,
-            _ => self.0.push((missing, image.number, image.number)),
-        }
-    }
-
-    fn items(self, index: &BagIndex<'_>, image_topic: &str) -> Vec<SkippedItem> {
-        let (source, hold_s) = (index.source.display(), index.options.hold_s);
-        let item = |(topic, first, last): (&str, u64, u64)| {
-            SkippedItem::new(
-                &format!("{source} messages {first} to {last} of {image_topic}"),
-                &format!("{topic} has no value in the {hold_s} s before them (--hold)"),
-            )
-        };
-        self.0.into_iter().map(item).collect()
-    }
+    Ok(joined)
 }
 
 #[cfg(test)]
@@ -298,20 +234,20 @@ mod tests {
 
     #[test]
     fn headers_of_another_clock_do_not_count() {
-        let times = |offset: i64| -> Vec<MessageTime> {
-            let at = |index: i64| MessageTime {
+        let times = |offset: i64| {
+            let at = move |index: i64| MessageTime {
                 log_ns: index * 100_000_000,
                 stamp_ns: Some(index * 100_000_000 + offset),
             };
-            (0..9).map(at).collect()
+            (0..9).map(at)
         };
         let options = ImportOptions::default();
-        assert_eq!(Clock::of(&times(40_000_000), &options).unwrap(), Clock::Header);
-        assert_eq!(Clock::of(&times(7_000_000_000), &options).unwrap(), Clock::Log);
+        assert_eq!(Clock::of(times(40_000_000), &options).unwrap(), Clock::Header);
+        assert_eq!(Clock::of(times(7_000_000_000), &options).unwrap(), Clock::Log);
         let forced = ImportOptions {
             time: Some("header".to_owned()),
             ..options
         };
-        assert_eq!(Clock::of(&times(7_000_000_000), &forced).unwrap(), Clock::Header);
+        assert_eq!(Clock::of(times(7_000_000_000), &forced).unwrap(), Clock::Header);
     }
 }

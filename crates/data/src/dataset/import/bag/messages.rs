@@ -1,8 +1,8 @@
-//! The ROS 2 messages that are read, from CDR to values.
+//! The ROS 2 messages that are read, from CDR to values. Errors: why a message cannot be read.
 
 use std::borrow::Cow;
 
-use super::cdr::{CdrError, CdrReader};
+use super::cdr::CdrReader;
 use super::pixels::RawImage;
 
 /// What a topic's messages are.
@@ -71,45 +71,40 @@ pub(super) struct FieldValue {
     pub(super) value: f64,
 }
 
-/// The time in a message's header, in nanoseconds; 0 where nobody set it. Errors: `CdrError`.
-fn header_stamp(reader: &mut CdrReader<'_>) -> Result<i64, CdrError> {
+/// The time in a message's header, in nanoseconds; 0 where nobody set it.
+fn header_stamp(reader: &mut CdrReader<'_>) -> Result<i64, String> {
     let seconds = reader.i32("header.stamp.sec")?;
     let nanoseconds = reader.u32("header.stamp.nanosec")?;
     reader.text("header.frame_id")?;
     Ok(i64::from(seconds) * 1_000_000_000 + i64::from(nanoseconds))
 }
 
-/// Time and pixels of a `sensor_msgs/Image`. Errors: `CdrError`.
-pub(super) fn image(message: &[u8]) -> Result<(i64, RawImage<'_>), CdrError> {
+/// Time and pixels of a `sensor_msgs/Image`.
+pub(super) fn image(message: &[u8]) -> Result<(i64, RawImage<'_>), String> {
     let mut reader = CdrReader::new(message)?;
     let stamp = header_stamp(&mut reader)?;
-    let (height_px, width_px) = (reader.u32("height")?, reader.u32("width")?);
-    let encoding = reader.text("encoding")?;
-    let big_endian = reader.u8("is_bigendian")? != 0;
-    let row_bytes = reader.u32("step")?;
-    Ok((
-        stamp,
-        RawImage {
-            width_px,
-            height_px,
-            encoding,
-            big_endian,
-            row_bytes,
-            bytes: reader.bytes("data")?,
-        },
-    ))
+    // The fields in the order of the message.
+    let image = RawImage {
+        height_px: reader.u32("height")?,
+        width_px: reader.u32("width")?,
+        encoding: reader.text("encoding")?,
+        big_endian: reader.u8("is_bigendian")? != 0,
+        row_bytes: reader.u32("step")?,
+        bytes: reader.bytes("data")?,
+    };
+    Ok((stamp, image))
 }
 
-/// Time, format and file of a `sensor_msgs/CompressedImage`. Errors: `CdrError`.
-pub(super) fn compressed_image(message: &[u8]) -> Result<(i64, &str, &[u8]), CdrError> {
+/// Time, format and file of a `sensor_msgs/CompressedImage`.
+pub(super) fn compressed_image(message: &[u8]) -> Result<(i64, &str, &[u8]), String> {
     let mut reader = CdrReader::new(message)?;
     let stamp = header_stamp(&mut reader)?;
     Ok((stamp, reader.text("format")?, reader.bytes("data")?))
 }
 
 /// Time (`None` without a header) and values of a message that is an action or a state. A value that is not finite is one
-/// that the robot does not measure in a `JointState`, and is left out there. Errors: `CdrError`.
-pub(super) fn values(kind: RosType, message: &[u8]) -> Result<(Option<i64>, Vec<FieldValue>), CdrError> {
+/// that the robot does not measure in a `JointState`, and is left out there.
+pub(super) fn values(kind: RosType, message: &[u8]) -> Result<(Option<i64>, Vec<FieldValue>), String> {
     let mut reader = CdrReader::new(message)?;
     let stamp = match kind {
         RosType::Twist => None,
@@ -131,7 +126,7 @@ fn field(name: impl Into<Cow<'static, str>>, unit: &'static str, value: f64) -> 
     }
 }
 
-fn twist(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, CdrError> {
+fn twist(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
     const NAMES: [(&str, &str); 6] = [
         ("linear.x", "m/s"),
         ("linear.y", "m/s"),
@@ -144,7 +139,7 @@ fn twist(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, CdrError> {
     NAMES.into_iter().map(read).collect()
 }
 
-fn odometry(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, CdrError> {
+fn odometry(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
     reader.text("child_frame_id")?;
     let mut fields = Vec::new();
     for name in ["x", "y", "z"] {
@@ -171,7 +166,7 @@ fn odometry(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, CdrError> {
     Ok(fields)
 }
 
-fn joint_state(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, CdrError> {
+fn joint_state(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
     let names = reader.texts("name")?;
     let (positions, velocities) = (reader.f64_sequence("position")?, reader.f64_sequence("velocity")?);
     let of = |values: Vec<f64>, what: &'static str, unit: &'static str| {
@@ -195,8 +190,8 @@ pub(super) struct Projection {
     pub(super) is_distorted: bool,
 }
 
-/// The projection of a `sensor_msgs/CameraInfo`. Errors: `CdrError`.
-pub(super) fn camera_info(message: &[u8]) -> Result<Projection, CdrError> {
+/// The projection of a `sensor_msgs/CameraInfo`.
+pub(super) fn camera_info(message: &[u8]) -> Result<Projection, String> {
     let mut reader = CdrReader::new(message)?;
     header_stamp(&mut reader)?;
     let (height_px, width_px) = (reader.u32("height")?, reader.u32("width")?);

@@ -1,35 +1,10 @@
 //! Raw images of ROS as gray frames.
 
 use foreframe_core::frame::codec::gray_from_rgb;
-use foreframe_core::frame::{Frame, FrameError, MAX_SIDE_PX};
+use foreframe_core::frame::{Frame, MAX_SIDE_PX};
 
 /// Names for a message.
 const ENCODINGS: &str = "mono8, mono16, rgb8, bgr8, rgba8, bgra8, yuyv (yuv422_yuy2) or uyvy (yuv422)";
-
-/// Why an image cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum PixelError {
-    #[error("its encoding is {0:?}; it must be {ENCODINGS}")]
-    Encoding(String),
-    #[error("its size is {width_px}×{height_px} px; each side must be 1 to {MAX_SIDE_PX} px")]
-    Size { width_px: u32, height_px: u32 },
-    #[error("its rows have {found} bytes (step); {width_px} px in {encoding} need {needed}")]
-    Row {
-        found: u32,
-        width_px: u32,
-        encoding: String,
-        needed: u32,
-    },
-    #[error("its data has {found} bytes; {height_px} rows of {row_bytes} bytes need {needed}")]
-    Data {
-        found: usize,
-        height_px: u32,
-        row_bytes: u32,
-        needed: usize,
-    },
-    #[error(transparent)]
-    Frame(#[from] FrameError),
-}
 
 /// The fields of a `sensor_msgs/Image`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,139 +17,110 @@ pub(super) struct RawImage<'a> {
     pub(super) bytes: &'a [u8],
 }
 
-/// How a pixel lies in memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum PixelLayout {
-    Gray8,
+/// What the bytes of a pixel hold.
+#[derive(Clone, Copy)]
+enum Samples {
+    /// The brightness in this byte.
+    Gray8(usize),
+    /// The brightness in both bytes.
     Gray16,
-    /// Positions of red, green and blue in a pixel of `bytes` bytes.
-    Color {
-        bytes: usize,
-        red: usize,
-        blue: usize,
-    },
-    /// Two bytes, of which this one is the brightness.
-    Yuv422 {
-        luma: usize,
-    },
+    /// Red, green and blue in these bytes.
+    Color([usize; 3]),
+}
+
+/// How a pixel lies in memory.
+#[derive(Clone, Copy)]
+struct PixelLayout {
+    bytes: usize,
+    samples: Samples,
 }
 
 impl PixelLayout {
     fn of(encoding: &str) -> Option<Self> {
-        Some(match encoding {
-            "mono8" | "8UC1" => Self::Gray8,
-            "mono16" => Self::Gray16,
-            "rgb8" => Self::Color {
-                bytes: 3,
-                red: 0,
-                blue: 2,
-            },
-            "bgr8" | "8UC3" => Self::Color {
-                bytes: 3,
-                red: 2,
-                blue: 0,
-            },
-            "rgba8" => Self::Color {
-                bytes: 4,
-                red: 0,
-                blue: 2,
-            },
-            "bgra8" | "8UC4" => Self::Color {
-                bytes: 4,
-                red: 2,
-                blue: 0,
-            },
-            "yuyv" | "yuv422_yuy2" => Self::Yuv422 { luma: 0 },
-            "uyvy" | "yuv422" => Self::Yuv422 { luma: 1 },
+        let (bytes, samples) = match encoding {
+            "mono8" | "8UC1" => (1, Samples::Gray8(0)),
+            "mono16" => (2, Samples::Gray16),
+            "rgb8" => (3, Samples::Color([0, 1, 2])),
+            "bgr8" | "8UC3" => (3, Samples::Color([2, 1, 0])),
+            "rgba8" => (4, Samples::Color([0, 1, 2])),
+            "bgra8" | "8UC4" => (4, Samples::Color([2, 1, 0])),
+            "yuyv" | "yuv422_yuy2" => (2, Samples::Gray8(0)),
+            "uyvy" | "yuv422" => (2, Samples::Gray8(1)),
             _ => return None,
-        })
-    }
-
-    fn bytes(self) -> usize {
-        match self {
-            Self::Gray8 => 1,
-            Self::Gray16 | Self::Yuv422 { .. } => 2,
-            Self::Color { bytes, .. } => bytes,
-        }
+        };
+        Some(Self { bytes, samples })
     }
 }
 
 impl RawImage<'_> {
-    /// Checks encoding, size and number of bytes. Errors: `Encoding`, `Size`, `Row`, `Data`.
-    pub(super) fn check(&self) -> Result<(), PixelError> {
+    /// Checks encoding, size and number of bytes. Errors: why the image cannot be read.
+    pub(super) fn check(&self) -> Result<(), String> {
         self.layout().map(drop)
     }
 
-    fn layout(&self) -> Result<PixelLayout, PixelError> {
-        let Some(layout) = PixelLayout::of(self.encoding) else {
-            return Err(PixelError::Encoding(self.encoding.chars().take(40).collect()));
+    fn layout(&self) -> Result<PixelLayout, String> {
+        let Self {
+            width_px,
+            height_px,
+            row_bytes,
+            encoding,
+            ..
+        } = *self;
+        let Some(layout) = PixelLayout::of(encoding) else {
+            let found: String = encoding.chars().take(40).collect();
+            return Err(format!("its encoding is {found:?}; it must be {ENCODINGS}"));
         };
         let sides = 1..=MAX_SIDE_PX;
-        if !sides.contains(&self.width_px) || !sides.contains(&self.height_px) {
-            return Err(PixelError::Size {
-                width_px: self.width_px,
-                height_px: self.height_px,
-            });
+        if !sides.contains(&width_px) || !sides.contains(&height_px) {
+            return Err(format!(
+                "its size is {width_px}×{height_px} px; each side must be 1 to {MAX_SIDE_PX} px"
+            ));
         }
-        let needed = self.width_px * layout.bytes() as u32;
-        if self.row_bytes < needed {
-            return Err(PixelError::Row {
-                found: self.row_bytes,
-                width_px: self.width_px,
-                encoding: self.encoding.to_owned(),
-                needed,
-            });
+        let needed = width_px * layout.bytes as u32;
+        if row_bytes < needed {
+            return Err(format!(
+                "its rows have {row_bytes} bytes (step); {width_px} px in {encoding} need {needed}"
+            ));
         }
         // The last row needs no padding.
-        let needed = self.row_bytes as usize * (self.height_px as usize - 1) + needed as usize;
-        if self.bytes.len() < needed {
-            return Err(PixelError::Data {
-                found: self.bytes.len(),
-                height_px: self.height_px,
-                row_bytes: self.row_bytes,
-                needed,
-            });
+        let needed = row_bytes as usize * (height_px as usize - 1) + needed as usize;
+        let found = self.bytes.len();
+        if found < needed {
+            return Err(format!(
+                "its data has {found} bytes; {height_px} rows of {row_bytes} bytes need {needed}"
+            ));
         }
         Ok(layout)
     }
 
     /// The image in gray. Colors become gray by ITU-R BT.601, 16-bit intensities are rounded to 8 bits. Errors: as
     /// [`RawImage::check`].
-    pub(super) fn gray(&self) -> Result<Frame, PixelError> {
-        let layout = self.layout()?;
-        let row_pixels = self.width_px as usize * layout.bytes();
-        let mut pixels = Vec::with_capacity(self.width_px as usize * self.height_px as usize);
-        let rows = self.bytes.chunks(self.row_bytes as usize).take(self.height_px as usize);
-        let mut rgb = Vec::new();
-        for row in rows {
-            let row = &row[..row_pixels];
-            match layout {
-                PixelLayout::Gray8 => pixels.extend_from_slice(row),
-                PixelLayout::Gray16 => {
-                    let levels = row.as_chunks::<2>().0.iter().map(|bytes| {
-                        if self.big_endian {
-                            u16::from_be_bytes(*bytes)
-                        } else {
-                            u16::from_le_bytes(*bytes)
-                        }
-                    });
-                    pixels.extend(levels.map(|level| ((u32::from(level) * 255 + 32_767) / 65_535) as u8));
+    pub(super) fn gray(&self) -> Result<Frame, String> {
+        let PixelLayout { bytes, samples } = self.layout()?;
+        let (width, height) = (self.width_px as usize, self.height_px as usize);
+        let mut pixels = Vec::with_capacity(width * height);
+        for row in self.bytes.chunks(self.row_bytes as usize).take(height) {
+            let row = &row[..width * bytes];
+            match samples {
+                Samples::Gray8(position) => pixels.extend(row.iter().skip(position).step_by(bytes)),
+                Samples::Gray16 => {
+                    let level = if self.big_endian {
+                        u16::from_be_bytes
+                    } else {
+                        u16::from_le_bytes
+                    };
+                    let levels = row.as_chunks::<2>().0.iter().map(|bytes| u32::from(level(*bytes)));
+                    pixels.extend(levels.map(|level| ((level * 255 + 32_767) / 65_535) as u8));
                 }
-                PixelLayout::Color { bytes: 3, red: 0, .. } => pixels.extend(gray_from_rgb(row)),
-                PixelLayout::Color { bytes, red, blue } => {
-                    rgb.clear();
-                    rgb.extend(
-                        row.chunks_exact(bytes)
-                            .flat_map(|pixel| [pixel[red], pixel[1], pixel[blue]]),
-                    );
-                    pixels.extend(gray_from_rgb(&rgb));
-                }
-                PixelLayout::Yuv422 { luma } => {
-                    pixels.extend(row.as_chunks::<2>().0.iter().map(|bytes| bytes[luma]));
+                Samples::Color(positions) => {
+                    let rgb = row
+                        .chunks_exact(bytes)
+                        .flat_map(|pixel| positions.map(|position| pixel[position]));
+                    pixels.extend(gray_from_rgb(&rgb.collect::<Vec<_>>()));
                 }
             }
         }
-        Ok(Frame::new(self.width_px, self.height_px, pixels)?)
+        Frame::new(self.width_px, self.height_px, pixels).map_err(|error| error.to_string())
     }
 }
 
@@ -234,7 +180,7 @@ mod tests {
 
     #[test]
     fn wrong_sizes_and_encodings_are_named() {
-        let text = |image: RawImage<'_>| image.check().unwrap_err().to_string();
+        let text = |image: RawImage<'_>| image.check().unwrap_err();
         assert!(text(image("bayer_rggb8", 2, &[0; 4])).contains("\"bayer_rggb8\"; it must be mono8"));
         assert!(text(image("rgb8", 5, &[0; 12])).contains("2 px in rgb8 need 6"));
         assert!(text(image("rgb8", 6, &[0; 11])).contains("11 bytes; 2 rows of 6 bytes need 12"));

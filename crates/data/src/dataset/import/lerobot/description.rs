@@ -67,24 +67,20 @@ impl Description {
     pub(super) fn read(source: &Path) -> Result<Self, ImportError> {
         let path = source.join(INFO);
         let text = read_file(&path)?;
-        let info: InfoFile = serde_json::from_slice(&text)
-            .map_err(|error| ImportError::record(path.display().to_string(), error.to_string()))?;
-        if !["v2.", "v3."]
-            .iter()
-            .any(|known| info.codebase_version.starts_with(known))
-        {
+        let info: InfoFile =
+            serde_json::from_slice(&text).map_err(|error| ImportError::record(path.display(), error))?;
+        let version = &info.codebase_version;
+        if !version.starts_with("v2.") && !version.starts_with("v3.") {
+            let source = source.display();
             return Err(ImportError::Option(format!(
-                "{} is a LeRobot data set of version {}; versions v2.0, v2.1 and v3.0 are read",
-                source.display(),
-                info.codebase_version
+                "{source} is a LeRobot data set of version {version}; versions v2.0, v2.1 and v3.0 are read"
             )));
         }
         let mut vectors = info.features.iter().filter(|(_, feature)| feature.is_vector());
         if let Some((name, feature)) = vectors.find(|(_, feature)| feature.size() > MAX_COMPONENTS) {
+            let (path, size) = (path.display(), feature.size());
             return Err(ImportError::Option(format!(
-                "{}: feature \"{name}\" has {} components; at most {MAX_COMPONENTS} are read",
-                path.display(),
-                feature.size()
+                "{path}: feature \"{name}\" has {size} components; at most {MAX_COMPONENTS} are read"
             )));
         }
         Ok(Self {
@@ -102,30 +98,30 @@ impl Description {
         let is_image = |feature: &Feature| ["image", "video"].contains(&feature.dtype.as_str());
         let images: Vec<(&String, &Feature)> = self.info.features.iter().filter(|(_, f)| is_image(f)).collect();
         let names = || listed(images.iter().map(|(name, _)| name));
-        let found = if let Some(wanted) = &options.image {
-            images.iter().find(|(name, _)| is_named(name, wanted)).ok_or_else(|| {
-                ImportError::Option(format!(
+        let mut cameras = images.iter().filter(|(name, feature)| match &options.image {
+            Some(wanted) => is_named(name, wanted),
+            None => !feature.is_depth(),
+        });
+        let reason = match (cameras.next(), cameras.next(), &options.image) {
+            (Some((name, feature)), None, _) | (Some((name, feature)), _, Some(_)) => {
+                return Ok(ImageFeature {
+                    name: (*name).clone(),
+                    is_video: feature.dtype == "video",
+                });
+            }
+            (None, _, Some(wanted)) => {
+                format!(
                     "the data set has no images {wanted:?} (--image); its images are: {}",
                     names()
-                ))
-            })?
-        } else {
-            let mut cameras = images.iter().filter(|(_, feature)| !feature.is_depth());
-            match (cameras.next(), cameras.next()) {
-                (None, _) => return Err(ImportError::Option("the data set has no images".to_owned())),
-                (Some(one), None) => one,
-                (Some(_), Some(_)) => {
-                    return Err(ImportError::Option(format!(
-                        "the data set has images of several cameras; choose one with --image: {}",
-                        names()
-                    )));
-                }
+                )
+            }
+            (None, _, None) => "the data set has no images".to_owned(),
+            (Some(_), Some(_), None) => {
+                let names = names();
+                format!("the data set has images of several cameras; choose one with --image: {names}")
             }
         };
-        Ok(ImageFeature {
-            name: found.0.clone(),
-            is_video: found.1.dtype == "video",
-        })
+        Err(ImportError::Option(reason))
     }
 
     /// The components of the features (or single components) that were named, else those of the default feature, if there is
@@ -136,34 +132,25 @@ impl Description {
         default: &str,
         option: &str,
     ) -> Result<Vec<Component>, ImportError> {
-        let numbers = || self.info.features.iter().filter(|(_, feature)| feature.is_vector());
-        let all = |name: &String, feature: &Feature| feature.components(name);
+        let vectors = || self.info.features.iter().filter(|(_, feature)| feature.is_vector());
+        let all = |(name, feature): (&String, &Feature)| feature.components(name);
         if wanted.is_empty() {
-            let found = numbers().find(|(name, _)| *name == default);
-            return Ok(found.map_or_else(Vec::new, |(name, feature)| all(name, feature)));
+            return Ok(vectors().filter(|(name, _)| *name == default).flat_map(all).collect());
         }
         let mut components = Vec::new();
         for one in wanted {
-            let feature = numbers().find(|(name, _)| is_named(name, one));
-            let single = || {
-                numbers()
-                    .flat_map(|(name, feature)| all(name, feature))
-                    .find(|c| c.name == *one)
-            };
-            match (feature, single()) {
-                (Some((name, feature)), _) => components.extend(all(name, feature)),
-                (None, Some(component)) => components.push(component),
-                (None, None) => {
-                    let known = numbers().map(|(name, feature)| {
-                        let components = all(name, feature).into_iter().map(|component| component.name);
-                        format!("{name} ({})", listed(components))
-                    });
-                    return Err(ImportError::Option(format!(
-                        "the data set has no numbers {one:?} ({option}); its features and their components are: {}",
-                        listed(known)
-                    )));
-                }
-            }
+            let feature = vectors().find(|(name, _)| is_named(name, one)).map(all);
+            let single = || vectors().flat_map(all).find(|component| component.name == *one);
+            let found = feature.or_else(|| Some(vec![single()?]));
+            components.extend(found.ok_or_else(|| {
+                let known = listed(vectors().map(|(name, feature)| {
+                    let names = feature.components(name).into_iter().map(|component| component.name);
+                    format!("{name} ({})", listed(names))
+                }));
+                ImportError::Option(format!(
+                    "the data set has no numbers {one:?} ({option}); its features and their components are: {known}"
+                ))
+            })?);
         }
         Ok(components)
     }
@@ -187,11 +174,10 @@ impl Feature {
     /// Its components, with the names that the data set gives them, or numbers.
     fn components(&self, feature: &str) -> Vec<Component> {
         let size = self.size();
-        let mut names = Vec::new();
-        texts(&self.names, &mut names);
+        let names = texts(&self.names);
         let short = feature.rsplit('.').next().unwrap_or(feature);
         let name = |index: usize| match names.get(index) {
-            Some(name) if names.len() == size && *name != feature => name.clone(),
+            Some(&name) if names.len() == size && name != feature => name.to_owned(),
             _ if size == 1 => short.to_owned(),
             _ => format!("{short}_{index}"),
         };
@@ -206,12 +192,12 @@ impl Feature {
 }
 
 /// All texts in lists and objects, in order: `["x", "y"]` or `{"motors": ["x", "y"]}`.
-fn texts(value: &Value, found: &mut Vec<String>) {
+fn texts(value: &Value) -> Vec<&str> {
     match value {
-        Value::String(text) => found.push(text.clone()),
-        Value::Array(items) => items.iter().for_each(|item| texts(item, found)),
-        Value::Object(fields) => fields.values().for_each(|item| texts(item, found)),
-        _ => {}
+        Value::String(text) => vec![text],
+        Value::Array(items) => items.iter().flat_map(texts).collect(),
+        Value::Object(fields) => fields.values().flat_map(texts).collect(),
+        _ => Vec::new(),
     }
 }
 

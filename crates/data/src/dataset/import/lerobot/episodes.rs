@@ -10,6 +10,7 @@ use super::rows::column_numbers;
 use crate::dataset::import::error::ImportError;
 use crate::dataset::import::files::{inside, read_text};
 use crate::dataset::store::shard_reader::batches;
+use foreframe_core::files::files_below;
 
 /// Episodes of version 2.
 const EPISODE_LINES: &str = "meta/episodes.jsonl";
@@ -57,16 +58,16 @@ impl Description {
         let text = read_text(&path)?;
         let entry = |(number, line): (usize, &str)| {
             let place = format!("{} line {}", path.display(), number + 1);
-            let line: Line =
-                serde_json::from_str(line).map_err(|error| ImportError::record(&place, error.to_string()))?;
+            let line: Line = serde_json::from_str(line).map_err(|error| ImportError::record(&place, error))?;
             let index = line.episode_index;
             let chunk = index / self.info.chunks_size.unwrap_or(CHUNK_EPISODES).max(1);
             let fields = [("episode_chunk", chunk), ("episode_index", index)];
+            let video = image.is_video.then(|| self.video(image, &fields, 0.0, &place));
             Ok(EpisodeEntry {
                 index,
                 length: line.length,
-                table: self.path(&self.info.data_path, &image.name, &fields, &place)?,
-                video: self.video(image, &fields, 0.0, &place)?,
+                table: self.path(&self.info.data_path, image, &fields, &place)?,
+                video: video.transpose()?,
             })
         };
         let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
@@ -74,8 +75,11 @@ impl Description {
     }
 
     fn episodes_of_tables(&self, image: &ImageFeature) -> Result<Vec<EpisodeEntry>, ImportError> {
+        let dir = self.source.join(EPISODE_TABLES);
+        let mut files = files_below(&dir).map_err(ImportError::io("list", &dir))?;
+        files.retain(|path| path.is_file() && path.extension().is_some_and(|extension| extension == "parquet"));
         let mut episodes = Vec::new();
-        for path in parquet_files(&self.source.join(EPISODE_TABLES))? {
+        for path in files {
             for batch in batches(&path)? {
                 self.entries(&batch, &path, image, &mut episodes)?;
             }
@@ -91,44 +95,29 @@ impl Description {
         episodes: &mut Vec<EpisodeEntry>,
     ) -> Result<(), ImportError> {
         let numbers = |column: &str| {
-            column_numbers(batch, column).ok_or_else(|| {
-                ImportError::record(
-                    path.display().to_string(),
-                    format!("it has no column {column:?} of numbers"),
-                )
-            })
+            let wrong = || ImportError::record(path.display(), format!("it has no column {column:?} of numbers"));
+            column_numbers(batch, column).ok_or_else(wrong)
         };
         let of_video = |what: &str| numbers(&format!("videos/{}/{what}", image.name));
         let (indexes, lengths) = (numbers("episode_index")?, numbers("length")?);
         let (chunks, files) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
         let videos = if image.is_video {
-            Some((
-                of_video("chunk_index")?,
-                of_video("file_index")?,
-                of_video("from_timestamp")?,
-            ))
+            let (chunks, files) = (of_video("chunk_index")?, of_video("file_index")?);
+            Some((chunks, files, of_video("from_timestamp")?))
         } else {
             None
         };
+        let fields = |chunk: f64, file: f64| [("chunk_index", chunk as usize), ("file_index", file as usize)];
         for row in 0..batch.num_rows() {
             let place = format!("{} row {row}", path.display());
-            let fields = |chunk: f64, file: f64| [("chunk_index", chunk as usize), ("file_index", file as usize)];
-            let video = match &videos {
-                Some((chunks, files, starts)) => {
-                    self.video(image, &fields(chunks[row], files[row]), starts[row], &place)?
-                }
-                None => None,
-            };
+            let video = videos.as_ref().map(|(chunks, files, starts)| {
+                self.video(image, &fields(chunks[row], files[row]), starts[row], &place)
+            });
             episodes.push(EpisodeEntry {
                 index: indexes[row] as usize,
                 length: lengths[row] as usize,
-                table: self.path(
-                    &self.info.data_path,
-                    &image.name,
-                    &fields(chunks[row], files[row]),
-                    &place,
-                )?,
-                video,
+                table: self.path(&self.info.data_path, image, &fields(chunks[row], files[row]), &place)?,
+                video: video.transpose()?,
             });
         }
         Ok(())
@@ -140,23 +129,24 @@ impl Description {
         fields: &[(&str, usize)],
         from_s: f64,
         place: &str,
-    ) -> Result<Option<VideoPart>, ImportError> {
-        if !image.is_video {
-            return Ok(None);
-        }
+    ) -> Result<VideoPart, ImportError> {
         let template = self.info.video_path.as_deref().ok_or_else(|| {
-            ImportError::record(
-                self.source.join(INFO).display().to_string(),
-                format!("\"{}\" is a video, but \"video_path\" is missing", image.name),
-            )
+            let reason = format!("\"{}\" is a video, but \"video_path\" is missing", image.name);
+            ImportError::record(self.source.join(INFO).display(), reason)
         })?;
-        let path = self.path(template, &image.name, fields, place)?;
-        Ok(Some(VideoPart { path, from_s }))
+        let path = self.path(template, image, fields, place)?;
+        Ok(VideoPart { path, from_s })
     }
 
     /// A path of the data set: the template with its fields filled in, below the data set's directory.
-    fn path(&self, template: &str, image: &str, fields: &[(&str, usize)], place: &str) -> Result<PathBuf, ImportError> {
-        let name = filled(template, image, fields);
+    fn path(
+        &self,
+        template: &str,
+        image: &ImageFeature,
+        fields: &[(&str, usize)],
+        place: &str,
+    ) -> Result<PathBuf, ImportError> {
+        let name = filled(template, &image.name, fields);
         inside(&self.source, &name, place)?;
         Ok(PathBuf::from(name))
     }
@@ -175,25 +165,6 @@ fn filled(template: &str, image: &str, fields: &[(&str, usize)]) -> String {
         }
     }
     text
-}
-
-/// All Parquet files below a directory, in order of their paths.
-fn parquet_files(dir: &Path) -> Result<Vec<PathBuf>, ImportError> {
-    let mut found = Vec::new();
-    let mut open = vec![dir.to_owned()];
-    while let Some(dir) = open.pop() {
-        let entries = std::fs::read_dir(&dir).map_err(ImportError::io("list", &dir))?;
-        for entry in entries {
-            let path = entry.map_err(ImportError::io("list", &dir))?.path();
-            if path.is_dir() {
-                open.push(path);
-            } else if path.is_file() && path.extension().is_some_and(|extension| extension == "parquet") {
-                found.push(path);
-            }
-        }
-    }
-    found.sort();
-    Ok(found)
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! The images of a data set of `LeRobot` in a column of its tables. Few of them are in memory at a time.
 
 use std::collections::VecDeque;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, PoisonError};
@@ -12,7 +13,7 @@ use parquet::arrow::ProjectionMask;
 use crate::dataset::import::error::ImportError;
 use crate::dataset::import::files::{inside, open_file};
 use crate::dataset::import::image_files::read_image;
-use crate::dataset::import::recording::{ImageSource, WantedImage};
+use crate::dataset::import::recording::{ImageSource, Record};
 use crate::dataset::store::parquet_file;
 use foreframe_core::frame::{Frame, codec};
 
@@ -39,24 +40,20 @@ pub(super) struct ImageTable {
 struct ImageBlock {
     table: usize,
     first: usize,
-    images: Vec<StoredImage>,
+    batches: Vec<RecordBatch>,
 }
 
-/// An image in a table: its bytes, or a file's name.
-#[derive(Clone)]
-enum StoredImage {
-    Bytes(Vec<u8>),
-    File(String),
-    Missing,
-}
-
-impl StoredImage {
-    fn bytes(&self) -> usize {
-        match self {
-            Self::Bytes(bytes) => bytes.len(),
-            Self::File(name) => name.len(),
-            Self::Missing => 0,
+impl ImageBlock {
+    /// The batch with a row, and the row's number in it.
+    fn row(&self, table: usize, row: usize) -> Option<(RecordBatch, usize)> {
+        let mut left = row.checked_sub(self.first).filter(|_| self.table == table)?;
+        for batch in &self.batches {
+            if left < batch.num_rows() {
+                return Some((batch.clone(), left));
+            }
+            left -= batch.num_rows();
         }
+        None
     }
 }
 
@@ -71,42 +68,37 @@ impl ImageTable {
         }
     }
 
-    fn stored(&self, table: usize, row: usize) -> Result<StoredImage, ImportError> {
+    /// The batch with a row, and the row's number in it; `None` if the table has no such row. Errors: `Io`, `Record`.
+    fn stored(&self, table: usize, row: usize) -> Result<Option<(RecordBatch, usize)>, ImportError> {
         let mut blocks = self.blocks.lock().unwrap_or_else(PoisonError::into_inner);
-        let find = |blocks: &VecDeque<ImageBlock>| {
-            let holds = |block: &&ImageBlock| block.table == table && row >= block.first;
-            let mut found = blocks.iter().filter(holds);
-            found.find_map(|block| block.images.get(row - block.first).cloned())
-        };
+        let find = |blocks: &VecDeque<ImageBlock>| blocks.iter().find_map(|block| block.row(table, row));
         // A block of large images can end before the row.
         for first in [row / BLOCK_ROWS * BLOCK_ROWS, row] {
-            if let Some(image) = find(&blocks) {
-                return Ok(image);
+            if let Some(found) = find(&blocks) {
+                return Ok(Some(found));
             }
             if blocks.iter().any(|block| block.table == table && block.first == first) {
                 continue;
             }
-            let images = self.load(table, first)?;
-            blocks.push_back(ImageBlock { table, first, images });
+            let batches = self.load(table, first)?;
+            blocks.push_back(ImageBlock { table, first, batches });
             if blocks.len() > KEPT {
                 blocks.pop_front();
             }
         }
-        Ok(find(&blocks).unwrap_or(StoredImage::Missing))
+        Ok(find(&blocks))
     }
 
-    /// The images of a block of rows, which ends early if they are large. Errors: `Io`, `Record`.
-    fn load(&self, table: usize, first: usize) -> Result<Vec<StoredImage>, ImportError> {
+    /// The batches of a block of rows, which ends early if they are large. Errors: `Io`, `Record`.
+    fn load(&self, table: usize, first: usize) -> Result<Vec<RecordBatch>, ImportError> {
         let path = &self.tables[table];
-        let wrong = |reason: String| ImportError::record(path.display().to_string(), reason.trim());
+        let wrong = |reason: &dyn Display| ImportError::record(path.display(), reason.to_string().trim());
         let file = open_file(path)?;
-        let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string()))?;
-        let root = builder
-            .schema()
-            .fields()
-            .iter()
-            .position(|field| *field.name() == self.column);
-        let root = root.ok_or_else(|| wrong(format!("it has no column {:?}", self.column)))?;
+        let builder = parquet_file::open(file).map_err(|error| wrong(&error))?;
+        let fields = builder.schema().fields();
+        let Some((root, _)) = fields.find(&self.column) else {
+            return Err(wrong(&format!("it has no column {:?}", self.column)));
+        };
         let mask = ProjectionMask::roots(builder.parquet_schema(), [root]);
         // Only the row groups that hold the block are opened.
         let (mut groups, mut start, mut skipped) = (Vec::new(), 0, 0);
@@ -125,61 +117,49 @@ impl ImageTable {
             .with_offset(first - skipped)
             .with_limit(BLOCK_ROWS)
             .with_batch_size(BATCH_ROWS);
-        let batches = parquet_file::batches(builder);
-        let (mut images, mut bytes) = (Vec::with_capacity(BLOCK_ROWS), 0);
-        for batch in batches.map_err(|error| wrong(error.to_string()))? {
-            let batch = batch.map_err(|error| wrong(error.to_string()))?;
-            let stored = stored_images(&batch)
-                .ok_or_else(|| wrong(format!("its column {:?} does not hold images", self.column)))?;
-            bytes += stored.iter().map(StoredImage::bytes).sum::<usize>();
-            images.extend(stored);
+        let (mut batches, mut bytes) = (Vec::new(), 0);
+        for batch in parquet_file::batches(builder).map_err(|error| wrong(&error))? {
+            let batch = batch.map_err(|error| wrong(&error))?;
+            bytes += batch.get_array_memory_size();
+            batches.push(batch);
             if bytes >= BLOCK_BYTES {
                 break;
             }
         }
-        Ok(images)
+        Ok(batches)
     }
 }
 
 impl ImageSource for ImageTable {
-    fn read(&self, wanted: &WantedImage<'_>, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
-        let WantedImage { image, place } = *wanted;
-        let (table, row) = self.places[image];
+    fn read(&self, wanted: &Record, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
+        let Record { image, place, .. } = wanted;
+        let (table, row) = self.places[*image];
         let path = &self.tables[table];
-        let (bytes, path) = match self.stored(table, row)? {
-            StoredImage::Bytes(bytes) => (bytes, path.clone()),
-            StoredImage::File(name) => {
-                let path = inside(&self.source, &name, place)?;
-                (read_image(&path, place)?, path)
-            }
-            StoredImage::Missing => {
-                return Err(ImportError::record(place, format!("{} has no image", self.column)));
-            }
-        };
-        codec::decode(&bytes).map_err(ImportError::image(place, path))
+        let missing = || ImportError::record(place, format!("{} has no image", self.column));
+        let (batch, row) = self.stored(table, row)?.ok_or_else(missing)?;
+        let (bytes, name) = stored_image(&batch, row).ok_or_else(|| {
+            let reason = format!("its column {:?} does not hold images", self.column);
+            ImportError::record(path.display(), reason)
+        })?;
+        if let Some(bytes) = bytes {
+            return codec::decode(bytes).map_err(ImportError::image(place, path));
+        }
+        let path = inside(&self.source, name.ok_or_else(missing)?, place)?;
+        codec::decode(&read_image(&path, place)?).map_err(ImportError::image(place, path))
     }
 }
 
-/// The images of a batch whose only column is one of images; `None` if it is of another type.
-fn stored_images(batch: &RecordBatch) -> Option<Vec<StoredImage>> {
+/// The bytes of an image and its file's name, in a batch whose only column is one of images; `None` if it is of another type.
+fn stored_image(batch: &RecordBatch, row: usize) -> Option<(Option<&[u8]>, Option<&str>)> {
     let column = batch.columns().first()?.as_struct_opt()?;
     let (bytes, paths) = (column.column_by_name("bytes")?, column.column_by_name("path"));
-    let bytes_at = |row: usize| -> Option<Vec<u8>> {
-        let (small, large) = (bytes.as_binary_opt::<i32>(), bytes.as_binary_opt::<i64>());
-        let small = small.map(|array| array.value(row).to_vec());
-        small.or_else(|| large.map(|array| array.value(row).to_vec()))
+    let bytes = match bytes.as_binary_opt::<i32>() {
+        Some(small) => small.is_valid(row).then(|| small.value(row)),
+        None => Some(bytes.as_binary_opt::<i64>()?)
+            .filter(|large| large.is_valid(row))
+            .map(|large| large.value(row)),
     };
-    let path_at = |row: usize| -> Option<String> {
-        let paths = paths.filter(|paths| paths.is_valid(row))?.as_string_opt::<i32>()?;
-        Some(paths.value(row).to_owned())
-    };
-    if bytes.as_binary_opt::<i32>().is_none() && bytes.as_binary_opt::<i64>().is_none() {
-        return None;
-    }
-    let image = |row: usize| match (bytes.is_valid(row).then(|| bytes_at(row)).flatten(), path_at(row)) {
-        (Some(bytes), _) => StoredImage::Bytes(bytes),
-        (None, Some(path)) => StoredImage::File(path),
-        (None, None) => StoredImage::Missing,
-    };
-    Some((0..batch.num_rows()).map(image).collect())
+    let paths = paths.and_then(|paths| paths.as_string_opt::<i32>());
+    let name = paths.filter(|paths| paths.is_valid(row)).map(|paths| paths.value(row));
+    Some((bytes, name))
 }

@@ -1,10 +1,12 @@
 //! The numbers of a table's rows. Images are not read.
 
+use std::fmt::Display;
 use std::path::Path;
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
-    Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type, UInt32Type,
+    ArrowPrimitiveType, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type,
+    UInt32Type,
 };
 use arrow_array::{Array, ArrayRef, RecordBatch};
 use arrow_schema::DataType;
@@ -31,17 +33,17 @@ const MAX_ROWS: i64 = 5_000_000;
 
 /// Reads the chosen components of all rows. Errors: `Io`, `Record`.
 pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> Result<Vec<Row>, ImportError> {
-    let wrong = |reason: String| ImportError::record(path.display().to_string(), reason);
+    let wrong = |reason: &dyn Display| ImportError::record(path.display(), reason.to_string().trim());
     let file = open_file(path).map_err(|error| match error {
         ImportError::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound => {
-            wrong(format!("the table {} is missing", name.display()))
+            wrong(&format!("the table {} is missing", name.display()))
         }
         other => other,
     })?;
-    let builder = parquet_file::open(file).map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+    let builder = parquet_file::open(file).map_err(|error| wrong(&error))?;
     let count = builder.metadata().file_metadata().num_rows();
     if count > MAX_ROWS {
-        return Err(wrong(format!(
+        return Err(wrong(&format!(
             "it has {count} rows; at most {MAX_ROWS} of a table are read"
         )));
     }
@@ -49,16 +51,16 @@ pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> R
     wanted.extend(components.iter().map(|component| component.feature.as_str()));
     let fields = builder.schema().fields();
     if let Some(missing) = wanted.iter().find(|name| fields.find(name).is_none()) {
-        return Err(wrong(format!("it has no column {missing:?}")));
+        return Err(wrong(&format!("it has no column {missing:?}")));
     }
     let roots = (0..fields.len()).filter(|&root| wanted.contains(&fields[root].name().as_str()));
     let mask = ProjectionMask::roots(builder.parquet_schema(), roots.collect::<Vec<_>>());
-    let batches = parquet_file::batches(builder.with_projection(mask)).map_err(|error| wrong(error.to_string()))?;
+    let batches = parquet_file::batches(builder.with_projection(mask)).map_err(|error| wrong(&error))?;
     let mut rows = Vec::new();
     for batch in batches {
-        let batch = batch.map_err(|error| wrong(error.to_string().trim().to_owned()))?;
+        let batch = batch.map_err(|error| wrong(&error))?;
         append(&batch, components, &mut rows).map_err(|column| {
-            wrong(format!(
+            wrong(&format!(
                 "column {column:?} does not hold one list of numbers in every row, as its feature states"
             ))
         })?;
@@ -80,9 +82,8 @@ fn append(batch: &RecordBatch, components: &[Component], rows: &mut Vec<Row>) ->
         vectors.push(lists);
     }
     for row in 0..batch.num_rows() {
-        let values: Vec<f32> = components
-            .iter()
-            .zip(&vectors)
+        let chosen = components.iter().zip(&vectors);
+        let values: Vec<f32> = chosen
             .map(|(component, lists)| lists[row][component.index] as f32)
             .collect();
         let bad = values.iter().position(|value| !value.is_finite());
@@ -104,34 +105,26 @@ pub(super) fn column_numbers(batch: &RecordBatch, name: &str) -> Option<Vec<f64>
 
 /// The numbers of an array of any numeric type; NaN where one is missing.
 fn numbers(array: &ArrayRef) -> Option<Vec<f64>> {
-    macro_rules! cast {
-        ($kind:ty) => {
-            array
-                .as_primitive::<$kind>()
-                .iter()
-                .map(|value| value.map_or(f64::NAN, f64::from))
-                .collect()
-        };
+    fn of<T: ArrowPrimitiveType>(array: &ArrayRef, number: impl Fn(T::Native) -> f64) -> Vec<f64> {
+        let values = array.as_primitive::<T>().iter();
+        values.map(|value| value.map_or(f64::NAN, &number)).collect()
     }
     Some(match array.data_type() {
-        DataType::Float32 => cast!(Float32Type),
-        DataType::Float64 => cast!(Float64Type),
-        DataType::Int8 => cast!(Int8Type),
-        DataType::Int16 => cast!(Int16Type),
-        DataType::Int32 => cast!(Int32Type),
-        DataType::UInt8 => cast!(UInt8Type),
-        DataType::UInt16 => cast!(UInt16Type),
-        DataType::UInt32 => cast!(UInt32Type),
-        DataType::Int64 => array
-            .as_primitive::<Int64Type>()
-            .iter()
-            .map(|value| value.map_or(f64::NAN, |value| value as f64))
-            .collect(),
-        DataType::Boolean => array
-            .as_boolean()
-            .iter()
-            .map(|value| value.map_or(f64::NAN, |value| f64::from(u8::from(value))))
-            .collect(),
+        DataType::Float32 => of::<Float32Type>(array, f64::from),
+        DataType::Float64 => of::<Float64Type>(array, f64::from),
+        DataType::Int8 => of::<Int8Type>(array, f64::from),
+        DataType::Int16 => of::<Int16Type>(array, f64::from),
+        DataType::Int32 => of::<Int32Type>(array, f64::from),
+        DataType::UInt8 => of::<UInt8Type>(array, f64::from),
+        DataType::UInt16 => of::<UInt16Type>(array, f64::from),
+        DataType::UInt32 => of::<UInt32Type>(array, f64::from),
+        DataType::Int64 => of::<Int64Type>(array, |value| value as f64),
+        DataType::Boolean => {
+            let values = array.as_boolean().iter();
+            values
+                .map(|value| value.map_or(f64::NAN, |value| f64::from(u8::from(value))))
+                .collect()
+        }
         _ => return None,
     })
 }
