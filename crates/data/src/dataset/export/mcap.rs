@@ -22,46 +22,21 @@ mod operation {
     pub(super) const DATA_END: u8 = 15;
 }
 
-/// The fields of a record, little endian.
-#[derive(Default)]
-struct RecordFields(Vec<u8>);
+/// A record of these fields.
+fn record(operation: u8, fields: &[&[u8]]) -> Vec<u8> {
+    let fields = fields.concat();
+    let length = (fields.len() as u64).to_le_bytes();
+    [&[operation][..], &length, &fields].concat()
+}
 
-impl RecordFields {
-    fn u16(self, value: u16) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
+/// A text, or a map or array that is already written, after its length in bytes.
+fn sized(bytes: impl AsRef<[u8]>) -> Vec<u8> {
+    let bytes = bytes.as_ref();
+    [&(bytes.len() as u32).to_le_bytes(), bytes].concat()
+}
 
-    fn u32(self, value: u32) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
-
-    fn u64(self, value: u64) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
-
-    fn u64s(self, values: &[u64]) -> Self {
-        values.iter().fold(self, |fields, &value| fields.u64(value))
-    }
-
-    /// A text, or a map or array that is already written, after its length in bytes.
-    fn sized(self, bytes: &[u8]) -> Self {
-        self.u32(bytes.len() as u32).raw(bytes)
-    }
-
-    fn text(self, text: &str) -> Self {
-        self.sized(text.as_bytes())
-    }
-
-    fn raw(mut self, bytes: &[u8]) -> Self {
-        self.0.extend_from_slice(bytes);
-        self
-    }
-
-    /// The whole record.
-    fn record(self, operation: u8) -> Vec<u8> {
-        let length = (self.0.len() as u64).to_le_bytes();
-        [&[operation][..], &length, &self.0].concat()
-    }
+fn u64s(values: &[u64]) -> Vec<u8> {
+    values.iter().flat_map(|value| value.to_le_bytes()).collect()
 }
 
 /// A topic of one type.
@@ -104,12 +79,7 @@ impl<W: Write> McapWriter<W> {
         };
         writer.put(MAGIC)?;
         let library = concat!("foreframe ", env!("CARGO_PKG_VERSION"));
-        writer.put(
-            &RecordFields::default()
-                .text("ros2")
-                .text(library)
-                .record(operation::HEADER),
-        )?;
+        writer.put(&record(operation::HEADER, &[&sized("ros2"), &sized(library)]))?;
         Ok(writer)
     }
 
@@ -120,29 +90,27 @@ impl<W: Write> McapWriter<W> {
 
     /// Adds a topic and returns its number. `definition` is the type's message definition with those of its parts.
     pub(super) fn topic(&mut self, name: &str, type_name: &str, definition: &str) -> u16 {
-        let id = self.topics.len() as u16 + 1;
-        let schema = RecordFields::default().u16(id).text(type_name).text("ros2msg");
-        let channel = RecordFields::default().u16(id).u16(id).text(name).text("cdr");
-        let records = [
-            schema.text(definition).record(operation::SCHEMA),
-            channel.sized(&[]).record(operation::CHANNEL),
-        ];
+        let number = self.topics.len() as u16 + 1;
+        let (id, definition) = (number.to_le_bytes(), sized(definition));
+        let schema = [&id[..], &sized(type_name), &sized("ros2msg"), &definition];
+        let channel = [&id[..], &id, &sized(name), &sized("cdr"), &sized("")];
+        let records = [record(operation::SCHEMA, &schema), record(operation::CHANNEL, &channel)];
         self.chunk.extend(records.concat());
         self.topics.push(TopicWriter {
             records,
             messages: 0,
             in_chunk: Vec::new(),
         });
-        id
+        number
     }
 
     /// Adds a message of a topic. Errors: those of the writer.
     pub(super) fn message(&mut self, topic: u16, time_ns: u64, content: &[u8]) -> io::Result<()> {
         let position = self.chunk.len() as u64;
         if let Some(of) = self.topics.get_mut(usize::from(topic) - 1) {
-            let fields = RecordFields::default().u16(topic).u32(of.messages as u32);
-            let fields = fields.u64s(&[time_ns, time_ns]).raw(content);
-            self.chunk.extend(fields.record(operation::MESSAGE));
+            let sequence = (of.messages as u32).to_le_bytes();
+            let fields = [&topic.to_le_bytes()[..], &sequence, &u64s(&[time_ns, time_ns]), content];
+            self.chunk.extend(record(operation::MESSAGE, &fields));
             of.messages += 1;
             of.in_chunk.extend([time_ns, position]);
         }
@@ -158,33 +126,38 @@ impl<W: Write> McapWriter<W> {
         let Some(times) = self.chunk_times.take() else {
             return Ok(());
         };
+        let times = u64s(&times);
         let records = std::mem::take(&mut self.chunk);
-        let length = records.len() as u64;
-        let fields = RecordFields::default().u64s(&times).u64(length);
-        let fields = fields.u32(crc32fast::hash(&records)).text("").u64(length).raw(&records);
+        let length = (records.len() as u64).to_le_bytes();
+        let checksum = crc32fast::hash(&records).to_le_bytes();
         let chunk_start = self.written;
-        self.put(&fields.record(operation::CHUNK))?;
+        let fields = [&times[..], &length, &checksum, &sized(""), &length, &records];
+        self.put(&record(operation::CHUNK, &fields))?;
         let indexes_start = self.written;
-        let mut offsets = RecordFields::default();
+        let mut offsets = Vec::new();
         for topic in 0..self.topics.len() {
             let entries = std::mem::take(&mut self.topics[topic].in_chunk);
             if entries.is_empty() {
                 continue;
             }
-            let id = topic as u16 + 1;
-            offsets = offsets.u16(id).u64(self.written);
-            let entries = RecordFields::default().u64s(&entries);
-            let index = RecordFields::default().u16(id).sized(&entries.0);
-            self.put(&index.record(operation::MESSAGE_INDEX))?;
+            let id = (topic as u16 + 1).to_le_bytes();
+            offsets.extend(id);
+            offsets.extend(self.written.to_le_bytes());
+            let fields = [&id[..], &sized(u64s(&entries))];
+            self.put(&record(operation::MESSAGE_INDEX, &fields))?;
         }
-        let index = RecordFields::default()
-            .u64s(&times)
-            .u64s(&[chunk_start, indexes_start - chunk_start])
-            .sized(&offsets.0)
-            .u64(self.written - indexes_start)
-            .text("")
-            .u64s(&[length, length]);
-        self.chunk_indexes.push(index.record(operation::CHUNK_INDEX));
+        let place = u64s(&[chunk_start, indexes_start - chunk_start]);
+        let indexes = (self.written - indexes_start).to_le_bytes();
+        let fields = [
+            &times[..],
+            &place,
+            &sized(offsets),
+            &indexes,
+            &sized(""),
+            &length,
+            &length,
+        ];
+        self.chunk_indexes.push(record(operation::CHUNK_INDEX, &fields));
         Ok(())
     }
 
@@ -198,26 +171,27 @@ impl<W: Write> McapWriter<W> {
     }
 
     fn statistics(&self) -> Vec<u8> {
-        let messages = self.topics.iter().map(|topic| topic.messages);
-        let counts = messages.clone().zip(1..);
-        let counts = counts.fold(RecordFields::default(), |fields, (count, id)| fields.u16(id).u64(count));
+        let counts = (1u16..).zip(self.topics.iter().map(|topic| topic.messages));
+        let counts = counts.flat_map(|(id, count)| [&id.to_le_bytes()[..], &count.to_le_bytes()].concat());
+        let messages: u64 = self.topics.iter().map(|topic| topic.messages).sum();
         let topics = self.topics.len();
-        RecordFields::default()
-            .u64(messages.sum())
-            .u16(topics as u16)
-            .u32(topics as u32)
-            .u32(0)
-            .u32(0)
-            .u32(self.chunk_indexes.len() as u32)
-            .u64s(&self.times.unwrap_or_default())
-            .sized(&counts.0)
-            .record(operation::STATISTICS)
+        let fields = [
+            &messages.to_le_bytes()[..],
+            &(topics as u16).to_le_bytes(),
+            &(topics as u32).to_le_bytes(),
+            // Neither attachments nor metadata.
+            &[0; 8],
+            &(self.chunk_indexes.len() as u32).to_le_bytes(),
+            &u64s(&self.times.unwrap_or_default()),
+            &sized(counts.collect::<Vec<u8>>()),
+        ];
+        record(operation::STATISTICS, &fields)
     }
 
     /// Writes the indexes; the file is then complete. Errors: those of the writer.
     pub(super) fn finish(mut self) -> io::Result<()> {
         self.close_chunk()?;
-        self.put(&RecordFields::default().u32(0).record(operation::DATA_END))?;
+        self.put(&record(operation::DATA_END, &[&[0; 4]]))?;
         let summary_start = self.written;
         let of_topics = |part: usize| self.topics.iter().map(|topic| topic.records[part].clone()).collect();
         let (schemas, channels): (Vec<_>, Vec<_>) = (of_topics(0), of_topics(1));
@@ -232,14 +206,13 @@ impl<W: Write> McapWriter<W> {
         ] {
             let group = self.group(&records)?;
             if !group.is_empty() {
-                let fields = RecordFields::default().raw(&[operation]);
-                let fields = fields.u64s(&[group.start, group.end - group.start]);
-                offsets.push(fields.record(operation::SUMMARY_OFFSET));
+                let place = u64s(&[group.start, group.end - group.start]);
+                offsets.push(record(operation::SUMMARY_OFFSET, &[&[operation], &place]));
             }
         }
         let offsets = self.group(&offsets)?;
-        let footer = RecordFields::default().u64s(&[summary_start, offsets.start]).u32(0);
-        self.put(&footer.record(operation::FOOTER))?;
+        let footer = [&u64s(&[summary_start, offsets.start])[..], &[0; 4]];
+        self.put(&record(operation::FOOTER, &footer))?;
         self.put(MAGIC)?;
         self.out.flush()
     }
