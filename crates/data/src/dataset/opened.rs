@@ -15,7 +15,7 @@ use foreframe_core::frame::Frame;
 /// An open data set.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
-    info: DatasetInfo,
+    pub(super) info: DatasetInfo,
     episodes: Vec<Episode>,
     images: FrameStore,
     actions: Vec<f32>,

@@ -1,6 +1,6 @@
 //! The small tables of a data set: tasks, episodes and statistics of every column; writes them, and reads the episodes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -101,7 +101,7 @@ pub(crate) fn episodes(
         counts("data/chunk_index", &chunk),
         counts("data/file_index", &file),
         counts("dataset_from_index", &|row| row.start.frame),
-        counts("dataset_to_index", &EpisodeRow::end),
+        counts("dataset_to_index", &|row| row.end()),
         counts("meta/episodes/chunk_index", &|_| 0),
         counts("meta/episodes/file_index", &|_| 0),
     ];
@@ -123,7 +123,7 @@ pub(crate) fn episodes(
             counts(&format!("videos/{IMAGE}/chunk_index"), &chunk),
             counts(&format!("videos/{IMAGE}/file_index"), &file),
             times("from_timestamp", &|row| row.start.frame),
-            times("to_timestamp", &EpisodeRow::end),
+            times("to_timestamp", &|row| row.end()),
         ]);
     }
     write(columns, &[])
@@ -205,7 +205,8 @@ fn write(columns: Vec<TableColumn>, metadata: &[(&str, String)]) -> Result<Vec<u
     let columns = columns.into_iter().map(|(name, values)| (name, values, true));
     let batch = RecordBatch::try_from_iter_with_nullable(columns)?;
     let metadata = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone()));
-    let schema = Schema::clone(&batch.schema()).with_metadata(metadata.collect());
+    let metadata: HashMap<String, String> = metadata.collect();
+    let schema = Schema::clone(&batch.schema()).with_metadata(metadata);
     let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
     let mut writer = ArrowWriter::try_new(Vec::new(), Arc::new(schema), Some(properties))?;
     writer.write(&batch)?;
