@@ -81,10 +81,10 @@ pub enum DatasetError {
     CorruptFrame(String, #[source] FrameError),
     /// A frame could not be encoded.
     #[error("could not encode a frame")]
-    Encode(#[source] FrameError),
+    Encode(#[from] FrameError),
     /// A table could not be built.
     #[error("could not build a table of the data set")]
-    Build(#[source] parquet::errors::ParquetError),
+    Build(#[from] parquet::errors::ParquetError),
     /// A file has changed since it was written.
     #[error(
         "{path} has the SHA-256 {found}, but its metadata states {expected}; restore the file or collect the data set \

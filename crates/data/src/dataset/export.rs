@@ -10,7 +10,6 @@ mod video;
 use std::path::Path;
 
 use parquet::arrow::ArrowWriter;
-use parquet::errors::ParquetError;
 use serde_json::{Value, json};
 
 pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
@@ -27,11 +26,7 @@ const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_
 /// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too.
 /// Errors: `Encode`, `Build`, `Io`.
 pub fn to_lerobot_images(dataset: &Dataset, out: &Path) -> Result<(), DatasetError> {
-    let info = DatasetInfo {
-        content_hash: String::new(),
-        ..dataset.info().clone()
-    };
-    let mut writer = ShardWriter::new(out, info);
+    let mut writer = ShardWriter::new(out, dataset.info().clone());
     for episodes in shards(dataset) {
         let encoded = encoded(dataset, writer.info(), episodes)?;
         writer.write(&encoded)?;
@@ -56,7 +51,7 @@ pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
     let (mut records, mut start) = (Vec::new(), ShardStart::default());
     for (shard, episodes) in shards(dataset).enumerate() {
         let encoded = encoded(dataset, &info, episodes)?;
-        let (bytes, end) = numbers(&info, start, &encoded).map_err(DatasetError::Build)?;
+        let (bytes, end) = numbers(&info, start, &encoded)?;
         write_atomically(&out.join(shard_path(shard)), &bytes)?;
         let (chunk, file) = shard_location(shard);
         let path = out.join(format!("videos/{IMAGE}/chunk-{chunk:03}/file-{file:03}.mp4"));
@@ -110,7 +105,7 @@ fn numbers(
     info: &DatasetInfo,
     start: ShardStart,
     episodes: &[EncodedEpisode],
-) -> Result<(Vec<u8>, ShardStart), ParquetError> {
+) -> Result<(Vec<u8>, ShardStart), DatasetError> {
     let schema = schema(info, false);
     let mut writer = ArrowWriter::try_new(Vec::new(), schema.clone(), None)?;
     let mut next = start;

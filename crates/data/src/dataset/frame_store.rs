@@ -2,11 +2,9 @@
 
 pub(super) mod frame_file;
 
-use std::borrow::Cow;
 use std::sync::Arc;
 
 use self::frame_file::FrameFile;
-use super::DatasetError;
 
 /// What was read of some frames, in their order. The images are left out if they are in a file.
 #[derive(Default)]
@@ -34,22 +32,4 @@ impl FrameContent {
 pub(super) enum FrameStore {
     Memory(Vec<Box<[u8]>>),
     File(Arc<FrameFile>),
-}
-
-impl FrameStore {
-    /// The pixels of an image. Panics if there is no such image. Errors: `Io`, `Corrupt`.
-    pub(super) fn image(&self, index: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
-        match self {
-            Self::Memory(images) => Ok(Cow::Borrowed(&images[index])),
-            Self::File(file) => file.read(index).map(Cow::Owned),
-        }
-    }
-
-    /// Bytes of frames and masks in memory.
-    pub(super) fn bytes_in_memory(&self) -> usize {
-        match self {
-            Self::Memory(images) => images.iter().map(|image| image.len()).sum(),
-            Self::File(_) => 0,
-        }
-    }
 }

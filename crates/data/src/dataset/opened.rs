@@ -97,8 +97,12 @@ impl Dataset {
         for episode in &self.episodes {
             hasher.update((episode.frame_count as u64).to_le_bytes());
         }
-        for image in 0..self.info.image_count() {
-            hasher.update(self.images.image(image)?);
+        let (frames, masks) = (self.info.frame_count, self.info.image_count() - self.info.frame_count);
+        for frame in 0..frames {
+            hasher.update(self.image(0, frame)?);
+        }
+        for frame in 0..masks {
+            hasher.update(self.image(frames, frame)?);
         }
         for value in self.actions.iter().chain(&self.states) {
             hasher.update(value.to_le_bytes());
@@ -124,34 +128,39 @@ impl Dataset {
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there
     /// is no such frame. Errors: `Io`, `Corrupt`; never if the frames are in memory.
     pub fn pixels(&self, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
-        self.assert_frame(frame);
-        self.images.image(frame)
+        self.image(0, frame)
     }
 
     /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame. Errors: as
     /// [`Dataset::pixels`].
     pub fn mask(&self, frame: usize) -> Result<Option<Cow<'_, [u8]>>, DatasetError> {
-        self.assert_frame(frame);
-        let mask = || self.images.image(self.info.frame_count + frame);
+        let mask = || self.image(self.info.frame_count, frame);
         self.info.has_masks.then(mask).transpose()
     }
 
-    fn assert_frame(&self, frame: usize) {
+    /// The pixels of a frame, or of its mask if `first` is where the masks begin.
+    fn image(&self, first: usize, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
         let frames = self.info.frame_count;
         assert!(frame < frames, "frame {frame} of {frames} frames is a bug");
+        match &self.images {
+            FrameStore::Memory(images) => Ok(Cow::Borrowed(&images[first + frame])),
+            FrameStore::File(file) => file.read(first + frame).map(Cow::Owned),
+        }
     }
 
     /// A frame. Panics if there is no such frame. Errors: as [`Dataset::pixels`].
     pub fn frame(&self, frame: usize) -> Result<Frame, DatasetError> {
         let pixels = self.pixels(frame)?.into_owned();
-        Frame::new(self.info.frame_width_px, self.info.frame_height_px, pixels)
-            .map_err(|error| DatasetError::Invalid(error.to_string()))
+        Ok(Frame::new(self.info.frame_width_px, self.info.frame_height_px, pixels)?)
     }
 
     /// Bytes of frames and masks that this data set holds in memory; 0 if they are in a file.
     #[must_use]
     pub fn frame_bytes_in_memory(&self) -> usize {
-        self.images.bytes_in_memory()
+        match &self.images {
+            FrameStore::Memory(images) => images.iter().map(|image| image.len()).sum(),
+            FrameStore::File(_) => 0,
+        }
     }
 
     /// The action from this frame to the next. Panics if there is no such frame.

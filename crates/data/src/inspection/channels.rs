@@ -25,10 +25,7 @@ pub enum ChannelRole {
 
 impl std::fmt::Display for ChannelRole {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Action => "action",
-            Self::State => "state",
-        })
+        self.serialize(f)
     }
 }
 

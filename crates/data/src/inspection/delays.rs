@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::places::{FramePlace, places};
 use crate::dataset::{Dataset, DatasetError};
 use crate::motion::phase_correlation;
 use foreframe_core::types::Channel;
@@ -102,12 +103,13 @@ pub(super) fn of(dataset: &Dataset) -> Result<Vec<ActionDelay>, DatasetError> {
 
 /// The motion from every frame to the next; the last frame of an episode has none.
 fn motion(dataset: &Dataset) -> Result<[(MotionSignal, Vec<f64>); 3], DatasetError> {
-    let (info, last) = (dataset.info(), last_frames(dataset));
-    let width = info.frame_width_px as usize;
-    let between = (0..info.frame_count)
+    let width = dataset.info().frame_width_px as usize;
+    let places: Vec<FramePlace> = places(dataset).collect();
+    let is_last = |frame: usize| places.get(frame + 1).is_none_or(|next| next.frame == 0);
+    let between = (0..places.len())
         .into_par_iter()
         .map(|frame| {
-            if last[frame] {
+            if is_last(frame) {
                 return Ok([0.0; 3]);
             }
             let floats = |frame| -> Result<Vec<f32>, DatasetError> {
@@ -126,17 +128,6 @@ fn motion(dataset: &Dataset) -> Result<[(MotionSignal, Vec<f64>); 3], DatasetErr
         (MotionSignal::Vertical, without_outliers(part(1))),
         (MotionSignal::Change, part(2)),
     ])
-}
-
-/// Whether a frame is the last one of its episode.
-fn last_frames(dataset: &Dataset) -> Vec<bool> {
-    let mut last = vec![false; dataset.info().frame_count];
-    for episode in dataset.episodes() {
-        if let Some(flag) = episode.frames().last().and_then(|frame| last.get_mut(frame)) {
-            *flag = true;
-        }
-    }
-    last
 }
 
 /// The values, limited to a few times the size that nine of ten do not exceed.

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::places::{FramePlace, counted, listed};
+use super::places::{FramePlace, counted, listed, places};
 use super::timing::FrameTiming;
 use crate::dataset::sampler::median;
 use crate::dataset::{Dataset, DatasetError};
@@ -98,19 +98,10 @@ struct LevelStep {
 }
 
 pub(super) fn of(dataset: &Dataset) -> Result<ImageSummary, DatasetError> {
-    let changes = dataset
-        .episodes()
-        .par_iter()
-        .flat_map_iter(|episode| {
-            episode.frames().enumerate().map(move |(frame, index)| {
-                let place = FramePlace {
-                    episode: episode.index,
-                    frame,
-                };
-                change(dataset, place, index)
-            })
-        })
-        .collect::<Result<Vec<FrameChange>, DatasetError>>()?;
+    let places: Vec<FramePlace> = places(dataset).collect();
+    let changes = places.into_par_iter().enumerate();
+    let changes: Result<Vec<_>, _> = changes.map(|(index, place)| change(dataset, place, index)).collect();
+    let changes = changes?;
     let histogram = level_histogram(dataset)?;
     let pixels = histogram.iter().sum::<u64>().max(1) as f64;
     let steps: Vec<&LevelStep> = changes.iter().filter_map(|change| change.step.as_ref()).collect();

@@ -40,10 +40,7 @@ pub fn page(inspection: &Inspection, dataset: &Dataset) -> Result<String, Datase
     let frozen = inspection.images.frozen.iter().take(SHOWN_PLACES);
     let frozen: Result<Vec<_>, DatasetError> = frozen.map(|span| pair(span.first, span.frames - 1)).collect();
     let jumps = inspection.images.exposure_jumps.iter().take(SHOWN_PLACES);
-    let jumps = jumps.map(|jump| {
-        let frame = jump.place.frame.saturating_sub(1);
-        pair(FramePlace { frame, ..jump.place }, 1)
-    });
+    let jumps = jumps.map(|jump| pair(jump.place.before(), 1));
     let content = context! {
         inspection,
         style => include_str!("page.css"),
@@ -63,7 +60,7 @@ pub fn page(inspection: &Inspection, dataset: &Dataset) -> Result<String, Datase
 fn picture(dataset: &Dataset, place: FramePlace) -> Result<Picture, DatasetError> {
     let episode = dataset.episodes().get(place.episode);
     let index = episode.map_or(0, |episode| episode.first_frame + place.frame);
-    let png = codec::encode_png(&dataset.frame(index)?).map_err(DatasetError::Encode)?;
+    let png = codec::encode_png(&dataset.frame(index)?)?;
     Ok(Picture {
         place,
         time_s: dataset.timestamp_s(index),

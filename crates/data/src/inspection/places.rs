@@ -13,13 +13,21 @@ pub struct FramePlace {
     pub frame: usize,
 }
 
-/// The place of a frame that is counted over the whole data set.
-pub(super) fn place_of(dataset: &Dataset, frame: usize) -> Option<FramePlace> {
-    let mut episodes = dataset.episodes().iter();
-    let episode = episodes.find(|episode| episode.frames().contains(&frame))?;
-    Some(FramePlace {
-        episode: episode.index,
-        frame: frame - episode.first_frame,
+impl FramePlace {
+    /// The frame before it in the episode; the first one itself.
+    pub(super) fn before(self) -> Self {
+        let frame = self.frame.saturating_sub(1);
+        Self { frame, ..self }
+    }
+}
+
+/// The places of all frames in their order.
+pub(super) fn places(dataset: &Dataset) -> impl Iterator<Item = FramePlace> {
+    dataset.episodes().iter().flat_map(|episode| {
+        (0..episode.frame_count).map(|frame| FramePlace {
+            episode: episode.index,
+            frame,
+        })
     })
 }
 

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::histogram::Histogram;
-use super::places::{FramePlace, counted, listed};
+use super::places::{FramePlace, counted, listed, places};
 use crate::dataset::Dataset;
 use crate::dataset::sampler::median;
 
@@ -88,14 +88,10 @@ pub(super) fn of(dataset: &Dataset) -> FrameTiming {
 
 /// Every step from one frame to the next.
 fn steps(dataset: &Dataset) -> Vec<TimeGap> {
-    let steps = dataset.episodes().iter().flat_map(|episode| {
-        (0..).zip(episode.frames().skip(1)).map(move |(frame, index)| TimeGap {
-            before: FramePlace {
-                episode: episode.index,
-                frame,
-            },
-            seconds: dataset.timestamp_s(index) - dataset.timestamp_s(index - 1),
-        })
+    let frames = places(dataset).enumerate().filter(|(_, place)| place.frame > 0);
+    let steps = frames.map(|(index, place)| TimeGap {
+        before: place.before(),
+        seconds: dataset.timestamp_s(index) - dataset.timestamp_s(index - 1),
     });
     steps.collect()
 }

@@ -31,12 +31,8 @@ const PART: usize = 10;
 /// A digit's intensities, row by row, 0 for black.
 pub(crate) type DigitImage = [u8; DIGIT_PIXELS];
 
-/// Digits for each split. No digit is in two of them.
-pub(crate) struct DigitPools {
-    train: Vec<DigitImage>,
-    validation: Vec<DigitImage>,
-    test: Vec<DigitImage>,
-}
+/// Digits for training, validation and test. No digit is in two of them.
+pub(crate) struct DigitPools([Vec<DigitImage>; 3]);
 
 impl DigitPools {
     /// Reads digits from an IDX file, a folder with MNIST's two IDX files, a folder of PNG images, or one with folders
@@ -58,36 +54,28 @@ impl DigitPools {
         if test.as_ref().is_some_and(Vec::is_empty) {
             return refused(path, "the part for tests has no digits; at least one is needed");
         }
-        let mut pools = Self {
-            train: Vec::new(),
-            validation: Vec::new(),
-            test: Vec::new(),
-        };
+        let mut pools: [Vec<DigitImage>; 3] = Default::default();
         for (index, digit) in digits.into_iter().enumerate() {
-            let pool = match index % PART {
-                0 => &mut pools.validation,
-                1 if test.is_none() => &mut pools.test,
-                _ => &mut pools.train,
+            let split = match index % PART {
+                0 => Split::Validation,
+                1 if test.is_none() => Split::Test,
+                _ => Split::Train,
             };
-            pool.push(digit);
+            pools[split as usize].push(digit);
         }
-        pools.test.extend(test.unwrap_or_default());
-        Ok(pools)
+        pools[Split::Test as usize].extend(test.unwrap_or_default());
+        Ok(Self(pools))
     }
 
     /// The digits for the trials of a split.
     pub(crate) fn of(&self, split: Split) -> &[DigitImage] {
-        match split {
-            Split::Train => &self.train,
-            Split::Validation => &self.validation,
-            _ => &self.test,
-        }
+        &self.0[split as usize]
     }
 
     /// SHA-256 of all digits, in hexadecimal.
     pub(crate) fn hash(&self) -> String {
         let mut hasher = Sha256::new();
-        for pool in [&self.train, &self.validation, &self.test] {
+        for pool in &self.0 {
             hasher.update((pool.len() as u64).to_le_bytes());
             hasher.update(pool.as_flattened());
         }

@@ -35,10 +35,11 @@ const MIN_TRIALS: u64 = 10;
 /// Longest trial, in frames.
 pub const MAX_FRAMES: usize = 1000;
 
-/// What to make.
-#[derive(Clone, Debug, PartialEq)]
+/// What to make. The fields that determine the bytes are written to the directory, in this order.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MovingMnistConfig {
     /// An IDX file of digits, or a folder with IDX files or PNG images.
+    #[serde(skip)]
     pub digits: PathBuf,
     /// Number of trials, at least 10.
     pub trials: u64,
@@ -47,6 +48,7 @@ pub struct MovingMnistConfig {
     /// The seed from which the seed of every trial is derived.
     pub seed: Seed,
     /// The data set's directory.
+    #[serde(skip)]
     pub out: PathBuf,
 }
 
@@ -106,9 +108,8 @@ impl MovingMnistConfig {
 struct MovingMnistArguments<'a> {
     scenario: &'static str,
     digits_sha256: &'a str,
-    trials: u64,
-    frames: usize,
-    seed: Seed,
+    #[serde(flatten)]
+    config: &'a MovingMnistConfig,
 }
 
 /// Makes the data set, or continues. Returns at once if it is complete.
@@ -123,9 +124,7 @@ pub fn collect_digits(
     let arguments = arguments_text(&MovingMnistArguments {
         scenario: MOVING_MNIST,
         digits_sha256: &pools.hash(),
-        trials: config.trials,
-        frames: config.frames,
-        seed: config.seed,
+        config,
     });
     has_arguments(&config.out, &arguments)?;
     let _lock = lock(&config.out, &arguments)?;

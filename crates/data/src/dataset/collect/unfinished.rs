@@ -32,7 +32,8 @@ pub(crate) fn save(
         episode: first as usize,
         frame: 0,
     };
-    files::write_atomically(&path(out, shard), &build(info, start, episodes)?.bytes)
+    let (bytes, _) = build(info, start, episodes)?;
+    files::write_atomically(&path(out, shard), &bytes)
 }
 
 /// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
@@ -59,10 +60,9 @@ fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetE
     let mut rows = Rows::default();
     for batch in &batches(path)? {
         let column = Column { batch, path };
-        let images = |key| Ok(column.images(key)?.iter().flatten().map(<[u8]>::to_vec));
-        rows.images.extend(images(IMAGE)?);
+        rows.images.extend(column.images(IMAGE)?.map(<[u8]>::to_vec));
         if info.has_masks {
-            rows.masks.extend(images(MASK)?);
+            rows.masks.extend(column.images(MASK)?.map(<[u8]>::to_vec));
         }
         rows.states.extend(column.vectors(STATE, info.state_channels.len())?);
         rows.actions.extend(column.vectors(ACTION, info.action_channels.len())?);

@@ -1,7 +1,6 @@
 //! Writes episodes as a bag of ROS 2: images, and actions and states as messages with the times of their images.
 
 use std::fs::File;
-use std::io::{self, BufWriter};
 use std::ops::Range;
 use std::path::Path;
 
@@ -38,25 +37,16 @@ const REGION: &str = "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32
 /// Writes episodes, as ranges of frames counted over the whole data set, as one MCAP file, which `foreframe import` and ROS 2
 /// read. Frame k of an episode is at k times the frame period. Errors: `Io`.
 pub fn to_mcap(dataset: &Dataset, episodes: &[Range<usize>], path: &Path) -> Result<(), DatasetError> {
-    let failed = |error| DatasetError::io("write", path)(error);
     write_whole(path, "partial.mcap", |partial| {
-        let mut out = BufWriter::new(File::create(partial).map_err(failed)?);
-        write(dataset, episodes, McapWriter::new(&mut out).map_err(failed)?, &failed)?;
-        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
-        file.sync_all().map_err(failed)
+        let file = File::create(partial).map_err(DatasetError::io("write", path))?;
+        write(dataset, episodes, McapWriter::new(file, path)?)
     })
 }
 
 /// How the values of a frame are read from a data set.
 type FrameValues = fn(&Dataset, usize) -> &[f32];
 
-/// `failed` says what a failed write of the file means.
-fn write<W: io::Write>(
-    dataset: &Dataset,
-    episodes: &[Range<usize>],
-    mut bag: McapWriter<W>,
-    failed: &dyn Fn(io::Error) -> DatasetError,
-) -> Result<(), DatasetError> {
+fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) -> Result<(), DatasetError> {
     let info = dataset.info();
     let image = bag.topic(IMAGE_TOPIC, "sensor_msgs/msg/Image", &image_definition());
     let camera = info.camera.map(|camera| {
@@ -89,22 +79,18 @@ fn write<W: io::Write>(
         for (place, frame) in episode.clone().enumerate() {
             let time_ns = start_ns + (place as f64 * period_ns).round() as u64;
             for (topic, kind, row) in &values {
-                bag.message(*topic, time_ns, &kind.message(time_ns, &row(frame)))
-                    .map_err(failed)?;
+                bag.message(*topic, time_ns, &kind.message(time_ns, &row(frame)))?;
             }
             if let Some((topic, fov_rad)) = camera {
-                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))
-                    .map_err(failed)?;
+                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))?;
             }
-            let pixels = dataset.pixels(frame)?;
-            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))
-                .map_err(failed)?;
+            bag.message(image, time_ns, &gray_image(time_ns, size, &dataset.pixels(frame)?))?;
         }
         let duration_ns = (episode.len() as f64 * period_ns) as u64;
         let gap_ns = MIN_GAP_NS.max((period_ns as u64).saturating_mul(GAP_FRAMES));
         start_ns = (start_ns + duration_ns + gap_ns).next_multiple_of(1_000_000_000);
     }
-    bag.finish().map_err(failed)
+    bag.finish()
 }
 
 /// The message that holds an action or a state.
@@ -151,14 +137,13 @@ impl ValueMessage {
     fn description(&self) -> (&'static str, String) {
         match self {
             Self::Twist(_) => {
-                let own = "std_msgs/Header header\ngeometry_msgs/Twist twist\n";
-                let parts = [HEADER, TIME, TWIST, VECTOR];
+                let own = "geometry_msgs/Twist twist\n";
+                let parts = [TWIST, VECTOR];
                 ("geometry_msgs/msg/TwistStamped", definition(own, &parts))
             }
             Self::Joints(_) => {
-                let own =
-                    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n";
-                ("sensor_msgs/msg/JointState", definition(own, &[HEADER, TIME]))
+                let own = "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n";
+                ("sensor_msgs/msg/JointState", definition(own, &[]))
             }
         }
     }
@@ -183,15 +168,17 @@ impl ValueMessage {
     }
 }
 
-/// A message definition with those of its parts.
+/// The definition of a message with a header and these fields, with those of its parts.
 fn definition(own: &str, parts: &[&str]) -> String {
-    parts.iter().fold(own.to_owned(), |text, part| text + SEPARATOR + part)
+    let own = format!("std_msgs/Header header\n{own}");
+    let parts = [HEADER, TIME].iter().chain(parts);
+    parts.fold(own, |text, part| text + SEPARATOR + part)
 }
 
 fn image_definition() -> String {
-    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+    let own = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
                uint8[] data\n";
-    definition(own, &[HEADER, TIME])
+    definition(own, &[])
 }
 
 fn gray_image(time_ns: u64, (width, height): (u32, u32), pixels: &[u8]) -> Vec<u8> {
@@ -200,9 +187,9 @@ fn gray_image(time_ns: u64, (width, height): (u32, u32), pixels: &[u8]) -> Vec<u
 }
 
 fn camera_definition() -> String {
-    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
+    let own = "uint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
                float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n";
-    definition(own, &[HEADER, TIME, REGION])
+    definition(own, &[REGION])
 }
 
 /// A camera without distortion, whose axis goes through the middle of the image.

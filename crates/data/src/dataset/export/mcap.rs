@@ -1,8 +1,12 @@
 //! Writes MCAP files: <https://mcap.dev/spec>. Chunks without compression, with checksums and with all indexes, as
 //! `ros2 bag record` writes them.
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::ops::Range;
+use std::path::Path;
+
+use crate::dataset::DatasetError;
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Number of bytes after which a chunk is closed.
@@ -41,18 +45,21 @@ fn u64s(values: &[u64]) -> Vec<u8> {
 
 /// A topic of one type.
 struct TopicWriter {
-    /// Its schema and its channel.
-    records: [Vec<u8>; 2],
     messages: u64,
     /// Time, and position in the open chunk, of the messages of that chunk.
     in_chunk: Vec<u64>,
 }
 
 /// Messages of some topics on their way into a file.
-pub(super) struct McapWriter<W> {
-    out: W,
+pub(super) struct McapWriter<'a> {
+    out: BufWriter<File>,
+    /// The name of the file in errors.
+    path: &'a Path,
     written: u64,
     topics: Vec<TopicWriter>,
+    /// One of each topic.
+    schemas: Vec<Vec<u8>>,
+    channels: Vec<Vec<u8>>,
     chunk: Vec<u8>,
     /// First and last time of the open chunk's messages, and of all.
     chunk_times: Option<[u64; 2]>,
@@ -65,13 +72,16 @@ fn including(times: Option<[u64; 2]>, time: u64) -> [u64; 2] {
     [first.min(time), last.max(time)]
 }
 
-impl<W: Write> McapWriter<W> {
-    /// Begins a file. Errors: those of the writer.
-    pub(super) fn new(out: W) -> io::Result<Self> {
+impl<'a> McapWriter<'a> {
+    /// Begins a file, whose errors name `path`. Errors: `Io`.
+    pub(super) fn new(file: File, path: &'a Path) -> Result<Self, DatasetError> {
         let mut writer = Self {
-            out,
+            out: BufWriter::new(file),
+            path,
             written: 0,
             topics: Vec::new(),
+            schemas: Vec::new(),
+            channels: Vec::new(),
             chunk: Vec::new(),
             chunk_times: None,
             times: None,
@@ -83,9 +93,10 @@ impl<W: Write> McapWriter<W> {
         Ok(writer)
     }
 
-    fn put(&mut self, bytes: &[u8]) -> io::Result<()> {
+    fn put(&mut self, bytes: &[u8]) -> Result<(), DatasetError> {
         self.written += bytes.len() as u64;
-        self.out.write_all(bytes)
+        let written = self.out.write_all(bytes);
+        written.map_err(DatasetError::io("write", self.path))
     }
 
     /// Adds a topic and returns its number. `definition` is the type's message definition with those of its parts.
@@ -94,18 +105,19 @@ impl<W: Write> McapWriter<W> {
         let (id, definition) = (number.to_le_bytes(), sized(definition));
         let schema = [&id[..], &sized(type_name), &sized("ros2msg"), &definition];
         let channel = [&id[..], &id, &sized(name), &sized("cdr"), &sized("")];
-        let records = [record(operation::SCHEMA, &schema), record(operation::CHANNEL, &channel)];
-        self.chunk.extend(records.concat());
+        self.schemas.push(record(operation::SCHEMA, &schema));
+        self.channels.push(record(operation::CHANNEL, &channel));
+        let records = [&self.schemas, &self.channels].map(|records| &records[usize::from(number) - 1]);
+        self.chunk.extend(records.into_iter().flatten());
         self.topics.push(TopicWriter {
-            records,
             messages: 0,
             in_chunk: Vec::new(),
         });
         number
     }
 
-    /// Adds a message of a topic. Errors: those of the writer.
-    pub(super) fn message(&mut self, topic: u16, time_ns: u64, content: &[u8]) -> io::Result<()> {
+    /// Adds a message of a topic. Errors: `Io`.
+    pub(super) fn message(&mut self, topic: u16, time_ns: u64, content: &[u8]) -> Result<(), DatasetError> {
         let position = self.chunk.len() as u64;
         if let Some(of) = self.topics.get_mut(usize::from(topic) - 1) {
             let sequence = (of.messages as u32).to_le_bytes();
@@ -122,7 +134,7 @@ impl<W: Write> McapWriter<W> {
         Ok(())
     }
 
-    fn close_chunk(&mut self) -> io::Result<()> {
+    fn close_chunk(&mut self) -> Result<(), DatasetError> {
         let Some(times) = self.chunk_times.take() else {
             return Ok(());
         };
@@ -162,7 +174,7 @@ impl<W: Write> McapWriter<W> {
     }
 
     /// Writes a group of the summary. Returns where it is.
-    fn group(&mut self, records: &[Vec<u8>]) -> io::Result<Range<u64>> {
+    fn group(&mut self, records: &[Vec<u8>]) -> Result<Range<u64>, DatasetError> {
         let start = self.written;
         for record in records {
             self.put(record)?;
@@ -170,7 +182,7 @@ impl<W: Write> McapWriter<W> {
         Ok(start..self.written)
     }
 
-    fn statistics(&self) -> Vec<u8> {
+    fn statistics(&self, chunks: usize) -> Vec<u8> {
         let counts = (1u16..).zip(self.topics.iter().map(|topic| topic.messages));
         let counts = counts.flat_map(|(id, count)| [&id.to_le_bytes()[..], &count.to_le_bytes()].concat());
         let messages: u64 = self.topics.iter().map(|topic| topic.messages).sum();
@@ -181,22 +193,21 @@ impl<W: Write> McapWriter<W> {
             &(topics as u32).to_le_bytes(),
             // Neither attachments nor metadata.
             &[0; 8],
-            &(self.chunk_indexes.len() as u32).to_le_bytes(),
+            &(chunks as u32).to_le_bytes(),
             &u64s(&self.times.unwrap_or_default()),
             &sized(counts.collect::<Vec<u8>>()),
         ];
         record(operation::STATISTICS, &fields)
     }
 
-    /// Writes the indexes; the file is then complete. Errors: those of the writer.
-    pub(super) fn finish(mut self) -> io::Result<()> {
+    /// Writes the indexes; the file is then complete. Errors: `Io`.
+    pub(super) fn finish(mut self) -> Result<(), DatasetError> {
         self.close_chunk()?;
         self.put(&record(operation::DATA_END, &[&[0; 4]]))?;
         let summary_start = self.written;
-        let of_topics = |part: usize| self.topics.iter().map(|topic| topic.records[part].clone()).collect();
-        let (schemas, channels): (Vec<_>, Vec<_>) = (of_topics(0), of_topics(1));
-        let statistics = vec![self.statistics()];
+        let (schemas, channels) = (std::mem::take(&mut self.schemas), std::mem::take(&mut self.channels));
         let chunks = std::mem::take(&mut self.chunk_indexes);
+        let statistics = vec![self.statistics(chunks.len())];
         let mut offsets = Vec::new();
         for (operation, records) in [
             (operation::SCHEMA, schemas),
@@ -214,6 +225,7 @@ impl<W: Write> McapWriter<W> {
         let footer = [&u64s(&[summary_start, offsets.start])[..], &[0; 4]];
         self.put(&record(operation::FOOTER, &footer))?;
         self.put(MAGIC)?;
-        self.out.flush()
+        let saved = self.out.flush().and_then(|()| self.out.get_ref().sync_all());
+        saved.map_err(DatasetError::io("write", self.path))
     }
 }

@@ -94,10 +94,8 @@ impl FrameFilePlace {
     /// Starts to write the file. Deletes those of other data and of killed writers; the caller holds the lock.
     /// Errors: `FrameFile`.
     pub(crate) fn create(&self) -> Result<FrameFileWriter<'_>, DatasetError> {
-        for entry in fs::read_dir(self.directory())
-            .map_err(|error| self.failed(error))?
-            .flatten()
-        {
+        let entries = fs::read_dir(self.directory()).map_err(|error| self.failed(error))?;
+        for entry in entries.flatten() {
             let name = entry.file_name();
             if name.as_encoded_bytes().starts_with(b"frames-") || is_partial(&entry.path()) {
                 // A file that cannot be deleted costs only disk space.

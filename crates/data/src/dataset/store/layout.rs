@@ -166,7 +166,6 @@ impl DatasetMetadata {
 #[derive(Deserialize)]
 struct CollectedWith {
     /// None where no world was simulated.
-    #[serde(default)]
     world: Option<WorldConfig>,
 }
 

@@ -47,8 +47,13 @@ impl Dataset {
         let start = wanted.first_frame.saturating_sub(shard.frames.start);
         let frames = content.pixels.into_iter().skip(start).take(wanted.frame_count);
         frames
-            .map(|pixels| Frame::new(info.frame_width_px, info.frame_height_px, pixels.into_vec()))
-            .collect::<Result<_, _>>()
-            .map_err(|error| DatasetError::Invalid(error.to_string()))
+            .map(|pixels| {
+                Ok(Frame::new(
+                    info.frame_width_px,
+                    info.frame_height_px,
+                    pixels.into_vec(),
+                )?)
+            })
+            .collect()
     }
 }

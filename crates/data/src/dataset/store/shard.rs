@@ -84,9 +84,8 @@ impl EncodedEpisode {
 
 fn encode_frames(info: &DatasetInfo, pixels: &[u8]) -> Result<Vec<Vec<u8>>, DatasetError> {
     let encode = |pixels: &[u8]| {
-        Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec())
-            .and_then(|frame| codec::encode_png(&frame))
-            .map_err(DatasetError::Encode)
+        let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec())?;
+        Ok(codec::encode_png(&frame)?)
     };
     pixels.chunks(info.frame_pixels()).map(encode).collect()
 }
@@ -110,29 +109,13 @@ impl ShardStart {
     }
 }
 
-/// The bytes of a shard, and its episode records as JSON.
-pub(crate) struct ShardBytes {
-    pub(crate) bytes: Vec<u8>,
-    pub(crate) records: String,
-}
-
-/// Writes a shard's episodes as a Parquet file in memory. Errors: `Build`.
+/// Writes a shard's episodes as a Parquet file in memory. Returns its bytes, and the episode records as JSON. Errors: `Build`.
 pub(crate) fn build(
     info: &DatasetInfo,
     start: ShardStart,
     episodes: &[EncodedEpisode],
-) -> Result<ShardBytes, DatasetError> {
+) -> Result<(Vec<u8>, String), DatasetError> {
     let records = json_text(&episodes.iter().map(|episode| &episode.record).collect::<Vec<_>>());
-    let bytes = write_parquet(info, start, episodes, &records).map_err(DatasetError::Build)?;
-    Ok(ShardBytes { bytes, records })
-}
-
-fn write_parquet(
-    info: &DatasetInfo,
-    start: ShardStart,
-    episodes: &[EncodedEpisode],
-    records: &str,
-) -> Result<Vec<u8>, ParquetError> {
     let schema = schema(info, true);
     let mut writer = ArrowWriter::try_new(Vec::new(), schema.clone(), Some(properties()))?;
     let mut next = start;
@@ -141,8 +124,8 @@ fn write_parquet(
         writer.flush()?;
         next = next.after(&episode.record);
     }
-    writer.append_key_value_metadata(KeyValue::new(RECORDS_KEY.to_owned(), records.to_owned()));
-    writer.into_inner()
+    writer.append_key_value_metadata(KeyValue::new(RECORDS_KEY.to_owned(), records.clone()));
+    Ok((writer.into_inner()?, records))
 }
 
 /// PNG images are already compressed, so their column is not compressed again. Masks often repeat, so their column keeps
@@ -195,7 +178,7 @@ pub(crate) fn batch(
     schema: &SchemaRef,
     start: ShardStart,
     episode: &EncodedEpisode,
-) -> Result<RecordBatch, ArrowError> {
+) -> Result<RecordBatch, ParquetError> {
     let frames = episode.record.frames;
     let mut columns = Vec::new();
     if schema.index_of(IMAGE).is_ok() {
@@ -218,7 +201,7 @@ pub(crate) fn batch(
         let values = (0..frames).map(|frame| (first + step * frame) as i64);
         columns.push(Arc::new(Int64Array::from_iter_values(values)));
     }
-    RecordBatch::try_new(schema.clone(), columns)
+    Ok(RecordBatch::try_new(schema.clone(), columns)?)
 }
 
 fn image_column(images: &[Vec<u8>]) -> Result<ArrayRef, ArrowError> {

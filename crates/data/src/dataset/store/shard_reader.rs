@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
-use arrow_array::{Array, ArrayRef, BinaryArray, RecordBatch, StringArray};
+use arrow_array::{Array, ArrayRef, RecordBatch, StringArray};
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
@@ -139,7 +139,7 @@ impl Shard {
         let pixels = Some((IMAGE, 0, &mut content.pixels));
         let masks = info.has_masks.then_some((MASK, info.frame_count, &mut content.masks));
         for (key, first_image, held) in pixels.into_iter().chain(masks) {
-            for (image, row) in column.images(key)?.iter().flatten().zip(first_row..) {
+            for (image, row) in column.images(key)?.zip(first_row..) {
                 let frame = self.decode(info, key, row, image)?;
                 match target {
                     ImageTarget::Memory => held.push(frame.into_pixels().into_boxed_slice()),
@@ -213,14 +213,12 @@ impl<'a> Column<'a> {
     }
 
     /// The encoded images of a column without null values. Errors: `Corrupt`.
-    pub(crate) fn images(&self, key: &str) -> Result<&'a BinaryArray, DatasetError> {
-        self.cast(key, "images", |column| {
-            let bytes = column
-                .as_struct_opt()?
-                .column_by_name("bytes")?
-                .as_binary_opt::<i32>()?;
+    pub(crate) fn images(&self, key: &str) -> Result<impl Iterator<Item = &'a [u8]> + use<'a>, DatasetError> {
+        let images = self.cast(key, "images", |column| {
+            let bytes = column.as_struct_opt()?.column_by_name("bytes")?.as_binary_opt::<i32>()?;
             (bytes.null_count() == 0).then_some(bytes)
-        })
+        })?;
+        Ok(images.iter().flatten())
     }
 
     /// The numbers of a column without null values. Errors: `Corrupt`.

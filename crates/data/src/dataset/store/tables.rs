@@ -75,7 +75,7 @@ pub(crate) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
         ("task_index".to_owned(), Arc::new(Int64Array::from(vec![0]))),
         ("task".to_owned(), Arc::new(StringArray::from(vec![task]))),
     ];
-    write(columns, &[("pandas", pandas.to_string())])
+    write(columns, HashMap::from([("pandas".to_owned(), pandas.to_string())]))
 }
 
 /// The table of episodes: position, trial parameters and statistics of every column. With a frame period, their frames are videos,
@@ -107,15 +107,10 @@ pub(crate) fn episodes(
     ];
     columns.extend(stats_columns(rows));
     if let Some(period_s) = video_period_s {
-        let first_frame = |shard: usize| {
-            rows.iter()
-                .find(|row| row.shard == shard)
-                .map_or(0, |row| row.start.frame)
-        };
         let times = |name: &str, frame: &dyn Fn(&EpisodeRow<'_>) -> usize| -> TableColumn {
-            let seconds = rows
-                .iter()
-                .map(|row| (frame(row) - first_frame(row.shard)) as f64 * period_s);
+            let shards = rows.chunk_by(|a, b| a.shard == b.shard);
+            let frames = shards.flat_map(|shard| shard.iter().map(|row| frame(row) - shard[0].start.frame));
+            let seconds = frames.map(|frame| frame as f64 * period_s);
             let seconds = Arc::new(Float64Array::from_iter_values(seconds));
             (format!("videos/{IMAGE}/{name}"), seconds)
         };
@@ -126,7 +121,7 @@ pub(crate) fn episodes(
             times("to_timestamp", &|row| row.end()),
         ]);
     }
-    write(columns, &[])
+    write(columns, HashMap::new())
 }
 
 fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<TableColumn> {
@@ -185,27 +180,23 @@ pub(crate) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
     for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
         let parts: Vec<_> = all.iter().filter_map(|stats| stats.get(key)).collect();
         let merged = ChannelStats::merged(&parts);
-        let mut statistics = serde_json::Map::new();
+        let mut statistics = json!({"count": [merged.count]});
         for (statistic, values) in STATISTICS {
             let values = values(&merged);
-            let value = if is_image(key) {
+            statistics[statistic] = if is_image(key) {
                 values.iter().map(|value| json!([[value]])).collect()
             } else {
                 json!(values)
             };
-            statistics.insert(statistic.to_owned(), value);
         }
-        statistics.insert("count".to_owned(), json!([merged.count]));
-        features.insert(key.clone(), Value::Object(statistics));
+        features.insert(key.clone(), statistics);
     }
     Value::Object(features)
 }
 
-fn write(columns: Vec<TableColumn>, metadata: &[(&str, String)]) -> Result<Vec<u8>, ParquetError> {
+fn write(columns: Vec<TableColumn>, metadata: HashMap<String, String>) -> Result<Vec<u8>, ParquetError> {
     let columns = columns.into_iter().map(|(name, values)| (name, values, true));
     let batch = RecordBatch::try_from_iter_with_nullable(columns)?;
-    let metadata = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone()));
-    let metadata: HashMap<String, String> = metadata.collect();
     let schema = Schema::clone(&batch.schema()).with_metadata(metadata);
     let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
     let mut writer = ArrowWriter::try_new(Vec::new(), Arc::new(schema), Some(properties))?;

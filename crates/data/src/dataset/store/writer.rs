@@ -71,11 +71,11 @@ impl ShardWriter {
 
     /// Writes the next shard. Errors: `Build`, `Invalid`, `Io`.
     pub(crate) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
-        let built = build(&self.info, self.start, episodes)?;
-        write_atomically(&self.out.join(shard_path(self.shards.len())), &built.bytes)?;
+        let (bytes, records) = build(&self.info, self.start, episodes)?;
+        write_atomically(&self.out.join(shard_path(self.shards.len())), &bytes)?;
         // Parse the text as a resumed run would, so that a resumed data set has the same digits.
-        let records = serde_json::from_str(&built.records).map_err(|error| DatasetError::Invalid(error.to_string()))?;
-        let sha256 = sha256_hex(&built.bytes);
+        let records = serde_json::from_str(&records).map_err(|error| DatasetError::Invalid(error.to_string()))?;
+        let sha256 = sha256_hex(&bytes);
         self.push(FinishedShard { sha256, records });
         Ok(())
     }
@@ -127,9 +127,9 @@ pub(crate) fn write_tables(
     video_period_s: Option<f64>,
 ) -> Result<Vec<u8>, DatasetError> {
     let task = info.scenario.as_ref().unwrap_or(&info.name);
-    let episodes = tables::episodes(rows, task, video_period_s).map_err(DatasetError::Build)?;
+    let episodes = tables::episodes(rows, task, video_period_s)?;
     write_atomically(&directory.join(EPISODES), &episodes)?;
-    let tasks = tables::tasks(task).map_err(DatasetError::Build)?;
+    let tasks = tables::tasks(task)?;
     write_atomically(&directory.join(TASKS), &tasks)?;
     write_json(&directory.join(STATS), &tables::stats_json(rows))?;
     Ok(episodes)
@@ -252,9 +252,9 @@ mod tests {
         let read = open_changed(info(), |_| {}, |_| {}).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
-        let built = build(&info(), ShardStart::default(), &[encoded]).unwrap();
+        let (bytes, _) = build(&info(), ShardStart::default(), &[encoded]).unwrap();
         let path = directory.path().join("shard");
-        std::fs::write(&path, &built.bytes).unwrap();
+        std::fs::write(&path, &bytes).unwrap();
         let digest = sha256_hex(super::super::files::sha256_of_file(&path).unwrap().as_bytes());
         assert_eq!(read.info().content_hash, digest);
     }
