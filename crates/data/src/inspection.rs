@@ -3,11 +3,11 @@
 //! motion (`delays`). What is wrong becomes a sentence in [`Inspection::warnings`]; [`page`] draws all of it as HTML.
 
 mod channels;
-mod charts;
 mod delays;
 mod findings;
 mod histogram;
 mod images;
+mod numbers;
 mod page;
 mod places;
 mod timing;

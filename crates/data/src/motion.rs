@@ -7,7 +7,7 @@ use rustfft::num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
 /// A shift of the image content in pixels: positive is right and down.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Shift {
     /// To the right.
     pub x_px: f32,
@@ -19,9 +19,8 @@ pub struct Shift {
 /// Zero where the images are flat or equal.
 #[must_use]
 pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
-    const STILL: Shift = Shift { x_px: 0.0, y_px: 0.0 };
     if before == after || width == 0 {
-        return STILL;
+        return Shift::default();
     }
     let height = before.len() / width;
     let (columns, rows) = (width.next_power_of_two(), height.next_power_of_two());
@@ -34,12 +33,10 @@ pub fn phase_correlation(before: &[f32], after: &[f32], width: usize) -> Shift {
         .collect();
     transform_2d(&mut cross, columns, FftPlanner::plan_fft_inverse);
     let surface: Vec<f32> = cross.iter().map(|value| value.re).collect();
-    let Some(peak) = (0..surface.len()).max_by(|&a, &b| surface[a].total_cmp(&surface[b])) else {
-        return STILL;
+    let peak = (0..surface.len()).max_by(|&a, &b| surface[a].total_cmp(&surface[b]));
+    let Some(peak) = peak.filter(|&peak| surface[peak] > 0.0) else {
+        return Shift::default();
     };
-    if surface[peak] <= 0.0 {
-        return STILL;
-    }
     let (x, y) = (peak % columns, peak / columns);
     let at = |x: usize, y: usize| surface[(y % rows) * columns + x % columns];
     Shift {

@@ -4,26 +4,28 @@
 //! atomically. If the collection is stopped, the finished trials of the other shards are saved beside them. The finished
 //! data set depends only on seed and trial numbers, not on threads or interruptions.
 
-mod collection;
 mod config;
 mod digits;
 pub mod moving_mnist;
+mod status;
 mod unfinished;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use self::collection::Collection;
-pub use self::collection::CollectionStatus;
+use self::config::ShardTrials;
 pub use self::config::{CollectConfig, CollectProgress, DEFAULT_TRIALS_PER_SHARD};
+pub use self::status::CollectionStatus;
+use super::store::arguments::{arguments_text, lock};
 use super::store::shard::EncodedEpisode;
+use super::store::writer::ShardWriter;
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_sim::{Observation, SimError, World, action_channels};
 
 /// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished
 /// ([`CollectionStatus::of`] tells). Several threads call `on_progress`.
-/// Errors: `Zero`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
+/// Errors: `Usage`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect(
     config: &CollectConfig,
     on_progress: &(dyn Fn(CollectProgress) + Sync),
@@ -33,12 +35,19 @@ pub fn collect(
     if let CollectionStatus::Finished(info) = CollectionStatus::of(config)? {
         return Ok(*info);
     }
-    let mut collection = Collection::open(config)?;
+    let _lock = lock(&config.out, &arguments_text(config))?;
+    let (mut writer, shards) = (ShardWriter::new(&config.out, config.info()), config.shards());
+    // A damaged shard is simulated again.
+    while writer.shard_count() < shards.count() && writer.resume(Some(shards.count_of(writer.shard_count()))) {}
+    let saved = |writer: &ShardWriter| {
+        let beside = unfinished::count(&config.out, writer.shard_count()..shards.count());
+        (writer.episode_count() + beside) as u64
+    };
     let workers = CollectWorkers {
         config,
-        info: collection.info().clone(),
-        next_shard: AtomicUsize::new(collection.shard_count()),
-        done: AtomicU64::new(collection.trial_count()),
+        info: writer.info().clone(),
+        next_shard: AtomicUsize::new(writer.shard_count()),
+        done: AtomicU64::new(saved(&writer)),
         on_progress,
         cancelled,
         failed: AtomicBool::new(false),
@@ -52,21 +61,22 @@ pub fn collect(
             scope.spawn(move || workers.work(&sender));
         }
         drop(sender);
-        let written = write_in_order(&mut collection, receiver);
+        let written = write_in_order(&mut writer, shards, receiver);
         workers.failed.store(written.is_err(), Ordering::Relaxed);
         written
     });
     let unwritten = written?;
-    if collection.shard_count() < config.shard_count() {
-        for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
-            collection.save_unfinished(*shard, episodes)?;
-        }
-        return Err(DatasetError::Cancelled {
-            done: collection.trial_count(),
-            total: config.trials,
-        });
+    if writer.shard_count() == shards.count() {
+        unfinished::remove_all(&config.out)?;
+        return writer.complete();
     }
-    collection.complete()
+    for (shard, episodes) in unwritten.iter().filter(|(_, episodes)| !episodes.is_empty()) {
+        unfinished::save(writer.info(), &config.out, *shard, shards.of(*shard).start, episodes)?;
+    }
+    Err(DatasetError::Cancelled {
+        done: saved(&writer),
+        total: config.trials,
+    })
 }
 
 /// A shard's number and its finished episodes (all of them, unless the collection was stopped), or the error.
@@ -75,17 +85,18 @@ type ShardResult = (usize, Result<Vec<EncodedEpisode>, DatasetError>);
 /// Writes complete shards in order. A shard that arrives early waits for the shards before it. Returns the episodes that
 /// could not be written: those of incomplete shards, and of shards after an incomplete one.
 fn write_in_order(
-    collection: &mut Collection<'_>,
+    writer: &mut ShardWriter,
+    shards: ShardTrials,
     results: Receiver<ShardResult>,
 ) -> Result<BTreeMap<usize, Vec<EncodedEpisode>>, DatasetError> {
     let mut waiting = BTreeMap::new();
     for (shard, episodes) in results {
         waiting.insert(shard, episodes?);
         while let Some(entry) = waiting.first_entry()
-            && *entry.key() == collection.shard_count()
-            && collection.is_complete(*entry.key(), entry.get())
+            && *entry.key() == writer.shard_count()
+            && entry.get().len() == shards.count_of(*entry.key())
         {
-            collection.write(&entry.remove())?;
+            writer.write(&entry.remove())?;
         }
     }
     Ok(waiting)
@@ -118,7 +129,7 @@ impl CollectWorkers<'_> {
     fn work(&self, sender: &SyncSender<ShardResult>) {
         loop {
             let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
-            if shard >= self.config.shard_count() {
+            if shard >= self.config.shards().count() {
                 return;
             }
             if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
@@ -129,10 +140,12 @@ impl CollectWorkers<'_> {
 
     /// Simulates the trials of a shard that are not saved yet; stops early if the collection was stopped.
     fn simulate_shard(&self, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
-        let mut episodes = Collection::saved_episodes(self.config, &self.info, shard);
-        for trial in self.config.shard_trials(shard).skip(episodes.len()) {
+        let shards = self.config.shards();
+        let mut episodes = unfinished::load(&self.info, &self.config.out, shard);
+        episodes.truncate(shards.count_of(shard));
+        for trial in shards.of(shard).skip(episodes.len()) {
             let simulated = self.simulate(trial);
-            let Some(data) = simulated.map_err(|source| DatasetError::Simulation { trial, source })? else {
+            let Some(data) = simulated.map_err(|error| DatasetError::Simulation(trial, error))? else {
                 break;
             };
             episodes.push(EncodedEpisode::new(&self.info, trial as usize, data)?);

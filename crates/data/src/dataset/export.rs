@@ -7,21 +7,17 @@ mod cdr;
 mod mcap;
 mod video;
 
-use std::collections::HashMap;
-use std::ops::Range;
 use std::path::Path;
 
-use arrow_array::RecordBatch;
-use arrow_schema::{ArrowError, SchemaRef};
 use parquet::arrow::ArrowWriter;
-use parquet::errors::ParquetError;
 use serde_json::{Value, json};
 
 pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
+pub use self::video::to_mp4;
 use super::store::files::write_atomically;
-use super::store::layout::{self, IMAGE, INFO, MASK, shard_location, shard_path};
+use super::store::layout::{self, IMAGE, INFO, shard_location, shard_path};
 use super::store::shard::{EncodedEpisode, ShardStart, batch, schema};
-use super::store::tables::{self, EpisodeRow};
+use super::store::tables::EpisodeRow;
 use super::store::writer::{ShardWriter, shard_ranges, write_json, write_tables};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, EpisodeData};
 
@@ -30,11 +26,7 @@ const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_
 /// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too.
 /// Errors: `Encode`, `Build`, `Io`.
 pub fn to_lerobot_images(dataset: &Dataset, out: &Path) -> Result<(), DatasetError> {
-    let info = DatasetInfo {
-        content_hash: String::new(),
-        ..dataset.info().clone()
-    };
-    let mut writer = ShardWriter::new(out, info);
+    let mut writer = ShardWriter::new(out, dataset.info().clone());
     for episodes in shards(dataset) {
         let encoded = encoded(dataset, writer.info(), episodes)?;
         writer.write(&encoded)?;
@@ -43,49 +35,33 @@ pub fn to_lerobot_images(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
 }
 
 /// Writes an empty directory as a `LeRobot` data set of version 3 with its frames as H.264 videos, without masks.
-/// Errors: `OddFrames`, `Program`, `Encode`, `Build`, `Io`.
+/// Errors: `Usage`, `Program`, `Encode`, `Build`, `Io`.
 pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetError> {
     let info = DatasetInfo {
         has_masks: false,
         ..dataset.info().clone()
     };
-    if info.frame_width_px % 2 == 1 || info.frame_height_px % 2 == 1 {
-        return Err(DatasetError::OddFrames {
-            width: info.frame_width_px,
-            height: info.frame_height_px,
-        });
+    let (width, height) = (info.frame_width_px, info.frame_height_px);
+    if width % 2 == 1 || height % 2 == 1 {
+        return Err(DatasetError::Usage(format!(
+            "frames of {width}×{height} px cannot become a video, which needs even sides; export images, or import with \
+             another --size"
+        )));
     }
-    let (mut records, mut start) = (Vec::new(), ShardStart { episode: 0, frame: 0 });
+    let (mut records, mut start) = (Vec::new(), ShardStart::default());
     for (shard, episodes) in shards(dataset).enumerate() {
         let encoded = encoded(dataset, &info, episodes)?;
-        let bytes = numbers(&info, start, &encoded).map_err(DatasetError::Build)?;
+        let (bytes, end) = numbers(&info, start, &encoded)?;
         write_atomically(&out.join(shard_path(shard)), &bytes)?;
-        let end = after(start, &encoded);
         let (chunk, file) = shard_location(shard);
         let path = out.join(format!("videos/{IMAGE}/chunk-{chunk:03}/file-{file:03}.mp4"));
-        video::write(dataset, start.frame..end.frame, &path)?;
+        to_mp4(dataset, start.frame..end.frame, &path)?;
         start = end;
         records.extend(encoded.into_iter().map(|episode| (shard, episode.record)));
     }
-    let mut first_frame = 0;
-    let mut rows = Vec::new();
-    for (shard, record) in &records {
-        rows.push(EpisodeRow {
-            record,
-            shard: *shard,
-            first_frame,
-        });
-        first_frame += record.frames;
-    }
-    write_tables(out, &info, &rows, |rows, task| {
-        tables::episodes_with_videos(rows, task, info.frame_period_s)
-    })?;
+    let rows = EpisodeRow::all(records.iter().map(|(shard, record)| (*shard, record)));
+    write_tables(out, &info, &rows, Some(info.frame_period_s))?;
     write_json(&out.join(INFO), &video_info(&info))
-}
-
-/// Writes frames of one episode, counted over the whole data set, as an MP4 file. Errors: `Program`, `Io`.
-pub fn to_mp4(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<(), DatasetError> {
-    video::write(dataset, frames, path)
 }
 
 /// The episodes of each shard.
@@ -106,22 +82,17 @@ fn encoded(dataset: &Dataset, info: &DatasetInfo, episodes: &[Episode]) -> Resul
                 masks.extend_from_slice(&mask);
             }
         }
+        let of_frames = |values: fn(&Dataset, usize) -> &[f32]| {
+            let values = episode.frames().flat_map(|frame| values(dataset, frame));
+            values.copied().collect()
+        };
+        let times = (0..episode.frame_count).map(|frame| frame as f64 * info.frame_period_s);
         let data = EpisodeData {
-            timestamps_s: (0..episode.frame_count)
-                .map(|frame| frame as f64 * info.frame_period_s)
-                .collect(),
+            timestamps_s: times.collect(),
             pixels,
             masks,
-            actions: episode
-                .frames()
-                .flat_map(|frame| dataset.action(frame))
-                .copied()
-                .collect(),
-            states: episode
-                .frames()
-                .flat_map(|frame| dataset.state(frame))
-                .copied()
-                .collect(),
+            actions: of_frames(Dataset::action),
+            states: of_frames(Dataset::state),
             trial: episode.trial.clone(),
         };
         EncodedEpisode::new(info, episode.index, data)
@@ -129,38 +100,20 @@ fn encoded(dataset: &Dataset, info: &DatasetInfo, episodes: &[Episode]) -> Resul
     episodes.iter().map(encode).collect()
 }
 
-fn after(start: ShardStart, episodes: &[EncodedEpisode]) -> ShardStart {
-    ShardStart {
-        episode: start.episode + episodes.len(),
-        frame: start.frame + episodes.iter().map(|episode| episode.record.frames).sum::<usize>(),
-    }
-}
-
-/// A table of everything but the images.
-fn numbers(info: &DatasetInfo, start: ShardStart, episodes: &[EncodedEpisode]) -> Result<Vec<u8>, ParquetError> {
-    let whole = schema(info);
-    let kept: Vec<usize> = (0..whole.fields().len())
-        .filter(|&column| *whole.field(column).name() != IMAGE)
-        .collect();
-    let schema = without_images(info, &whole, &kept)?;
+/// A table of everything but the images, and the position after it.
+fn numbers(
+    info: &DatasetInfo,
+    start: ShardStart,
+    episodes: &[EncodedEpisode],
+) -> Result<(Vec<u8>, ShardStart), DatasetError> {
+    let schema = schema(info, false);
     let mut writer = ArrowWriter::try_new(Vec::new(), schema.clone(), None)?;
     let mut next = start;
     for episode in episodes {
-        let numbers = batch(info, &whole, next, episode)?.project(&kept)?;
-        writer.write(&RecordBatch::try_new(schema.clone(), numbers.columns().to_vec())?)?;
-        next = after(next, std::slice::from_ref(episode));
+        writer.write(&batch(info, &schema, next, episode)?)?;
+        next = next.after(&episode.record);
     }
-    writer.into_inner()
-}
-
-/// The schema of the kept columns; the description for the `datasets` library has no images either.
-fn without_images(info: &DatasetInfo, whole: &SchemaRef, kept: &[usize]) -> Result<SchemaRef, ArrowError> {
-    let mut described = layout::huggingface_features(info);
-    if let Some(features) = described["info"]["features"].as_object_mut() {
-        features.remove(IMAGE);
-    }
-    let metadata = HashMap::from([("huggingface".to_owned(), described.to_string())]);
-    Ok(whole.project(kept)?.with_metadata(metadata).into())
+    Ok((writer.into_inner()?, next))
 }
 
 /// `LeRobot`'s `info.json` of a data set with videos.
@@ -183,8 +136,5 @@ fn video_info(info: &DatasetInfo) -> Value {
             "has_audio": false,
         },
     });
-    if let Some(features) = described["features"].as_object_mut() {
-        features.remove(MASK);
-    }
     described
 }

@@ -2,15 +2,22 @@
 
 use std::ops::Range;
 
+use serde::{Deserialize, Serialize};
+
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::{Channel, Seed};
 use foreframe_sim::{TrialParameters, WorldConfig};
 
-/// Description of a data set: frame size, frame period, channels, origin and the hash of its content.
-#[derive(Clone, Debug, Default, PartialEq)]
+/// Description of a data set: frame size, frame period, channels, origin and the hash of its content. The fields in the order
+/// of the metadata file.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
     /// Its name, for reports.
     pub name: String,
+    /// The simulated scenario; none for recordings.
+    pub scenario: Option<String>,
+    /// The seed it was simulated from; none for recordings.
+    pub seed: Option<Seed>,
     /// Width of every frame in pixels.
     pub frame_width_px: u32,
     /// Height of every frame in pixels.
@@ -21,21 +28,21 @@ pub struct DatasetInfo {
     pub action_channels: Vec<Channel>,
     /// Components of a state.
     pub state_channels: Vec<Channel>,
-    /// SHA-256 of the content, in hexadecimal. [`Dataset::from_episodes`](super::Dataset::from_episodes) computes it if this is empty.
-    pub content_hash: String,
-    /// The simulated scenario; none for recordings.
-    pub scenario: Option<String>,
-    /// The seed it was simulated from; none for recordings.
-    pub seed: Option<Seed>,
-    /// Number of frames of all episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
-    pub frame_count: usize,
-    /// Number of episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
-    pub episode_count: usize,
     /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
     pub has_masks: bool,
     /// How the camera projects; none where that is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraModel>,
+    /// SHA-256 of the content, in hexadecimal. [`Dataset::from_episodes`](super::Dataset::from_episodes) computes it if this is empty.
+    pub content_hash: String,
+    /// Number of frames of all episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
+    #[serde(skip)]
+    pub frame_count: usize,
+    /// Number of episodes; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
+    #[serde(skip)]
+    pub episode_count: usize,
     /// How the simulated world was run and seen; none for recordings.
+    #[serde(skip)]
     pub world: Option<WorldConfig>,
 }
 
@@ -46,11 +53,15 @@ impl DatasetInfo {
         self.frame_width_px as usize * self.frame_height_px as usize
     }
 
+    /// Number of frames and masks.
+    pub(super) fn image_count(&self) -> usize {
+        self.frame_count * (1 + usize::from(self.has_masks))
+    }
+
     /// Bytes of all frames, decoded, with their masks.
     #[must_use]
     pub fn decoded_bytes(&self) -> u64 {
-        let images = 1 + u64::from(self.has_masks);
-        self.frame_count as u64 * self.frame_pixels() as u64 * images
+        self.image_count() as u64 * self.frame_pixels() as u64
     }
 }
 

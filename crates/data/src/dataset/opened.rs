@@ -1,11 +1,13 @@
 //! An open data set: its numbers are in memory, its frames in memory or in a file of decoded frames.
 
 use std::borrow::Cow;
+use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
 use super::check::{check_description, check_episode};
-use super::frame_store::{FrameStore, HeldFrames, item};
+use super::frame_store::frame_file::FrameFile;
+use super::frame_store::{FrameContent, FrameStore};
 use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
 use foreframe_core::files::hex;
 use foreframe_core::frame::Frame;
@@ -14,86 +16,101 @@ use foreframe_core::frame::Frame;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
     pub(super) info: DatasetInfo,
-    pub(super) episodes: Vec<Episode>,
-    pub(super) frames: FrameStore,
-    pub(super) actions: Vec<f32>,
-    pub(super) states: Vec<f32>,
-    pub(super) timestamps_s: Vec<f64>,
+    episodes: Vec<Episode>,
+    images: FrameStore,
+    actions: Vec<f32>,
+    states: Vec<f32>,
+    timestamps_s: Vec<f64>,
 }
 
 impl Dataset {
-    /// A data set of these episodes. Fills in the counts in `info`, and the hash if it is empty. Errors: `Description`,
-    /// `PartLength`, `NotFinite`, `TimeOrder`, `MixedMasks`, `Empty`.
+    /// A data set of these episodes. Fills in the counts in `info`, and the hash if it is empty. Errors: `Invalid`, `TimeOrder`.
     pub fn from_episodes(info: DatasetInfo, episodes: Vec<EpisodeData>) -> Result<Self, DatasetError> {
         check_description(&info)?;
         let has_masks = episodes.first().is_some_and(|episode| episode.masks.is_some());
-        let frame_count: usize = episodes.iter().map(|episode| episode.timestamps_s.len()).sum();
-        let bytes = frame_count * info.frame_pixels();
-        let mut held = HeldFrames {
-            pixels: Vec::with_capacity(bytes),
-            masks: has_masks.then(|| Vec::with_capacity(bytes)),
-        };
-        let mut dataset = Self {
-            episodes: Vec::with_capacity(episodes.len()),
-            frames: FrameStore::Memory(HeldFrames::default()),
-            actions: Vec::with_capacity(frame_count * info.action_channels.len()),
-            states: Vec::with_capacity(frame_count * info.state_channels.len()),
-            timestamps_s: Vec::with_capacity(frame_count),
-            info,
-        };
-        for episode in episodes {
-            dataset.push(&mut held, episode)?;
-        }
-        if dataset.timestamps_s.is_empty() {
-            return Err(DatasetError::Empty {
-                name: dataset.info.name,
+        let size = info.frame_pixels();
+        let mut content = FrameContent::default();
+        let mut placed = Vec::with_capacity(episodes.len());
+        for (index, data) in episodes.into_iter().enumerate() {
+            check_episode(&info, index, &data)?;
+            if data.masks.is_some() != has_masks {
+                return Err(DatasetError::Invalid(format!(
+                    "episode {index}: either every episode must have masks, or none"
+                )));
+            }
+            placed.push(Episode {
+                index,
+                first_frame: content.timestamps_s.len(),
+                frame_count: data.timestamps_s.len(),
+                trial: data.trial,
+            });
+            let images = |pixels: Vec<u8>| pixels.chunks(size).map(Box::from).collect();
+            content.append(FrameContent {
+                pixels: images(data.pixels),
+                masks: images(data.masks.unwrap_or_default()),
+                actions: data.actions,
+                states: data.states,
+                timestamps_s: data.timestamps_s,
             });
         }
-        dataset.info.frame_count = dataset.timestamps_s.len();
-        dataset.info.episode_count = dataset.episodes.len();
-        dataset.info.has_masks = has_masks;
-        if dataset.info.content_hash.is_empty() {
-            dataset.info.content_hash = dataset.hash_content(&held);
+        if content.timestamps_s.is_empty() {
+            return Err(DatasetError::Invalid(format!(
+                "the data set \"{}\" has no frames; at least one episode with one frame is needed",
+                info.name
+            )));
         }
-        dataset.frames = FrameStore::Memory(held);
+        let info = DatasetInfo {
+            frame_count: content.timestamps_s.len(),
+            episode_count: placed.len(),
+            has_masks,
+            ..info
+        };
+        let mut dataset = Self::new(info, placed, content, None);
+        if dataset.info.content_hash.is_empty() {
+            dataset.info.content_hash = dataset.hash_content()?;
+        }
         Ok(dataset)
     }
 
-    fn push(&mut self, held: &mut HeldFrames, data: EpisodeData) -> Result<(), DatasetError> {
-        let index = self.episodes.len();
-        check_episode(&self.info, index, &data)?;
-        match (&mut held.masks, data.masks) {
-            (Some(all), Some(masks)) => all.extend(masks),
-            (None, None) => {}
-            _ => return Err(DatasetError::MixedMasks { episode: index }),
+    /// The data set with this content; its images are in the file if there is one.
+    pub(super) fn new(
+        info: DatasetInfo,
+        episodes: Vec<Episode>,
+        mut content: FrameContent,
+        file: Option<FrameFile>,
+    ) -> Self {
+        content.pixels.append(&mut content.masks);
+        Self {
+            info,
+            episodes,
+            images: file.map_or(FrameStore::Memory(content.pixels), |file| {
+                FrameStore::File(Arc::new(file))
+            }),
+            actions: content.actions,
+            states: content.states,
+            timestamps_s: content.timestamps_s,
         }
-        self.episodes.push(Episode {
-            index,
-            first_frame: self.timestamps_s.len(),
-            frame_count: data.timestamps_s.len(),
-            trial: data.trial,
-        });
-        held.pixels.extend(data.pixels);
-        self.actions.extend(data.actions);
-        self.states.extend(data.states);
-        self.timestamps_s.extend(data.timestamps_s);
-        Ok(())
     }
 
-    fn hash_content(&self, held: &HeldFrames) -> String {
+    fn hash_content(&self) -> Result<String, DatasetError> {
         let mut hasher = Sha256::new();
         for episode in &self.episodes {
             hasher.update((episode.frame_count as u64).to_le_bytes());
         }
-        hasher.update(&held.pixels);
-        hasher.update(held.masks.as_deref().unwrap_or_default());
+        let (frames, masks) = (self.info.frame_count, self.info.image_count() - self.info.frame_count);
+        for frame in 0..frames {
+            hasher.update(self.image(0, frame)?);
+        }
+        for frame in 0..masks {
+            hasher.update(self.image(frames, frame)?);
+        }
         for value in self.actions.iter().chain(&self.states) {
             hasher.update(value.to_le_bytes());
         }
         for value in &self.timestamps_s {
             hasher.update(value.to_le_bytes());
         }
-        hex(&hasher.finalize())
+        Ok(hex(&hasher.finalize()))
     }
 
     /// The description of the data set.
@@ -111,26 +128,39 @@ impl Dataset {
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there
     /// is no such frame. Errors: `Io`, `Corrupt`; never if the frames are in memory.
     pub fn pixels(&self, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
-        self.frames.pixels(frame, self.info.frame_pixels())
+        self.image(0, frame)
     }
 
     /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame. Errors: as
     /// [`Dataset::pixels`].
     pub fn mask(&self, frame: usize) -> Result<Option<Cow<'_, [u8]>>, DatasetError> {
-        self.frames.mask(frame, self.info.frame_pixels())
+        let mask = || self.image(self.info.frame_count, frame);
+        self.info.has_masks.then(mask).transpose()
+    }
+
+    /// The pixels of a frame, or of its mask if `first` is where the masks begin.
+    fn image(&self, first: usize, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
+        let frames = self.info.frame_count;
+        assert!(frame < frames, "frame {frame} of {frames} frames is a bug");
+        match &self.images {
+            FrameStore::Memory(images) => Ok(Cow::Borrowed(&images[first + frame])),
+            FrameStore::File(file) => file.read(first + frame).map(Cow::Owned),
+        }
     }
 
     /// A frame. Panics if there is no such frame. Errors: as [`Dataset::pixels`].
     pub fn frame(&self, frame: usize) -> Result<Frame, DatasetError> {
         let pixels = self.pixels(frame)?.into_owned();
-        Frame::new(self.info.frame_width_px, self.info.frame_height_px, pixels)
-            .map_err(|error| DatasetError::Description(error.to_string()))
+        Ok(Frame::new(self.info.frame_width_px, self.info.frame_height_px, pixels)?)
     }
 
     /// Bytes of frames and masks that this data set holds in memory; 0 if they are in a file.
     #[must_use]
     pub fn frame_bytes_in_memory(&self) -> usize {
-        self.frames.bytes_in_memory()
+        match &self.images {
+            FrameStore::Memory(images) => images.iter().map(|image| image.len()).sum(),
+            FrameStore::File(_) => 0,
+        }
     }
 
     /// The action from this frame to the next. Panics if there is no such frame.
@@ -150,4 +180,9 @@ impl Dataset {
     pub fn timestamp_s(&self, frame: usize) -> f64 {
         self.timestamps_s[frame]
     }
+}
+
+/// Item `index` of those of equal size that lie one after another.
+fn item<T>(all: &[T], index: usize, size: usize) -> &[T] {
+    &all[index * size..(index + 1) * size]
 }

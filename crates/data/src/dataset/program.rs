@@ -1,7 +1,7 @@
 //! Other programs that do a part of the work, such as `ffmpeg`. A program ends with the work that started it: when the work is
 //! cancelled, when it fails, and when this process is killed.
 
-use std::io::Read;
+use std::io::{BufRead, Cursor, Read};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
@@ -74,9 +74,7 @@ fn end_with_this_process(command: &mut Command) {
 pub(super) struct ProgramOutput {
     child: Child,
     pieces: Receiver<Vec<u8>>,
-    piece: Vec<u8>,
-    /// How much of `piece` was read.
-    taken: usize,
+    piece: Cursor<Vec<u8>>,
     reason: Option<JoinHandle<String>>,
 }
 
@@ -95,39 +93,34 @@ impl ProgramOutput {
         Ok(Self {
             child,
             pieces,
-            piece: Vec::new(),
-            taken: 0,
+            piece: Cursor::default(),
             reason: Some(reason),
         })
     }
 
     /// Output that was not read yet; empty at its end. Errors: `Cancelled`.
-    fn waiting(&mut self, cancelled: &AtomicBool) -> Result<&[u8], ProgramError> {
-        while self.taken == self.piece.len() {
+    fn waiting(&mut self, cancelled: &AtomicBool) -> Result<&mut Cursor<Vec<u8>>, ProgramError> {
+        while self.piece.position() == self.piece.get_ref().len() as u64 {
             if cancelled.load(Ordering::Acquire) {
                 return Err(ProgramError::Cancelled);
             }
             match self.pieces.recv_timeout(POLL_EVERY) {
-                Ok(piece) => (self.piece, self.taken) = (piece, 0),
+                Ok(piece) => self.piece = Cursor::new(piece),
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return Ok(&[]),
+                Err(RecvTimeoutError::Disconnected) => break,
             }
         }
-        Ok(&self.piece[self.taken..])
+        Ok(&mut self.piece)
     }
 
     /// Reads until the buffer is full or the output ends. Returns how many bytes were read. Errors: `Cancelled`.
     pub(super) fn read(&mut self, buffer: &mut [u8], cancelled: &AtomicBool) -> Result<usize, ProgramError> {
         let mut filled = 0;
         while filled < buffer.len() {
-            let waiting = self.waiting(cancelled)?;
-            let count = waiting.len().min(buffer.len() - filled);
-            if count == 0 {
-                break;
+            match self.waiting(cancelled)?.read(&mut buffer[filled..]) {
+                Ok(count) if count > 0 => filled += count,
+                _ => break,
             }
-            buffer[filled..filled + count].copy_from_slice(&waiting[..count]);
-            self.taken += count;
-            filled += count;
         }
         Ok(filled)
     }
@@ -135,22 +128,17 @@ impl ProgramOutput {
     /// Reads the next line, without its end; `None` at the end of the output. Errors: `Cancelled`, `Failed` if the line is too long.
     pub(super) fn line(&mut self, cancelled: &AtomicBool) -> Result<Option<String>, ProgramError> {
         let mut line = Vec::new();
-        loop {
-            let waiting = self.waiting(cancelled)?;
-            if waiting.is_empty() {
-                let rest = String::from_utf8_lossy(&line).into_owned();
-                return Ok((!rest.is_empty()).then_some(rest));
-            }
-            let end = waiting.iter().position(|&byte| byte == b'\n');
-            line.extend_from_slice(&waiting[..end.unwrap_or(waiting.len())]);
-            self.taken += end.map_or(waiting.len(), |end| end + 1);
-            if line.len() > MAX_LINE_BYTES {
-                return Err(ProgramError::Failed("its output has a line without end".to_owned()));
-            }
-            if end.is_some() {
-                return Ok(Some(String::from_utf8_lossy(&line).trim_end().to_owned()));
+        while !line.ends_with(b"\n") {
+            match self.waiting(cancelled)?.read_until(b'\n', &mut line) {
+                Ok(_) if line.len() > MAX_LINE_BYTES => {
+                    return Err(ProgramError::Failed("its output has a line without end".to_owned()));
+                }
+                Ok(count) if count > 0 => {}
+                _ => break,
             }
         }
+        let text = String::from_utf8_lossy(&line);
+        Ok((!line.is_empty()).then(|| text.trim_end().to_owned()))
     }
 
     /// Waits for the program's end, after its output has ended. Returns the first line of its error output; empty without any.
@@ -165,11 +153,10 @@ impl ProgramOutput {
             }
         };
         let reason = self.reason.take().and_then(|reason| reason.join().ok());
-        let reason = reason.unwrap_or_default();
-        match (status.success(), reason.is_empty()) {
-            (true, _) => Ok(reason),
-            (false, true) => Err(ProgramError::Failed(status.to_string())),
-            (false, false) => Err(ProgramError::Failed(reason)),
+        match reason.unwrap_or_default() {
+            reason if status.success() => Ok(reason),
+            reason if reason.is_empty() => Err(ProgramError::Failed(status.to_string())),
+            reason => Err(ProgramError::Failed(reason)),
         }
     }
 }

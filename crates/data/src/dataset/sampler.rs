@@ -6,7 +6,8 @@ use std::ops::Range;
 use rand::Rng;
 use rand::seq::index;
 
-use super::{Dataset, DatasetError};
+use super::check::check_counts;
+use super::{Dataset, DatasetError, Episode};
 use foreframe_core::types::Seed;
 use foreframe_sim::TrialParameters;
 
@@ -45,13 +46,7 @@ impl Split {
     /// `train`, `validation`, `test`, `unseen-pairs` or `unseen-gains`.
     #[must_use]
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Train => "train",
-            Self::Validation => "validation",
-            Self::Test => "test",
-            Self::UnseenPairs => "unseen-pairs",
-            Self::UnseenGains => "unseen-gains",
-        }
+        ["train", "validation", "test", "unseen-pairs", "unseen-gains"][self as usize]
     }
 }
 
@@ -87,11 +82,20 @@ pub struct Window {
     pub first_frame: usize,
 }
 
-/// Consecutive frames of one episode that belong to one split and contain no gap.
+/// Consecutive frames of one episode that belong to one split.
 #[derive(Clone, Debug, PartialEq)]
 struct EpisodeSegment {
     episode: usize,
     frames: Range<usize>,
+}
+
+impl EpisodeSegment {
+    fn whole(episode: &Episode) -> Self {
+        Self {
+            episode: episode.index,
+            frames: episode.frames(),
+        }
+    }
 }
 
 /// The episodes and segments of each split. Simulated trials are never divided; their split depends only on split seed and
@@ -100,6 +104,7 @@ struct EpisodeSegment {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
     episodes: [Vec<usize>; Split::ALL.len()],
+    /// They contain no gap.
     segments: [Vec<EpisodeSegment>; Split::ALL.len()],
     /// A longer time step is a gap, in seconds.
     max_step_s: f64,
@@ -109,101 +114,48 @@ impl Splits {
     /// Splits the data set with this seed.
     #[must_use]
     pub fn new(dataset: &Dataset, split_seed: Seed) -> Self {
-        let mut splits = Self {
-            episodes: Default::default(),
-            segments: Default::default(),
-            max_step_s: GAP_PERIODS * median_period_s(dataset),
-        };
-        let trials: Option<Vec<&TrialParameters>> = dataset
-            .episodes()
-            .iter()
-            .map(|episode| episode.trial.as_ref())
-            .collect();
+        let episodes = dataset.episodes();
+        let trials: Option<Vec<&TrialParameters>> = episodes.iter().map(|episode| episode.trial.as_ref()).collect();
         match trials {
             Some(trials) => {
-                for (episode, trial) in dataset.episodes().iter().zip(trials) {
-                    let split = match trial {
-                        trial if trial.has_held_out_pair() => Split::UnseenPairs,
-                        trial if trial.is_held_out() => Split::UnseenGains,
-                        trial => split_of(split_seed, trial.trial),
-                    };
-                    splits.add(dataset, split, episode.index, &episode.frames());
-                }
+                let splits = trials.into_iter().map(|trial| match trial {
+                    trial if trial.has_held_out_pair() => Split::UnseenPairs,
+                    trial if trial.is_held_out() => Split::UnseenGains,
+                    trial => split_of(split_seed, trial.trial),
+                });
+                Self::of(dataset, splits.zip(episodes.iter().map(EpisodeSegment::whole)))
             }
-            None if dataset.episodes().len() >= WHOLE_EPISODES => splits.add_whole_episodes(dataset),
-            None => splits.add_by_time(dataset),
+            None if episodes.len() >= WHOLE_EPISODES => Self::of(dataset, whole_episodes(dataset)),
+            None => Self::of(dataset, by_time(dataset)),
         }
-        splits
     }
 
     /// Every episode in the test split, for a data set that holds nothing but test data.
     #[must_use]
     pub fn all_for_test(dataset: &Dataset) -> Self {
+        let whole = dataset.episodes().iter().map(EpisodeSegment::whole);
+        Self::of(dataset, whole.map(|whole| (Split::Test, whole)))
+    }
+
+    /// The splits that consist of these segments, which are in order. They are cut at gaps.
+    fn of(dataset: &Dataset, parts: impl IntoIterator<Item = (Split, EpisodeSegment)>) -> Self {
         let mut splits = Self {
             episodes: Default::default(),
             segments: Default::default(),
             max_step_s: GAP_PERIODS * median_period_s(dataset),
         };
-        for episode in dataset.episodes() {
-            splits.add(dataset, Split::Test, episode.index, &episode.frames());
-        }
-        splits
-    }
-
-    /// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
-    /// them, with at least a tenth, for validation; the others for training.
-    fn add_whole_episodes(&mut self, dataset: &Dataset) {
-        let tenth = dataset.info().frame_count.div_ceil(10);
-        let (mut test, mut validation) = (0, 0);
-        for episode in dataset.episodes().iter().rev() {
-            let split = if test < tenth {
-                test += episode.frame_count;
-                Split::Test
-            } else if validation < tenth {
-                validation += episode.frame_count;
-                Split::Validation
-            } else {
-                Split::Train
-            };
-            self.add(dataset, split, episode.index, &episode.frames());
-        }
-        for split in Split::ALL {
-            self.episodes[split as usize].reverse();
-            self.segments[split as usize].sort_by_key(|segment| segment.frames.start);
-        }
-    }
-
-    /// Splits all frames by time: the first 80 % for training, the next 10 % for validation, the last 10 % for testing.
-    fn add_by_time(&mut self, dataset: &Dataset) {
-        let frame_count = dataset.info().frame_count;
-        let (validation, test) = (frame_count * 8 / 10, frame_count * 9 / 10);
-        for (split, part) in [
-            (Split::Train, 0..validation),
-            (Split::Validation, validation..test),
-            (Split::Test, test..frame_count),
-        ] {
-            for episode in dataset.episodes() {
-                let frames = episode.frames();
-                let frames = frames.start.max(part.start)..frames.end.min(part.end);
-                if !frames.is_empty() {
-                    self.add(dataset, split, episode.index, &frames);
+        for (split, EpisodeSegment { episode, frames }) in parts {
+            splits.episodes[split as usize].push(episode);
+            let mut start = frames.start;
+            for frame in frames.start + 1..=frames.end {
+                if frame == frames.end || splits.is_gap(dataset, frame) {
+                    let frames = start..frame;
+                    splits.segments[split as usize].push(EpisodeSegment { episode, frames });
+                    start = frame;
                 }
             }
         }
-    }
-
-    fn add(&mut self, dataset: &Dataset, split: Split, episode: usize, frames: &Range<usize>) {
-        self.episodes[split as usize].push(episode);
-        let mut start = frames.start;
-        for frame in frames.start + 1..=frames.end {
-            if frame == frames.end || self.is_gap(dataset, frame) {
-                self.segments[split as usize].push(EpisodeSegment {
-                    episode,
-                    frames: start..frame,
-                });
-                start = frame;
-            }
-        }
+        splits
     }
 
     /// Whether there is a gap between the previous frame and this one.
@@ -227,7 +179,7 @@ impl Splits {
 
     /// Every `stride`-th window of a split, in order; no windows if the split is empty. No window crosses an episode's end or
     /// a gap. If recordings are split by time, the first windows after a boundary are skipped, so that splits do not overlap.
-    /// Errors: `Zero` for a stride, context or horizon of 0, `WindowTooLong` if no segment of the split is long enough.
+    /// Errors: `Usage` for a stride, context or horizon of 0, `WindowTooLong` if no segment of the split is long enough.
     pub fn windows(
         &self,
         dataset: &Dataset,
@@ -235,15 +187,11 @@ impl Splits {
         shape: WindowShape,
         stride: usize,
     ) -> Result<Vec<Window>, DatasetError> {
-        for (what, value) in [
-            ("the stride of windows", stride),
-            ("the context", shape.context),
-            ("the horizon", shape.horizon),
-        ] {
-            if value == 0 {
-                return Err(DatasetError::Zero { what });
-            }
-        }
+        check_counts(&[
+            ("the stride of windows", stride as u64),
+            ("the context", shape.context as u64),
+            ("the horizon", shape.horizon as u64),
+        ])?;
         let mut windows = Vec::new();
         let mut longest = 0;
         for segment in &self.segments[split as usize] {
@@ -258,7 +206,6 @@ impl Splits {
         }
         if windows.is_empty() && !self.segments[split as usize].is_empty() {
             return Err(DatasetError::WindowTooLong {
-                window: shape.frames(),
                 context: shape.context,
                 horizon: shape.horizon,
                 split: split.name(),
@@ -269,7 +216,7 @@ impl Splits {
     }
 
     /// `count` different windows of a split, drawn at random, in random order.
-    /// Errors: as [`Splits::windows`]; `TooFewWindows` if the split has fewer windows.
+    /// Errors: as [`Splits::windows`]; `Usage` if the split has fewer windows.
     #[expect(clippy::too_many_arguments, reason = "the draw depends on all five")]
     pub fn sample(
         &self,
@@ -281,15 +228,56 @@ impl Splits {
     ) -> Result<Vec<Window>, DatasetError> {
         let windows = self.windows(dataset, split, shape, 1)?;
         if count > windows.len() {
-            return Err(DatasetError::TooFewWindows {
-                requested: count,
-                split: split.name(),
-                available: windows.len(),
-            });
+            return Err(DatasetError::Usage(format!(
+                "data.windows is {count}, but the {split} split has only {} windows; use a smaller number, use \
+                 data.windows=all, or collect more trials",
+                windows.len()
+            )));
         }
         let chosen = index::sample(&mut seed.derive("windows", 0).rng(), windows.len(), count);
         Ok(chosen.iter().map(|index| windows[index]).collect())
     }
+}
+
+/// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
+/// them, with at least a tenth, for validation; the others for training.
+fn whole_episodes(dataset: &Dataset) -> Vec<(Split, EpisodeSegment)> {
+    let tenth = dataset.info().frame_count.div_ceil(10);
+    let (mut test, mut validation) = (0, 0);
+    let backwards = dataset.episodes().iter().rev().map(|episode| {
+        let split = if test < tenth {
+            test += episode.frame_count;
+            Split::Test
+        } else if validation < tenth {
+            validation += episode.frame_count;
+            Split::Validation
+        } else {
+            Split::Train
+        };
+        (split, EpisodeSegment::whole(episode))
+    });
+    let mut parts: Vec<_> = backwards.collect();
+    parts.reverse();
+    parts
+}
+
+/// Splits all frames by time: the first 80 % for training, the next 10 % for validation, the last 10 % for testing.
+fn by_time(dataset: &Dataset) -> impl Iterator<Item = (Split, EpisodeSegment)> {
+    let frame_count = dataset.info().frame_count;
+    let (validation, test) = (frame_count * 8 / 10, frame_count * 9 / 10);
+    let parts = [
+        (Split::Train, 0..validation),
+        (Split::Validation, validation..test),
+        (Split::Test, test..frame_count),
+    ];
+    parts.into_iter().flat_map(|(split, part)| {
+        let segments = dataset.episodes().iter().map(move |whole| EpisodeSegment {
+            episode: whole.index,
+            frames: whole.frames().start.max(part.start)..whole.frames().end.min(part.end),
+        });
+        let segments = segments.filter(|segment| !segment.frames.is_empty());
+        segments.map(move |segment| (split, segment))
+    })
 }
 
 /// The split of a trial. In each block of ten trials, one is for validation and one for testing, drawn from seed and block.
@@ -306,15 +294,13 @@ fn split_of(split_seed: Seed, trial: u64) -> Split {
 
 /// The median time step within episodes, in seconds; the frame period of the description if no episode has two frames.
 fn median_period_s(dataset: &Dataset) -> f64 {
-    let mut steps: Vec<f64> = dataset
-        .episodes()
-        .iter()
-        .flat_map(|episode| episode.frames().skip(1))
-        .map(|frame| dataset.timestamp_s(frame) - dataset.timestamp_s(frame - 1))
-        .collect();
-    if steps.is_empty() {
-        return dataset.info().frame_period_s;
-    }
-    let middle = steps.len() / 2;
-    *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+    let frames = dataset.episodes().iter().flat_map(|episode| episode.frames().skip(1));
+    let steps = frames.map(|frame| dataset.timestamp_s(frame) - dataset.timestamp_s(frame - 1));
+    median(&mut steps.collect::<Vec<f64>>()).unwrap_or(dataset.info().frame_period_s)
+}
+
+/// The median, if there are values.
+pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

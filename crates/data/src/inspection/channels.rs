@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::charts::number;
 use super::histogram::Histogram;
+use super::numbers::number;
 use crate::dataset::Dataset;
 use foreframe_core::types::Channel;
 
@@ -25,10 +25,7 @@ pub enum ChannelRole {
 
 impl std::fmt::Display for ChannelRole {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Action => "action",
-            Self::State => "state",
-        })
+        self.serialize(f)
     }
 }
 
@@ -59,23 +56,25 @@ pub struct ChannelSummary {
 
 pub(super) fn of(dataset: &Dataset) -> Vec<ChannelSummary> {
     let info = dataset.info();
-    let actions = info.action_channels.iter().enumerate().map(|(component, channel)| {
-        let value = move |frame: usize| f64::from(dataset.action(frame)[component]);
-        summary(ChannelRole::Action, channel, (0..info.frame_count).map(value))
+    let groups: [(ChannelRole, &[Channel], fn(&Dataset, usize) -> &[f32]); 2] = [
+        (ChannelRole::Action, &info.action_channels, Dataset::action),
+        (ChannelRole::State, &info.state_channels, Dataset::state),
+    ];
+    let summaries = groups.into_iter().flat_map(|(role, channels, of_frame)| {
+        channels.iter().enumerate().map(move |(component, channel)| {
+            let values = (0..info.frame_count).map(|frame| f64::from(of_frame(dataset, frame)[component]));
+            summary(role, channel, values.collect())
+        })
     });
-    let states = info.state_channels.iter().enumerate().map(|(component, channel)| {
-        let value = move |frame: usize| f64::from(dataset.state(frame)[component]);
-        summary(ChannelRole::State, channel, (0..info.frame_count).map(value))
-    });
-    actions.chain(states).collect()
+    summaries.collect()
 }
 
-fn summary(role: ChannelRole, channel: &Channel, values: impl Iterator<Item = f64> + Clone) -> ChannelSummary {
-    let count = values.clone().count().max(1) as f64;
-    let mean = values.clone().sum::<f64>() / count;
-    let variance = values.clone().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
-    let histogram = Histogram::of(values.clone(), BINS);
-    let (commonest, frames) = commonest(values.collect());
+fn summary(role: ChannelRole, channel: &Channel, mut values: Vec<f64>) -> ChannelSummary {
+    let count = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
+    let histogram = Histogram::of(values.iter().copied(), BINS);
+    let (commonest, frames) = commonest(&mut values);
     ChannelSummary {
         role,
         name: channel.name.clone(),
@@ -91,7 +90,7 @@ fn summary(role: ChannelRole, channel: &Channel, values: impl Iterator<Item = f6
 }
 
 /// The value that occurs most often, and how often.
-fn commonest(mut values: Vec<f64>) -> (f64, usize) {
+fn commonest(values: &mut [f64]) -> (f64, usize) {
     values.sort_unstable_by(f64::total_cmp);
     let runs = values.chunk_by(|a, b| a == b);
     let longest = runs.max_by_key(|run| run.len());

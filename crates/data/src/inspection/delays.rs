@@ -7,8 +7,10 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::places::{FramePlace, places};
 use crate::dataset::{Dataset, DatasetError};
 use crate::motion::phase_correlation;
+use foreframe_core::types::Channel;
 
 /// The longest delay that is looked for, in seconds and in frames.
 const MAX_DELAY_S: f64 = 2.0;
@@ -75,83 +77,57 @@ pub struct LagCorrelation {
     pub correlation: f64,
 }
 
-/// The motion from every frame to the next; the last frame of an episode has none.
-struct ImageMotion {
-    sideways: Vec<f64>,
-    vertical: Vec<f64>,
-    change: Vec<f64>,
-}
-
 pub(super) fn of(dataset: &Dataset) -> Result<Vec<ActionDelay>, DatasetError> {
     let info = dataset.info();
     if info.action_channels.is_empty() {
         return Ok(Vec::new());
     }
-    let motion = motion(dataset)?;
+    let signals = motion(dataset)?;
     let least = LEAST_CORRELATION.max(CHANCE_CORRELATION / (info.frame_count as f64).sqrt());
     let most = (MAX_DELAY_S / info.frame_period_s).round() as i64;
     let most = most.clamp(*FRAMES_LOOKED_AT.start(), *FRAMES_LOOKED_AT.end());
-    let signals = [
-        (MotionSignal::Sideways, &motion.sideways),
-        (MotionSignal::Vertical, &motion.vertical),
-        (MotionSignal::Change, &motion.change),
-    ];
-    let channels = info.action_channels.iter().enumerate();
-    let delays = channels
-        .filter_map(|(component, channel)| {
-            let candidates = signals.into_iter().map(|(signal, values)| {
-                let lags = (-most..=most).map(|lag| LagCorrelation {
-                    lag_frames: lag,
-                    correlation: correlation(dataset, component, values, lag),
-                });
-                delay(&channel.name, signal, lags.collect())
+    let strongest = |(component, channel): (usize, &Channel)| {
+        let candidates = signals.iter().map(|(signal, values)| {
+            let lags = (-most..=most).map(|lag_frames| LagCorrelation {
+                lag_frames,
+                correlation: correlation(dataset, component, values, lag_frames),
             });
-            candidates.max_by(|a, b| a.weight().total_cmp(&b.weight()))
-        })
-        .map(|delay| ActionDelay {
-            delay_frames: delay.delay_frames.filter(|_| delay.correlation.abs() >= least),
-            ..delay
+            delay(&channel.name, *signal, lags.collect())
         });
-    Ok(delays.collect())
+        let mut strongest = candidates.max_by(|a, b| a.weight().total_cmp(&b.weight()))?;
+        strongest.delay_frames = strongest.delay_frames.filter(|_| strongest.correlation.abs() >= least);
+        Some(strongest)
+    };
+    Ok(info.action_channels.iter().enumerate().filter_map(strongest).collect())
 }
 
-fn motion(dataset: &Dataset) -> Result<ImageMotion, DatasetError> {
-    let (info, last) = (dataset.info(), last_frames(dataset));
-    let width = info.frame_width_px as usize;
-    let between = (0..info.frame_count)
+/// The motion from every frame to the next; the last frame of an episode has none.
+fn motion(dataset: &Dataset) -> Result<[(MotionSignal, Vec<f64>); 3], DatasetError> {
+    let width = dataset.info().frame_width_px as usize;
+    let places: Vec<FramePlace> = places(dataset).collect();
+    let is_last = |frame: usize| places.get(frame + 1).is_none_or(|next| next.frame == 0);
+    let between = (0..places.len())
         .into_par_iter()
         .map(|frame| {
-            if last[frame] {
-                return Ok((0.0, 0.0, 0.0));
+            if is_last(frame) {
+                return Ok([0.0; 3]);
             }
-            let (before, after) = (dataset.pixels(frame)?, dataset.pixels(frame + 1)?);
-            let floats = |pixels: &[u8]| -> Vec<f32> { pixels.iter().map(|&pixel| f32::from(pixel)).collect() };
-            let (before, after) = (floats(&before), floats(&after));
+            let floats = |frame| -> Result<Vec<f32>, DatasetError> {
+                Ok(dataset.pixels(frame)?.iter().map(|&pixel| f32::from(pixel)).collect())
+            };
+            let (before, after) = (floats(frame)?, floats(frame + 1)?);
             let shift = phase_correlation(&before, &after, width);
             let change: f32 = before.iter().zip(&after).map(|(a, b)| (a - b).abs()).sum();
-            Ok((
-                f64::from(shift.x_px),
-                f64::from(shift.y_px),
-                f64::from(change) / before.len() as f64,
-            ))
+            let change = f64::from(change) / before.len() as f64;
+            Ok([f64::from(shift.x_px), f64::from(shift.y_px), change])
         })
-        .collect::<Result<Vec<(f64, f64, f64)>, DatasetError>>()?;
-    Ok(ImageMotion {
-        sideways: without_outliers(between.iter().map(|motion| motion.0).collect()),
-        vertical: without_outliers(between.iter().map(|motion| motion.1).collect()),
-        change: between.iter().map(|motion| motion.2).collect(),
-    })
-}
-
-/// Whether a frame is the last one of its episode.
-fn last_frames(dataset: &Dataset) -> Vec<bool> {
-    let mut last = vec![false; dataset.info().frame_count];
-    for episode in dataset.episodes() {
-        if let Some(flag) = episode.frames().last().and_then(|frame| last.get_mut(frame)) {
-            *flag = true;
-        }
-    }
-    last
+        .collect::<Result<Vec<[f64; 3]>, DatasetError>>()?;
+    let part = |part: usize| between.iter().map(|motion| motion[part]).collect();
+    Ok([
+        (MotionSignal::Sideways, without_outliers(part(0))),
+        (MotionSignal::Vertical, without_outliers(part(1))),
+        (MotionSignal::Change, part(2)),
+    ])
 }
 
 /// The values, limited to a few times the size that nine of ten do not exceed.
@@ -190,35 +166,26 @@ fn correlation(dataset: &Dataset, component: usize, motion: &[f64], lag: i64) ->
 }
 
 fn delay(action: &str, motion: MotionSignal, lags: Vec<LagCorrelation>) -> ActionDelay {
-    let at = |place: Option<usize>| {
-        place
-            .and_then(|place| lags.get(place))
-            .map_or(0.0, |lag| lag.correlation)
-    };
-    let size = |place: usize| at(Some(place)).abs();
+    let size = |place: usize| lags[place].correlation.abs();
     let peak = (0..lags.len()).max_by(|&a, &b| size(a).total_cmp(&size(b)));
-    let correlation = at(peak);
     let delay_frames = peak.map(|peak| {
-        let inner = peak > 0 && peak + 1 < lags.len();
-        let (before, after) = if inner {
-            (size(peak - 1), size(peak + 1))
-        } else {
-            (0.0, 0.0)
-        };
-        let curvature = before - 2.0 * size(peak) + after;
-        let fraction = if inner && curvature < -1e-12 {
-            (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
-        } else {
-            0.0
-        };
+        let mut fraction = 0.0;
+        if peak > 0 && peak + 1 < lags.len() {
+            let (before, after) = (size(peak - 1), size(peak + 1));
+            let curvature = before - 2.0 * size(peak) + after;
+            if curvature < -1e-12 {
+                fraction = (0.5 * (before - after) / curvature).clamp(-0.5, 0.5);
+            }
+        }
         lags[peak].lag_frames as f64 + fraction
     });
+    let at_zero = lags.iter().find(|lag| lag.lag_frames == 0);
     ActionDelay {
         action: action.to_owned(),
         motion,
         delay_frames,
-        correlation,
-        correlation_without_lag: at(lags.iter().position(|lag| lag.lag_frames == 0)),
+        correlation: peak.map_or(0.0, |peak| lags[peak].correlation),
+        correlation_without_lag: at_zero.map_or(0.0, |lag| lag.correlation),
         lags,
     }
 }

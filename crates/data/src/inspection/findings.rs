@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::channels::{self, ChannelSummary};
 use super::delays::{self, ActionDelay};
 use super::images::{self, ImageSummary};
-use super::places::{FramePlace, place_of};
+use super::places::{FramePlace, places};
 use super::timing::{self, FrameTiming};
 use crate::dataset::{Dataset, DatasetError};
 
@@ -75,9 +75,9 @@ pub fn inspect(dataset: &Dataset) -> Result<Inspection, DatasetError> {
 }
 
 fn contact_sheet(dataset: &Dataset) -> Vec<FramePlace> {
-    let frames = dataset.info().frame_count;
-    let count = CONTACT_FRAMES.min(frames);
+    let places: Vec<FramePlace> = places(dataset).collect();
+    let count = CONTACT_FRAMES.min(places.len());
     // The middles of equal parts.
-    let chosen = (0..count).map(|index| (2 * index + 1) * frames / (2 * count));
-    chosen.filter_map(|frame| place_of(dataset, frame)).collect()
+    let chosen = (0..count).map(|index| (2 * index + 1) * places.len() / (2 * count));
+    chosen.map(|frame| places[frame]).collect()
 }

@@ -1,4 +1,4 @@
-//! Values counted in ranges, and their median.
+//! Values counted in ranges.
 
 use serde::Serialize;
 
@@ -27,15 +27,6 @@ impl Histogram {
         }
         Self { from, to, counts }
     }
-}
-
-/// The median; 0 if there is no value.
-pub(super) fn median(values: &mut [f64]) -> f64 {
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        return 0.0;
-    }
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 #[cfg(test)]

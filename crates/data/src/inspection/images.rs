@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::histogram::median;
-use super::places::{FramePlace, counted, listed};
+use super::places::{FramePlace, counted, listed, places};
 use super::timing::FrameTiming;
+use crate::dataset::sampler::median;
 use crate::dataset::{Dataset, DatasetError};
 
 /// The largest difference of two pixels, in gray levels, that counts as equal.
@@ -83,6 +83,13 @@ struct FrameChange {
     step: Option<LevelStep>,
 }
 
+impl FrameChange {
+    /// Whether the frame equals the one before.
+    fn is_repeated(&self) -> bool {
+        self.step.as_ref().is_some_and(|step| step.is_equal)
+    }
+}
+
 struct LevelStep {
     before: f64,
     mean_change: f64,
@@ -91,35 +98,24 @@ struct LevelStep {
 }
 
 pub(super) fn of(dataset: &Dataset) -> Result<ImageSummary, DatasetError> {
-    let changes = dataset
-        .episodes()
-        .par_iter()
-        .flat_map_iter(|episode| {
-            episode.frames().enumerate().map(move |(frame, index)| {
-                let place = FramePlace {
-                    episode: episode.index,
-                    frame,
-                };
-                change(dataset, place, index)
-            })
-        })
-        .collect::<Result<Vec<FrameChange>, DatasetError>>()?;
+    let places: Vec<FramePlace> = places(dataset).collect();
+    let changes = places.into_par_iter().enumerate();
+    let changes: Result<Vec<_>, _> = changes.map(|(index, place)| change(dataset, place, index)).collect();
+    let changes = changes?;
     let histogram = level_histogram(dataset)?;
     let pixels = histogram.iter().sum::<u64>().max(1) as f64;
-    let share = |level: usize| histogram.get(level).copied().unwrap_or_default() as f64 / pixels;
     let steps: Vec<&LevelStep> = changes.iter().filter_map(|change| change.step.as_ref()).collect();
     let total_change: f64 = steps.iter().map(|step| step.mean_change).sum();
-    let is_equal = |change: &&FrameChange| change.step.as_ref().is_some_and(|step| step.is_equal);
+    let total_level: f64 = changes.iter().map(|change| change.level).sum();
+    let ranges = histogram.chunks(256 / LEVEL_BINS);
+    let repeated = changes.iter().filter(|change| change.is_repeated());
     Ok(ImageSummary {
-        mean_level: changes.iter().map(|change| change.level).sum::<f64>() / changes.len().max(1) as f64,
-        black_share: share(0),
-        white_share: share(255),
-        level_counts: histogram
-            .chunks(256 / LEVEL_BINS)
-            .map(|part| part.iter().sum())
-            .collect(),
+        mean_level: total_level / changes.len().max(1) as f64,
+        black_share: histogram[0] as f64 / pixels,
+        white_share: histogram[255] as f64 / pixels,
+        level_counts: ranges.map(|range| range.iter().sum()).collect(),
         mean_change: total_change / steps.len().max(1) as f64,
-        repeated_frames: changes.iter().filter(is_equal).map(|change| change.place).collect(),
+        repeated_frames: repeated.map(|change| change.place).collect(),
         frozen: frozen(&changes),
         exposure_jumps: jumps(&changes),
         timeline: timeline(&changes),
@@ -129,8 +125,15 @@ pub(super) fn of(dataset: &Dataset) -> Result<ImageSummary, DatasetError> {
 fn change(dataset: &Dataset, place: FramePlace, index: usize) -> Result<FrameChange, DatasetError> {
     let now = dataset.pixels(index)?;
     let before = (place.frame > 0).then(|| dataset.pixels(index - 1)).transpose()?;
-    let level = mean(&now);
-    let step = before.as_deref().map(|before| {
+    Ok(FrameChange {
+        place,
+        level: mean(&now),
+        step: before.map(|before| LevelStep::between(&before, &now)),
+    })
+}
+
+impl LevelStep {
+    fn between(before: &[u8], now: &[u8]) -> Self {
         let (mut total, mut brighter, mut darker) = (0u64, 0usize, 0usize);
         for (&now, &before) in now.iter().zip(before) {
             let difference = i16::from(now) - i16::from(before);
@@ -138,17 +141,17 @@ fn change(dataset: &Dataset, place: FramePlace, index: usize) -> Result<FrameCha
             brighter += usize::from(difference > CHANGED_LEVELS);
             darker += usize::from(difference < -CHANGED_LEVELS);
         }
-        let share = |count: usize| count as f64 / now.len().max(1) as f64;
-        LevelStep {
+        let pixels = now.len().max(1) as f64;
+        let share = |count: usize| count as f64 / pixels;
+        Self {
             before: mean(before),
-            mean_change: total as f64 / now.len().max(1) as f64,
+            mean_change: total as f64 / pixels,
             is_equal: now.iter().zip(before).all(|(a, b)| a.abs_diff(*b) <= EQUAL_LEVELS),
             is_one_way: share(brighter.max(darker)) >= SAME_SHARE
                 && share(brighter.min(darker)) <= OPPOSITE_SHARE
-                && correlation(before, &now) >= SAME_VIEW,
+                && correlation(before, now) >= SAME_VIEW,
         }
-    });
-    Ok(FrameChange { place, level, step })
+    }
 }
 
 fn mean(pixels: &[u8]) -> f64 {
@@ -170,8 +173,8 @@ fn correlation(a: &[u8], b: &[u8]) -> f64 {
     if scale < 1e-9 { 0.0 } else { product / scale }
 }
 
-fn level_histogram(dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
-    let mut histogram = vec![0; 256];
+fn level_histogram(dataset: &Dataset) -> Result<[u64; 256], DatasetError> {
+    let mut histogram = [0; 256];
     for frame in 0..dataset.info().frame_count {
         for &pixel in &*dataset.pixels(frame)? {
             histogram[usize::from(pixel)] += 1;
@@ -182,7 +185,7 @@ fn level_histogram(dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
 
 fn frozen(changes: &[FrameChange]) -> Vec<FrozenSpan> {
     // A frame belongs to the run of the frame before if both are equal.
-    let runs = changes.chunk_by(|_, now| now.step.as_ref().is_some_and(|step| step.is_equal));
+    let runs = changes.chunk_by(|_, now| now.is_repeated());
     let long = runs.filter(|run| run.len() >= FROZEN_FRAMES);
     long.map(|run| FrozenSpan {
         first: run[0].place,
@@ -192,21 +195,16 @@ fn frozen(changes: &[FrameChange]) -> Vec<FrozenSpan> {
 }
 
 fn jumps(changes: &[FrameChange]) -> Vec<ExposureJump> {
-    let with_step = || {
-        changes
-            .iter()
-            .filter_map(|change| Some((change, change.step.as_ref()?)))
+    let steps = || changes.iter().filter_map(|now| Some((now, now.step.as_ref()?)));
+    let jump = |(now, step): (&FrameChange, &LevelStep)| ExposureJump {
+        place: now.place,
+        from_level: step.before,
+        to_level: now.level,
     };
-    let mut usual: Vec<f64> = with_step().map(|(now, step)| (now.level - step.before).abs()).collect();
-    let least = JUMP_LEVELS.max(JUMP_FACTOR * median(&mut usual));
-    with_step()
-        .filter(|(now, step)| step.is_one_way && (now.level - step.before).abs() >= least)
-        .map(|(now, step)| ExposureJump {
-            place: now.place,
-            from_level: step.before,
-            to_level: now.level,
-        })
-        .collect()
+    let mut usual: Vec<f64> = steps().map(jump).map(|jump| jump.size()).collect();
+    let least = JUMP_LEVELS.max(JUMP_FACTOR * median(&mut usual).unwrap_or_default());
+    let one_way = steps().filter(|(_, step)| step.is_one_way).map(jump);
+    one_way.filter(|jump| jump.size() >= least).collect()
 }
 
 fn timeline(changes: &[FrameChange]) -> Vec<[f64; 2]> {
@@ -237,13 +235,10 @@ impl ImageSummary {
         let single = self.repeated_frames.len().saturating_sub(in_frozen);
         if single > 0 {
             warnings.push(format!(
-                "{} the frame before without being part of a longer standstill. The recorder probably runs faster than the \
-                 camera; import with the camera's --rate.",
-                if single == 1 {
-                    "1 frame repeats".to_owned()
-                } else {
-                    format!("{single} frames repeat")
-                }
+                "{} {} the frame before without being part of a longer standstill. The recorder probably runs faster than \
+                 the camera; import with the camera's --rate.",
+                counted(single, "frame"),
+                if single == 1 { "repeats" } else { "repeat" }
             ));
         }
         if let Some(worst) = self.exposure_jumps.iter().max_by(|a, b| a.size().total_cmp(&b.size())) {

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::dataset::{Dataset, Episode};
+use crate::dataset::Dataset;
 
 /// Where a frame is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -13,31 +13,33 @@ pub struct FramePlace {
     pub frame: usize,
 }
 
-/// The place of a frame that is counted over the whole data set.
-pub(super) fn place_of(dataset: &Dataset, frame: usize) -> Option<FramePlace> {
-    let holds_it = |episode: &&Episode| episode.frames().contains(&frame);
-    let episode = dataset.episodes().iter().find(holds_it)?;
-    Some(FramePlace {
-        episode: episode.index,
-        frame: frame - episode.first_frame,
+impl FramePlace {
+    /// The frame before it in the episode; the first one itself.
+    pub(super) fn before(self) -> Self {
+        let frame = self.frame.saturating_sub(1);
+        Self { frame, ..self }
+    }
+}
+
+/// The places of all frames in their order.
+pub(super) fn places(dataset: &Dataset) -> impl Iterator<Item = FramePlace> {
+    dataset.episodes().iter().flat_map(|episode| {
+        (0..episode.frame_count).map(|frame| FramePlace {
+            episode: episode.index,
+            frame,
+        })
     })
 }
 
 /// The first places, as in `episode 0 frame 12, episode 3 frame 7 and 4 more`.
 pub(super) fn listed(places: &[FramePlace]) -> String {
     const NAMED: usize = 3;
-    let names: Vec<String> = places
-        .iter()
-        .take(NAMED)
-        .map(|place| format!("episode {} frame {}", place.episode, place.frame))
-        .collect();
-    let more = places.len().saturating_sub(NAMED);
-    let rest = if more == 0 {
-        String::new()
-    } else {
-        format!(" and {more} more")
-    };
-    names.join(", ") + &rest
+    let name = |place: &FramePlace| format!("episode {} frame {}", place.episode, place.frame);
+    let names = places.iter().take(NAMED).map(name).collect::<Vec<_>>().join(", ");
+    match places.len().saturating_sub(NAMED) {
+        0 => names,
+        more => format!("{names} and {more} more"),
+    }
 }
 
 /// A count with its noun, as in `1 frame` or `3 frames`.

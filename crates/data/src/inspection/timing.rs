@@ -2,9 +2,10 @@
 
 use serde::Serialize;
 
-use super::histogram::{Histogram, median};
-use super::places::{FramePlace, counted, listed};
+use super::histogram::Histogram;
+use super::places::{FramePlace, counted, listed, places};
 use crate::dataset::Dataset;
+use crate::dataset::sampler::median;
 
 /// A step longer than this many median steps is a gap.
 const GAP_STEPS: f64 = 3.0;
@@ -49,12 +50,12 @@ pub struct FrameTiming {
     pub step_ms_histogram: Histogram,
 }
 
-/// A gap in time within an episode.
+/// A step in time within an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct TimeGap {
-    /// The frame before the gap.
+    /// The frame before it.
     pub before: FramePlace,
-    /// How long it is, in seconds.
+    /// How long it takes, in seconds.
     pub seconds: f64,
 }
 
@@ -62,15 +63,12 @@ pub(super) fn of(dataset: &Dataset) -> FrameTiming {
     let mut lengths: Vec<usize> = dataset.episodes().iter().map(|episode| episode.frame_count).collect();
     lengths.sort_unstable();
     let length = |place: usize| lengths.get(place).copied().unwrap_or_default();
-    let steps: Vec<(FramePlace, f64)> = steps(dataset);
-    let mut seconds: Vec<f64> = steps.iter().map(|(_, step_s)| *step_s).collect();
+    let steps = steps(dataset);
+    let mut seconds: Vec<f64> = steps.iter().map(|step| step.seconds).collect();
     let total_s = seconds.iter().sum();
-    let median_step_s = median(&mut seconds);
-    let gap = |&(before, seconds): &(FramePlace, f64)| {
-        (seconds > GAP_STEPS * median_step_s).then_some(TimeGap { before, seconds })
-    };
+    let median_step_s = median(&mut seconds).unwrap_or_default();
+    let is_gap = |step: &&TimeGap| step.seconds > GAP_STEPS * median_step_s;
     let is_irregular = |step_s: &&f64| (*step_s - median_step_s).abs() > IRREGULAR_SHARE * median_step_s;
-    let or_zero = |value: f64| if value.is_finite() { value } else { 0.0 };
     FrameTiming {
         frame_period_s: dataset.info().frame_period_s,
         total_s,
@@ -78,29 +76,24 @@ pub(super) fn of(dataset: &Dataset) -> FrameTiming {
         median_episode_frames: length(lengths.len() / 2),
         longest_episode_frames: length(lengths.len().saturating_sub(1)),
         short_episodes: lengths.iter().filter(|&&frames| frames < WINDOW_FRAMES).count(),
-        shortest_step_s: or_zero(seconds.iter().copied().fold(f64::INFINITY, f64::min)),
+        shortest_step_s: seconds.iter().copied().reduce(f64::min).unwrap_or_default(),
         median_step_s,
-        longest_step_s: or_zero(seconds.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+        longest_step_s: seconds.iter().copied().reduce(f64::max).unwrap_or_default(),
         irregular_steps: seconds.iter().filter(is_irregular).count(),
         steps: steps.len(),
-        gaps: steps.iter().filter_map(gap).collect(),
+        gaps: steps.iter().filter(is_gap).copied().collect(),
         step_ms_histogram: Histogram::of(seconds.iter().map(|step_s| step_s * 1e3), STEP_BINS),
     }
 }
 
-/// Every step from one frame to the next, with the frame before it.
-fn steps(dataset: &Dataset) -> Vec<(FramePlace, f64)> {
-    let mut steps = Vec::with_capacity(dataset.info().frame_count);
-    for episode in dataset.episodes() {
-        for (frame, index) in episode.frames().skip(1).enumerate() {
-            let place = FramePlace {
-                episode: episode.index,
-                frame,
-            };
-            steps.push((place, dataset.timestamp_s(index) - dataset.timestamp_s(index - 1)));
-        }
-    }
-    steps
+/// Every step from one frame to the next.
+fn steps(dataset: &Dataset) -> Vec<TimeGap> {
+    let frames = places(dataset).enumerate().filter(|(_, place)| place.frame > 0);
+    let steps = frames.map(|(index, place)| TimeGap {
+        before: place.before(),
+        seconds: dataset.timestamp_s(index) - dataset.timestamp_s(index - 1),
+    });
+    steps.collect()
 }
 
 impl FrameTiming {

@@ -3,15 +3,18 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use crate::dataset::error::DatasetError;
+use serde::Serialize;
+
+use crate::dataset::check::check_counts;
+use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::types::Seed;
-use foreframe_sim::{Scenario, WorldConfig};
+use foreframe_sim::{Scenario, WorldConfig, action_channels, state_channels};
 
 /// Default number of trials in a shard.
 pub const DEFAULT_TRIALS_PER_SHARD: u64 = 50;
 
-/// Settings of a collection.
-#[derive(Clone, Debug, PartialEq)]
+/// Settings of a collection. Those that determine its bytes are written to its directory, in this order.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CollectConfig {
     /// The scenario.
     pub scenario: Scenario,
@@ -19,14 +22,16 @@ pub struct CollectConfig {
     pub trials: u64,
     /// The seed from which the seed of every trial is derived.
     pub seed: Seed,
-    /// The data set's directory.
-    pub out: PathBuf,
-    /// Settings of the simulated world.
-    pub world: WorldConfig,
-    /// Number of simulation threads; 0 for the number of cores.
-    pub threads: usize,
     /// Number of trials in a shard.
     pub trials_per_shard: u64,
+    /// Settings of the simulated world.
+    pub world: WorldConfig,
+    /// The data set's directory.
+    #[serde(skip)]
+    pub out: PathBuf,
+    /// Number of simulation threads; 0 for the number of cores.
+    #[serde(skip)]
+    pub threads: usize,
 }
 
 impl CollectConfig {
@@ -44,35 +49,71 @@ impl CollectConfig {
         }
     }
 
-    /// Checks the settings. Errors: `Zero`, `World`.
+    /// Checks the settings. Errors: `Usage`, `World`.
     pub fn validate(&self) -> Result<(), DatasetError> {
-        for (what, value) in [
+        check_counts(&[
             ("the number of trials", self.trials),
             ("the number of trials in a shard", self.trials_per_shard),
-        ] {
-            if value == 0 {
-                return Err(DatasetError::Zero { what });
-            }
-        }
+        ])?;
         self.world.validate().map_err(DatasetError::World)
     }
 
-    /// Number of shards.
-    pub(crate) fn shard_count(&self) -> usize {
-        self.trials.div_ceil(self.trials_per_shard) as usize
+    /// The trials of each shard.
+    pub(super) fn shards(&self) -> ShardTrials {
+        ShardTrials {
+            trials: self.trials,
+            per_shard: self.trials_per_shard,
+        }
     }
 
-    /// The trials of a shard.
-    pub(crate) fn shard_trials(&self, shard: usize) -> Range<u64> {
-        let first = shard as u64 * self.trials_per_shard;
-        first..(first + self.trials_per_shard).min(self.trials)
-    }
-
-    pub(crate) fn thread_count(&self) -> usize {
+    pub(super) fn thread_count(&self) -> usize {
         match self.threads {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
         }
+    }
+
+    /// The description of the data set, without counts and hash.
+    pub(super) fn info(&self) -> DatasetInfo {
+        DatasetInfo {
+            name: format!("{}-{}-seed-{}", self.scenario, self.trials, self.seed.0),
+            frame_width_px: self.world.frame_width_px,
+            frame_height_px: self.world.frame_height_px,
+            frame_period_s: self.world.frame_period_s,
+            action_channels: action_channels(),
+            state_channels: state_channels(),
+            scenario: Some(self.scenario.to_string()),
+            seed: Some(self.seed),
+            has_masks: true,
+            camera: Some(self.world.camera.model()),
+            world: Some(self.world.clone()),
+            ..DatasetInfo::default()
+        }
+    }
+}
+
+/// How the trials of a collection are divided among shards.
+#[derive(Clone, Copy)]
+pub(super) struct ShardTrials {
+    pub(super) trials: u64,
+    pub(super) per_shard: u64,
+}
+
+impl ShardTrials {
+    /// Number of shards.
+    pub(super) fn count(self) -> usize {
+        self.trials.div_ceil(self.per_shard) as usize
+    }
+
+    /// The trials of a shard.
+    pub(super) fn of(self, shard: usize) -> Range<u64> {
+        let first = shard as u64 * self.per_shard;
+        first..(first + self.per_shard).min(self.trials)
+    }
+
+    /// Number of trials of a shard.
+    pub(super) fn count_of(self, shard: usize) -> usize {
+        self.of(shard).count()
     }
 }
 

@@ -31,83 +31,63 @@ const PART: usize = 10;
 /// A digit's intensities, row by row, 0 for black.
 pub(crate) type DigitImage = [u8; DIGIT_PIXELS];
 
-/// Digits for each split. No digit is in two of them.
-pub(crate) struct DigitPools {
-    train: Vec<DigitImage>,
-    validation: Vec<DigitImage>,
-    test: Vec<DigitImage>,
-}
+/// Digits for training, validation and test. No digit is in two of them.
+pub(crate) struct DigitPools([Vec<DigitImage>; 3]);
 
 impl DigitPools {
     /// Reads digits from an IDX file, a folder with MNIST's two IDX files, a folder of PNG images, or one with folders
     /// `train` and `test` of them. Of files for training and test, a tenth of those for training is for validation; of a
-    /// single file or folder, a tenth each is for validation and test. Errors: `Io`, `Digits`.
+    /// single file or folder, a tenth each is for validation and test. Errors: `Io`, `Invalid`.
     pub(crate) fn read(path: &Path) -> Result<Self, DatasetError> {
         let found = |names: &[&str]| names.iter().map(|name| path.join(name)).find(|file| file.exists());
         let parts = found(&TRAIN_FILES)
             .zip(found(&TEST_FILES))
             .or_else(|| found(&[TRAIN_FOLDER]).zip(found(&[TEST_FOLDER])));
-        let mut pools = Self {
-            train: Vec::new(),
-            validation: Vec::new(),
-            test: Vec::new(),
-        };
-        let (train, test) = match &parts {
+        let (digits, test) = match &parts {
             Some((train, test)) => (read_images(train)?, Some(read_images(test)?)),
             None => (read_images(path)?, None),
         };
-        if train.len() < PART {
-            let found = train.len();
-            return Err(refused(
-                path,
-                format!("{found} digits were found; at least {PART} are needed"),
-            ));
+        let count = digits.len();
+        if count < PART {
+            return refused(path, &format!("{count} digits were found; at least {PART} are needed"));
         }
         if test.as_ref().is_some_and(Vec::is_empty) {
-            return Err(refused(
-                path,
-                "the part for tests has no digits; at least one is needed",
-            ));
+            return refused(path, "the part for tests has no digits; at least one is needed");
         }
-        for (index, digit) in train.into_iter().enumerate() {
-            let pool = match index % PART {
-                0 => &mut pools.validation,
-                1 if test.is_none() => &mut pools.test,
-                _ => &mut pools.train,
+        let mut pools: [Vec<DigitImage>; 3] = Default::default();
+        for (index, digit) in digits.into_iter().enumerate() {
+            let split = match index % PART {
+                0 => Split::Validation,
+                1 if test.is_none() => Split::Test,
+                _ => Split::Train,
             };
-            pool.push(digit);
+            pools[split as usize].push(digit);
         }
-        pools.test.extend(test.unwrap_or_default());
-        Ok(pools)
+        pools[Split::Test as usize].extend(test.unwrap_or_default());
+        Ok(Self(pools))
     }
 
     /// The digits for the trials of a split.
     pub(crate) fn of(&self, split: Split) -> &[DigitImage] {
-        match split {
-            Split::Train => &self.train,
-            Split::Validation => &self.validation,
-            _ => &self.test,
-        }
+        &self.0[split as usize]
     }
 
     /// SHA-256 of all digits, in hexadecimal.
     pub(crate) fn hash(&self) -> String {
         let mut hasher = Sha256::new();
-        for pool in [&self.train, &self.validation, &self.test] {
+        for pool in &self.0 {
             hasher.update((pool.len() as u64).to_le_bytes());
-            for digit in pool {
-                hasher.update(digit);
-            }
+            hasher.update(pool.as_flattened());
         }
         hex(&hasher.finalize())
     }
 }
 
-fn refused(path: &Path, reason: impl Into<String>) -> DatasetError {
-    DatasetError::Digits {
-        path: path.to_owned(),
-        reason: reason.into(),
-    }
+fn refused<T>(path: &Path, reason: &str) -> Result<T, DatasetError> {
+    let path = path.display();
+    Err(DatasetError::Invalid(format!(
+        "{path} cannot be used as digits: {reason}"
+    )))
 }
 
 fn read_images(path: &Path) -> Result<Vec<DigitImage>, DatasetError> {
@@ -120,84 +100,67 @@ fn read_images(path: &Path) -> Result<Vec<DigitImage>, DatasetError> {
 
 /// Every PNG image below a folder, in the order of the paths.
 fn read_folder(folder: &Path) -> Result<Vec<DigitImage>, DatasetError> {
-    let is_png = |path: &PathBuf| path.extension().is_some_and(|name| name.eq_ignore_ascii_case("png"));
+    let is_png = |path: &&PathBuf| path.extension().is_some_and(|name| name.eq_ignore_ascii_case("png"));
     let files = files_below(folder).map_err(DatasetError::io("read", folder))?;
-    let digits: Result<Vec<_>, _> = files
-        .iter()
-        .filter(|path| is_png(path))
-        .map(|path| read_png(path))
-        .collect();
+    let digits: Result<Vec<_>, _> = files.iter().filter(is_png).map(|path| read_png(path)).collect();
     let digits = digits?;
     if digits.is_empty() {
-        return Err(refused(
-            folder,
-            format!(
-                "it holds no PNG images; give an IDX file, or a folder with PNG images or with {} and {}",
-                TRAIN_FILES[1], TEST_FILES[1]
-            ),
-        ));
+        let reason = format!(
+            "it holds no PNG images; give an IDX file, or a folder with PNG images or with {} and {}",
+            TRAIN_FILES[1], TEST_FILES[1]
+        );
+        return refused(folder, &reason);
     }
     Ok(digits)
 }
 
 fn read_png(path: &Path) -> Result<DigitImage, DatasetError> {
     let bytes = fs::read(path).map_err(DatasetError::io("read", path))?;
-    let frame = codec::decode(&bytes).map_err(|error| refused(path, error.to_string()))?;
-    let digit = <DigitImage>::try_from(frame.pixels()).ok();
-    digit
-        .filter(|_| frame.width() as usize == DIGIT_SIDE_PX)
-        .ok_or_else(|| {
-            refused(
-                path,
-                format!(
-                    "it has {}×{} px; a digit has {DIGIT_SIDE_PX}×{DIGIT_SIDE_PX} px",
-                    frame.width(),
-                    frame.height()
-                ),
-            )
-        })
+    let frame = match codec::decode(&bytes) {
+        Ok(frame) => frame,
+        Err(error) => return refused(path, &error.to_string()),
+    };
+    let (width, height) = (frame.width(), frame.height());
+    match <DigitImage>::try_from(frame.pixels()) {
+        Ok(digit) if width as usize == DIGIT_SIDE_PX => Ok(digit),
+        _ => {
+            let side = DIGIT_SIDE_PX;
+            let reason = format!("it has {width}×{height} px; a digit has {side}×{side} px");
+            refused(path, &reason)
+        }
+    }
 }
 
 /// An IDX file of digits (magic 2051, then the number of digits, rows and columns, big endian, then the pixels).
 fn read_idx(path: &Path) -> Result<Vec<DigitImage>, DatasetError> {
-    let bytes = fs::read(path).map_err(DatasetError::io("read", path))?;
-    let bytes = if bytes.starts_with(&GZIP) {
+    let mut bytes = fs::read(path).map_err(DatasetError::io("read", path))?;
+    if bytes.starts_with(&GZIP) {
         let mut plain = Vec::new();
-        MultiGzDecoder::new(bytes.as_slice())
-            .take(MAX_FILE_BYTES)
-            .read_to_end(&mut plain)
-            .map_err(|error| refused(path, format!("its compression is damaged: {error}")))?;
-        plain
-    } else {
-        bytes
-    };
+        let mut decoder = MultiGzDecoder::new(bytes.as_slice()).take(MAX_FILE_BYTES);
+        if let Err(error) = decoder.read_to_end(&mut plain) {
+            return refused(path, &format!("its compression is damaged: {error}"));
+        }
+        bytes = plain;
+    }
     let Some((header, pixels)) = bytes.split_at_checked(IDX_HEADER_BYTES) else {
-        return Err(refused(path, "it ends within its header; give an IDX file of images"));
+        return refused(path, "it ends within its header; give an IDX file of images");
     };
     let words = header.as_chunks::<4>().0;
     let [magic, count, rows, columns] = [0, 1, 2, 3].map(|word: usize| u32::from_be_bytes(words[word]));
-    if magic != IDX_BYTES_3D {
-        return Err(refused(
-            path,
-            "it does not begin as an IDX file of images; give one as train-images-idx3-ubyte.gz",
-        ));
-    }
-    if [rows, columns] != [DIGIT_SIDE_PX as u32; 2] {
-        return Err(refused(
-            path,
-            format!("its images are {columns}×{rows} px; digits are {DIGIT_SIDE_PX}×{DIGIT_SIDE_PX} px"),
-        ));
-    }
     let (digits, rest) = pixels.as_chunks::<DIGIT_PIXELS>();
-    if digits.len() != count as usize || !rest.is_empty() {
-        return Err(refused(
-            path,
-            format!(
-                "its header states {count} images, and {} bytes follow; {} are needed",
-                pixels.len(),
-                u64::from(count) * DIGIT_PIXELS as u64
-            ),
-        ));
-    }
-    Ok(digits.to_vec())
+    let side = DIGIT_SIDE_PX;
+    let wrong = if magic != IDX_BYTES_3D {
+        "it does not begin as an IDX file of images; give one as train-images-idx3-ubyte.gz".to_owned()
+    } else if [rows, columns] != [side as u32; 2] {
+        format!("its images are {columns}×{rows} px; digits are {side}×{side} px")
+    } else if digits.len() != count as usize || !rest.is_empty() {
+        format!(
+            "its header states {count} images, and {} bytes follow; {} are needed",
+            pixels.len(),
+            u64::from(count) * DIGIT_PIXELS as u64
+        )
+    } else {
+        return Ok(digits.to_vec());
+    };
+    refused(path, &wrong)
 }

@@ -4,8 +4,6 @@
 //! Such a data set is split by whole trials in their order (see [`sampler`](crate::dataset::sampler)), so the last tenth of the trials
 //! gets the digits for test, the tenth before it those for validation.
 
-use std::fs::File;
-use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -13,10 +11,11 @@ use rand::seq::IndexedRandom;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::config::{CollectProgress, DEFAULT_TRIALS_PER_SHARD};
+use super::config::{CollectProgress, DEFAULT_TRIALS_PER_SHARD, ShardTrials};
 use super::digits::DigitPools;
 use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
-use crate::dataset::store::layout::{DatasetMetadata, INFO};
+use crate::dataset::store::layout::INFO;
+use crate::dataset::store::preview::describe;
 use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::ShardWriter;
 use crate::dataset::{DatasetError, DatasetInfo, EpisodeData, Split};
@@ -36,10 +35,11 @@ const MIN_TRIALS: u64 = 10;
 /// Longest trial, in frames.
 pub const MAX_FRAMES: usize = 1000;
 
-/// What to make.
-#[derive(Clone, Debug, PartialEq)]
+/// What to make. The fields that determine the bytes are written to the directory, in this order.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MovingMnistConfig {
     /// An IDX file of digits, or a folder with IDX files or PNG images.
+    #[serde(skip)]
     pub digits: PathBuf,
     /// Number of trials, at least 10.
     pub trials: u64,
@@ -48,24 +48,23 @@ pub struct MovingMnistConfig {
     /// The seed from which the seed of every trial is derived.
     pub seed: Seed,
     /// The data set's directory.
+    #[serde(skip)]
     pub out: PathBuf,
 }
 
 impl MovingMnistConfig {
     fn validate(&self) -> Result<(), DatasetError> {
-        if self.trials < MIN_TRIALS {
-            return Err(DatasetError::Description(format!(
-                "{} trials are too few; moving digits need at least {MIN_TRIALS}, a tenth of them for testing",
-                self.trials
-            )));
-        }
-        if !(2..=MAX_FRAMES).contains(&self.frames) {
-            return Err(DatasetError::Description(format!(
-                "a trial of {} frames is out of range; it must have 2 to {MAX_FRAMES}",
-                self.frames
-            )));
-        }
-        Ok(())
+        let Self { trials, frames, .. } = self;
+        let wrong = if *trials < MIN_TRIALS {
+            format!(
+                "{trials} trials are too few; moving digits need at least {MIN_TRIALS}, a tenth of them for testing"
+            )
+        } else if !(2..=MAX_FRAMES).contains(frames) {
+            format!("a trial of {frames} frames is out of range; it must have 2 to {MAX_FRAMES}")
+        } else {
+            return Ok(());
+        };
+        Err(DatasetError::Invalid(wrong))
     }
 
     /// The split to which a trial will belong.
@@ -76,15 +75,6 @@ impl MovingMnistConfig {
             left if left <= 2 * tenth => Split::Validation,
             _ => Split::Train,
         }
-    }
-
-    fn shards(&self) -> Range<usize> {
-        0..self.trials.div_ceil(DEFAULT_TRIALS_PER_SHARD) as usize
-    }
-
-    fn shard_trials(&self, shard: usize) -> Range<u64> {
-        let first = shard as u64 * DEFAULT_TRIALS_PER_SHARD;
-        first..(first + DEFAULT_TRIALS_PER_SHARD).min(self.trials)
     }
 
     fn info(&self) -> DatasetInfo {
@@ -116,16 +106,14 @@ impl MovingMnistConfig {
 /// The arguments that determine the bytes. They are written first.
 #[derive(Serialize)]
 struct MovingMnistArguments<'a> {
-    program_version: &'static str,
     scenario: &'static str,
     digits_sha256: &'a str,
-    trials: u64,
-    frames: usize,
-    seed: Seed,
+    #[serde(flatten)]
+    config: &'a MovingMnistConfig,
 }
 
 /// Makes the data set, or continues. Returns at once if it is complete.
-/// Errors: `Digits`, `Description`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Io`.
+/// Errors: `Invalid`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Io`.
 pub fn collect_digits(
     config: &MovingMnistConfig,
     on_progress: &(dyn Fn(CollectProgress) + Sync),
@@ -133,38 +121,33 @@ pub fn collect_digits(
 ) -> Result<DatasetInfo, DatasetError> {
     config.validate()?;
     let pools = DigitPools::read(&config.digits)?;
-    let _lock = claim(config, &pools.hash())?;
+    let arguments = arguments_text(&MovingMnistArguments {
+        scenario: MOVING_MNIST,
+        digits_sha256: &pools.hash(),
+        config,
+    });
+    has_arguments(&config.out, &arguments)?;
+    let _lock = lock(&config.out, &arguments)?;
     if config.out.join(INFO).exists() {
-        return DatasetMetadata::read(&config.out)?.info_in(&config.out);
+        return describe(&config.out);
     }
     let mut writer = ShardWriter::new(&config.out, config.info());
-    for shard in config.shards() {
+    let shards = ShardTrials {
+        trials: config.trials,
+        per_shard: DEFAULT_TRIALS_PER_SHARD,
+    };
+    for shard in 0..shards.count() {
         let (done, total) = (writer.episode_count() as u64, config.trials);
         on_progress(CollectProgress { done, total });
         if cancelled.load(Ordering::Relaxed) {
             return Err(DatasetError::Cancelled { done, total });
         }
-        let trials = config.shard_trials(shard);
-        if !writer.resume(Some(trials.clone().count())) {
+        if !writer.resume(Some(shards.count_of(shard))) {
             let info = writer.info();
             let encode = |trial| EncodedEpisode::new(info, trial as usize, config.trial(&pools, trial));
-            let episodes: Result<Vec<_>, _> = trials.into_par_iter().map(encode).collect();
+            let episodes: Result<Vec<_>, _> = shards.of(shard).into_par_iter().map(encode).collect();
             writer.write(&episodes?)?;
         }
     }
     writer.complete()
-}
-
-/// Takes an unused directory, or one with the same arguments, and locks it.
-fn claim(config: &MovingMnistConfig, digits_sha256: &str) -> Result<File, DatasetError> {
-    let arguments = arguments_text(&MovingMnistArguments {
-        program_version: env!("CARGO_PKG_VERSION"),
-        scenario: MOVING_MNIST,
-        digits_sha256,
-        trials: config.trials,
-        frames: config.frames,
-        seed: config.seed,
-    })?;
-    has_arguments(&config.out, &arguments)?;
-    lock(&config.out, &arguments)
 }

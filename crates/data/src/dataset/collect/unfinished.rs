@@ -2,12 +2,15 @@
 //! each shard, until the same command resumes the collection and writes the complete shard.
 
 use std::fs;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
+
+use arrow_array::types::Float32Type;
 
 use crate::dataset::store::files;
 use crate::dataset::store::layout::{ACTION, IMAGE, MASK, STATE, TIMESTAMP};
 use crate::dataset::store::shard::{EncodedEpisode, ShardStart, build};
-use crate::dataset::store::shard_reader::{Column, batches, image_bytes, records};
+use crate::dataset::store::shard_reader::{Column, batches, records};
 use crate::dataset::{DatasetError, DatasetInfo};
 
 /// Their directory in the data set's.
@@ -29,7 +32,8 @@ pub(crate) fn save(
         episode: first as usize,
         frame: 0,
     };
-    files::write_atomically(&path(out, shard), &build(info, start, episodes)?.bytes)
+    let (bytes, _) = build(info, start, episodes)?;
+    files::write_atomically(&path(out, shard), &bytes)
 }
 
 /// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
@@ -37,14 +41,10 @@ pub(crate) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedE
     read(info, &path(out, shard)).unwrap_or_default()
 }
 
-/// How many trials of a shard are saved.
-pub(crate) fn count(out: &Path, shard: usize) -> usize {
-    let path = path(out, shard);
-    if path.is_file() {
-        records(&path).map_or(0, |records| records.len())
-    } else {
-        0
-    }
+/// How many trials of these shards are saved.
+pub(crate) fn count(out: &Path, shards: Range<usize>) -> usize {
+    let saved = shards.filter_map(|shard| records(&path(out, shard)).ok());
+    saved.map(|records| records.len()).sum()
 }
 
 /// Deletes the saved trials of all shards, after every shard is complete. Errors: `Io`.
@@ -60,14 +60,13 @@ fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetE
     let mut rows = Rows::default();
     for batch in &batches(path)? {
         let column = Column { batch, path };
-        rows.images.extend(image_column(&column, IMAGE)?);
+        rows.images.extend(column.images(IMAGE)?.map(<[u8]>::to_vec));
         if info.has_masks {
-            rows.masks.extend(image_column(&column, MASK)?);
+            rows.masks.extend(column.images(MASK)?.map(<[u8]>::to_vec));
         }
         rows.states.extend(column.vectors(STATE, info.state_channels.len())?);
         rows.actions.extend(column.vectors(ACTION, info.action_channels.len())?);
-        rows.timestamps_s
-            .extend(column.numbers::<arrow_array::types::Float32Type>(TIMESTAMP)?);
+        rows.timestamps_s.extend(column.numbers::<Float32Type>(TIMESTAMP)?);
     }
     let records = records(path)?;
     if records.iter().map(|record| record.frames).sum::<usize>() != rows.images.len() {
@@ -95,12 +94,4 @@ struct Rows {
     states: Vec<f32>,
     actions: Vec<f32>,
     timestamps_s: Vec<f32>,
-}
-
-fn image_column(column: &Column<'_>, key: &str) -> Result<Vec<Vec<u8>>, DatasetError> {
-    let missing = || DatasetError::corrupt(column.path, &format!("it has no column \"{key}\" of images"));
-    let images = image_bytes(column.batch, key).ok_or_else(missing)?;
-    Ok((0..column.batch.num_rows())
-        .map(|row| images.value(row).to_vec())
-        .collect())
 }

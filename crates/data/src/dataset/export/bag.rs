@@ -1,7 +1,6 @@
 //! Writes episodes as a bag of ROS 2: images, and actions and states as messages with the times of their images.
 
 use std::fs::File;
-use std::io::{self, BufWriter};
 use std::ops::Range;
 use std::path::Path;
 
@@ -38,22 +37,16 @@ const REGION: &str = "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32
 /// Writes episodes, as ranges of frames counted over the whole data set, as one MCAP file, which `foreframe import` and ROS 2
 /// read. Frame k of an episode is at k times the frame period. Errors: `Io`.
 pub fn to_mcap(dataset: &Dataset, episodes: &[Range<usize>], path: &Path) -> Result<(), DatasetError> {
-    let failed = |error| DatasetError::io("write", path)(error);
     write_whole(path, "partial.mcap", |partial| {
-        let mut out = BufWriter::new(File::create(partial).map_err(failed)?);
-        write(dataset, episodes, McapWriter::new(&mut out).map_err(failed)?, &failed)?;
-        let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
-        file.sync_all().map_err(failed)
+        let file = File::create(partial).map_err(DatasetError::io("write", path))?;
+        write(dataset, episodes, McapWriter::new(file, path)?)
     })
 }
 
-/// `failed` says what a failed write of the file means.
-fn write<W: io::Write>(
-    dataset: &Dataset,
-    episodes: &[Range<usize>],
-    mut bag: McapWriter<W>,
-    failed: &dyn Fn(io::Error) -> DatasetError,
-) -> Result<(), DatasetError> {
+/// How the values of a frame are read from a data set.
+type FrameValues = fn(&Dataset, usize) -> &[f32];
+
+fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) -> Result<(), DatasetError> {
     let info = dataset.info();
     let image = bag.topic(IMAGE_TOPIC, "sensor_msgs/msg/Image", &image_definition());
     let camera = info.camera.map(|camera| {
@@ -61,42 +54,43 @@ fn write<W: io::Write>(
         (topic, camera.horizontal_fov_rad)
     });
     let frames = || episodes.iter().cloned().flatten();
-    let mut values = |name, channels: &[Channel], row: &dyn Fn(usize) -> Vec<f64>| {
-        let kind = (!channels.is_empty()).then(|| ValueMessage::of(channels, || frames().map(row)));
-        kind.map(|kind| (bag.topic(name, kind.type_name(), &kind.definition()), kind))
-    };
-    let numbers = |values: &[f32]| values.iter().copied().map(f64::from).collect::<Vec<_>>();
-    let action_of = |frame| numbers(dataset.action(frame));
-    let state_of = |frame| numbers(dataset.state(frame));
-    let action = values(ACTION_TOPIC, &info.action_channels, &action_of);
-    let state = values(STATE_TOPIC, &info.state_channels, &state_of);
+    let mut values = Vec::new();
+    for (name, channels, of_frame) in [
+        (ACTION_TOPIC, &info.action_channels, Dataset::action as FrameValues),
+        (STATE_TOPIC, &info.state_channels, Dataset::state),
+    ] {
+        let row = move |frame: usize| {
+            of_frame(dataset, frame)
+                .iter()
+                .copied()
+                .map(f64::from)
+                .collect::<Vec<_>>()
+        };
+        if !channels.is_empty() {
+            let kind = ValueMessage::of(channels, || frames().map(row));
+            let (type_name, definition) = kind.description();
+            values.push((bag.topic(name, type_name, &definition), kind, row));
+        }
+    }
     let size = (info.frame_width_px, info.frame_height_px);
     let period_ns = info.frame_period_s * 1e9;
     let mut start_ns = START_NS;
     for episode in episodes {
         for (place, frame) in episode.clone().enumerate() {
             let time_ns = start_ns + (place as f64 * period_ns).round() as u64;
-            if let Some((topic, kind)) = &action {
-                bag.message(*topic, time_ns, &kind.message(time_ns, &action_of(frame)))
-                    .map_err(failed)?;
-            }
-            if let Some((topic, kind)) = &state {
-                bag.message(*topic, time_ns, &kind.message(time_ns, &state_of(frame)))
-                    .map_err(failed)?;
+            for (topic, kind, row) in &values {
+                bag.message(*topic, time_ns, &kind.message(time_ns, &row(frame)))?;
             }
             if let Some((topic, fov_rad)) = camera {
-                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))
-                    .map_err(failed)?;
+                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))?;
             }
-            let pixels = dataset.pixels(frame)?;
-            bag.message(image, time_ns, &gray_image(time_ns, size, &pixels))
-                .map_err(failed)?;
+            bag.message(image, time_ns, &gray_image(time_ns, size, &dataset.pixels(frame)?))?;
         }
         let duration_ns = (episode.len() as f64 * period_ns) as u64;
         let gap_ns = MIN_GAP_NS.max((period_ns as u64).saturating_mul(GAP_FRAMES));
         start_ns = (start_ns + duration_ns + gap_ns).next_multiple_of(1_000_000_000);
     }
-    bag.finish().map_err(failed)
+    bag.finish()
 }
 
 /// The message that holds an action or a state.
@@ -112,18 +106,14 @@ impl ValueMessage {
     /// robot on wheels among them, and every other one is used.
     fn of<I: Iterator<Item = Vec<f64>>>(channels: &[Channel], rows: impl Fn() -> I) -> Self {
         let place = |channel: &Channel| {
-            let names = [
-                "linear.x",
-                "linear.y",
-                "linear.z",
-                "angular.x",
-                "angular.y",
-                "angular.z",
-            ];
             let place = match channel.name.as_str() {
-                "linear" => 0,
-                "angular" => 5,
-                name => names.iter().position(|known| *known == name)?,
+                "linear" | "linear.x" => 0,
+                "linear.y" => 1,
+                "linear.z" => 2,
+                "angular.x" => 3,
+                "angular.y" => 4,
+                "angular" | "angular.z" => 5,
+                _ => return None,
             };
             let unit = if place < 3 { "m/s" } else { "rad/s" };
             (channel.unit.is_empty() || channel.unit == unit).then_some(place)
@@ -143,23 +133,18 @@ impl ValueMessage {
         }
     }
 
-    fn type_name(&self) -> &'static str {
+    /// The name of the type and its definition.
+    fn description(&self) -> (&'static str, String) {
         match self {
-            Self::Twist(_) => "geometry_msgs/msg/TwistStamped",
-            Self::Joints(_) => "sensor_msgs/msg/JointState",
-        }
-    }
-
-    fn definition(&self) -> String {
-        match self {
-            Self::Twist(_) => definition(
-                "std_msgs/Header header\ngeometry_msgs/Twist twist\n",
-                &[HEADER, TIME, TWIST, VECTOR],
-            ),
-            Self::Joints(_) => definition(
-                "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
-                &[HEADER, TIME],
-            ),
+            Self::Twist(_) => {
+                let own = "geometry_msgs/Twist twist\n";
+                let parts = [TWIST, VECTOR];
+                ("geometry_msgs/msg/TwistStamped", definition(own, &parts))
+            }
+            Self::Joints(_) => {
+                let own = "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n";
+                ("sensor_msgs/msg/JointState", definition(own, &[]))
+            }
         }
     }
 
@@ -177,39 +162,41 @@ impl ValueMessage {
                 let named = names
                     .iter()
                     .fold(cdr.u32(names.len() as u32), |cdr, name| cdr.text(name));
-                named.f64_sequence(values).u32(0).u32(0).end()
+                named.f64_sequence(values).u32s(&[0; 2]).end()
             }
         }
     }
 }
 
-/// A message definition with those of its parts.
+/// The definition of a message with a header and these fields, with those of its parts.
 fn definition(own: &str, parts: &[&str]) -> String {
-    parts.iter().fold(own.to_owned(), |text, part| text + SEPARATOR + part)
+    let own = format!("std_msgs/Header header\n{own}");
+    let parts = [HEADER, TIME].iter().chain(parts);
+    parts.fold(own, |text, part| text + SEPARATOR + part)
 }
 
 fn image_definition() -> String {
-    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+    let own = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
                uint8[] data\n";
-    definition(own, &[HEADER, TIME])
+    definition(own, &[])
 }
 
 fn gray_image(time_ns: u64, (width, height): (u32, u32), pixels: &[u8]) -> Vec<u8> {
-    let size = CdrWriter::new().header(time_ns).u32(height).u32(width);
+    let size = CdrWriter::new().header(time_ns).u32s(&[height, width]);
     size.text("mono8").u8(0).u32(width).bytes(pixels).end()
 }
 
 fn camera_definition() -> String {
-    let own = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
+    let own = "uint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n\
                float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n";
-    definition(own, &[HEADER, TIME, REGION])
+    definition(own, &[REGION])
 }
 
 /// A camera without distortion, whose axis goes through the middle of the image.
 fn camera_info(time_ns: u64, (width, height): (u32, u32), horizontal_fov_rad: f32) -> Vec<u8> {
     let focal_px = f64::from(width) / 2.0 / (f64::from(horizontal_fov_rad) / 2.0).tan();
     let (middle_x, middle_y) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
-    let size = CdrWriter::new().header(time_ns).u32(height).u32(width);
+    let size = CdrWriter::new().header(time_ns).u32s(&[height, width]);
     size.text("plumb_bob")
         .f64_sequence(&[0.0; 5])
         .f64s(&[focal_px, 0.0, middle_x, 0.0, focal_px, middle_y, 0.0, 0.0, 1.0])
@@ -217,13 +204,10 @@ fn camera_info(time_ns: u64, (width, height): (u32, u32), horizontal_fov_rad: f3
         .f64s(&[
             focal_px, 0.0, middle_x, 0.0, 0.0, focal_px, middle_y, 0.0, 0.0, 0.0, 1.0, 0.0,
         ])
-        .u32(0)
-        .u32(0)
+        // No binning.
+        .u32s(&[0; 2])
         // The region of interest: the whole image.
-        .u32(0)
-        .u32(0)
-        .u32(0)
-        .u32(0)
+        .u32s(&[0; 4])
         .u8(0)
         .end()
 }

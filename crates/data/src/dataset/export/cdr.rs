@@ -23,6 +23,10 @@ impl CdrWriter {
         self.number(&value.to_le_bytes())
     }
 
+    pub(super) fn u32s(self, values: &[u32]) -> Self {
+        values.iter().fold(self, |cdr, &value| cdr.u32(value))
+    }
+
     pub(super) fn f64s(self, values: &[f64]) -> Self {
         values.iter().fold(self, |cdr, value| cdr.number(&value.to_le_bytes()))
     }
@@ -50,7 +54,7 @@ impl CdrWriter {
     /// A `std_msgs/Header` of the camera.
     pub(super) fn header(self, time_ns: u64) -> Self {
         let (seconds, rest) = (time_ns / 1_000_000_000, time_ns % 1_000_000_000);
-        self.u32(seconds as u32).u32(rest as u32).text("camera")
+        self.u32s(&[seconds as u32, rest as u32]).text("camera")
     }
 
     pub(super) fn end(self) -> Vec<u8> {

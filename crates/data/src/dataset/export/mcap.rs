@@ -1,8 +1,12 @@
 //! Writes MCAP files: <https://mcap.dev/spec>. Chunks without compression, with checksums and with all indexes, as
 //! `ros2 bag record` writes them.
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::ops::Range;
+use std::path::Path;
+
+use crate::dataset::DatasetError;
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Number of bytes after which a chunk is closed.
@@ -22,62 +26,40 @@ mod operation {
     pub(super) const DATA_END: u8 = 15;
 }
 
-/// The fields of a record, little endian.
-#[derive(Default)]
-struct RecordFields(Vec<u8>);
+/// A record of these fields.
+fn record(operation: u8, fields: &[&[u8]]) -> Vec<u8> {
+    let fields = fields.concat();
+    let length = (fields.len() as u64).to_le_bytes();
+    [&[operation][..], &length, &fields].concat()
+}
 
-impl RecordFields {
-    fn u16(self, value: u16) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
+/// A text, or a map or array that is already written, after its length in bytes.
+fn sized(bytes: impl AsRef<[u8]>) -> Vec<u8> {
+    let bytes = bytes.as_ref();
+    [&(bytes.len() as u32).to_le_bytes(), bytes].concat()
+}
 
-    fn u32(self, value: u32) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
-
-    fn u64(self, value: u64) -> Self {
-        self.raw(&value.to_le_bytes())
-    }
-
-    fn u64s(self, values: &[u64]) -> Self {
-        values.iter().fold(self, |fields, &value| fields.u64(value))
-    }
-
-    /// A text, or a map or array that is already written, after its length in bytes.
-    fn sized(self, bytes: &[u8]) -> Self {
-        self.u32(bytes.len() as u32).raw(bytes)
-    }
-
-    fn text(self, text: &str) -> Self {
-        self.sized(text.as_bytes())
-    }
-
-    fn raw(mut self, bytes: &[u8]) -> Self {
-        self.0.extend_from_slice(bytes);
-        self
-    }
-
-    /// The whole record.
-    fn record(self, operation: u8) -> Vec<u8> {
-        let length = (self.0.len() as u64).to_le_bytes();
-        [&[operation][..], &length, &self.0].concat()
-    }
+fn u64s(values: &[u64]) -> Vec<u8> {
+    values.iter().flat_map(|value| value.to_le_bytes()).collect()
 }
 
 /// A topic of one type.
 struct TopicWriter {
-    /// Its schema and its channel.
-    records: [Vec<u8>; 2],
     messages: u64,
     /// Time, and position in the open chunk, of the messages of that chunk.
     in_chunk: Vec<u64>,
 }
 
 /// Messages of some topics on their way into a file.
-pub(super) struct McapWriter<W> {
-    out: W,
+pub(super) struct McapWriter<'a> {
+    out: BufWriter<File>,
+    /// The name of the file in errors.
+    path: &'a Path,
     written: u64,
     topics: Vec<TopicWriter>,
+    /// One of each topic.
+    schemas: Vec<Vec<u8>>,
+    channels: Vec<Vec<u8>>,
     chunk: Vec<u8>,
     /// First and last time of the open chunk's messages, and of all.
     chunk_times: Option<[u64; 2]>,
@@ -90,13 +72,16 @@ fn including(times: Option<[u64; 2]>, time: u64) -> [u64; 2] {
     [first.min(time), last.max(time)]
 }
 
-impl<W: Write> McapWriter<W> {
-    /// Begins a file. Errors: those of the writer.
-    pub(super) fn new(out: W) -> io::Result<Self> {
+impl<'a> McapWriter<'a> {
+    /// Begins a file, whose errors name `path`. Errors: `Io`.
+    pub(super) fn new(file: File, path: &'a Path) -> Result<Self, DatasetError> {
         let mut writer = Self {
-            out,
+            out: BufWriter::new(file),
+            path,
             written: 0,
             topics: Vec::new(),
+            schemas: Vec::new(),
+            channels: Vec::new(),
             chunk: Vec::new(),
             chunk_times: None,
             times: None,
@@ -104,45 +89,40 @@ impl<W: Write> McapWriter<W> {
         };
         writer.put(MAGIC)?;
         let library = concat!("foreframe ", env!("CARGO_PKG_VERSION"));
-        writer.put(
-            &RecordFields::default()
-                .text("ros2")
-                .text(library)
-                .record(operation::HEADER),
-        )?;
+        writer.put(&record(operation::HEADER, &[&sized("ros2"), &sized(library)]))?;
         Ok(writer)
     }
 
-    fn put(&mut self, bytes: &[u8]) -> io::Result<()> {
+    fn put(&mut self, bytes: &[u8]) -> Result<(), DatasetError> {
         self.written += bytes.len() as u64;
-        self.out.write_all(bytes)
+        let written = self.out.write_all(bytes);
+        written.map_err(DatasetError::io("write", self.path))
     }
 
     /// Adds a topic and returns its number. `definition` is the type's message definition with those of its parts.
     pub(super) fn topic(&mut self, name: &str, type_name: &str, definition: &str) -> u16 {
-        let id = self.topics.len() as u16 + 1;
-        let schema = RecordFields::default().u16(id).text(type_name).text("ros2msg");
-        let channel = RecordFields::default().u16(id).u16(id).text(name).text("cdr");
-        let records = [
-            schema.text(definition).record(operation::SCHEMA),
-            channel.sized(&[]).record(operation::CHANNEL),
-        ];
-        self.chunk.extend(records.concat());
+        let number = self.topics.len() as u16 + 1;
+        let (id, definition) = (number.to_le_bytes(), sized(definition));
+        let schema = [&id[..], &sized(type_name), &sized("ros2msg"), &definition];
+        let channel = [&id[..], &id, &sized(name), &sized("cdr"), &sized("")];
+        self.schemas.push(record(operation::SCHEMA, &schema));
+        self.channels.push(record(operation::CHANNEL, &channel));
+        let records = [&self.schemas, &self.channels].map(|records| &records[usize::from(number) - 1]);
+        self.chunk.extend(records.into_iter().flatten());
         self.topics.push(TopicWriter {
-            records,
             messages: 0,
             in_chunk: Vec::new(),
         });
-        id
+        number
     }
 
-    /// Adds a message of a topic. Errors: those of the writer.
-    pub(super) fn message(&mut self, topic: u16, time_ns: u64, content: &[u8]) -> io::Result<()> {
+    /// Adds a message of a topic. Errors: `Io`.
+    pub(super) fn message(&mut self, topic: u16, time_ns: u64, content: &[u8]) -> Result<(), DatasetError> {
         let position = self.chunk.len() as u64;
         if let Some(of) = self.topics.get_mut(usize::from(topic) - 1) {
-            let fields = RecordFields::default().u16(topic).u32(of.messages as u32);
-            let fields = fields.u64s(&[time_ns, time_ns]).raw(content);
-            self.chunk.extend(fields.record(operation::MESSAGE));
+            let sequence = (of.messages as u32).to_le_bytes();
+            let fields = [&topic.to_le_bytes()[..], &sequence, &u64s(&[time_ns, time_ns]), content];
+            self.chunk.extend(record(operation::MESSAGE, &fields));
             of.messages += 1;
             of.in_chunk.extend([time_ns, position]);
         }
@@ -154,42 +134,47 @@ impl<W: Write> McapWriter<W> {
         Ok(())
     }
 
-    fn close_chunk(&mut self) -> io::Result<()> {
+    fn close_chunk(&mut self) -> Result<(), DatasetError> {
         let Some(times) = self.chunk_times.take() else {
             return Ok(());
         };
+        let times = u64s(&times);
         let records = std::mem::take(&mut self.chunk);
-        let length = records.len() as u64;
-        let fields = RecordFields::default().u64s(&times).u64(length);
-        let fields = fields.u32(crc32fast::hash(&records)).text("").u64(length).raw(&records);
+        let length = (records.len() as u64).to_le_bytes();
+        let checksum = crc32fast::hash(&records).to_le_bytes();
         let chunk_start = self.written;
-        self.put(&fields.record(operation::CHUNK))?;
+        let fields = [&times[..], &length, &checksum, &sized(""), &length, &records];
+        self.put(&record(operation::CHUNK, &fields))?;
         let indexes_start = self.written;
-        let mut offsets = RecordFields::default();
+        let mut offsets = Vec::new();
         for topic in 0..self.topics.len() {
             let entries = std::mem::take(&mut self.topics[topic].in_chunk);
             if entries.is_empty() {
                 continue;
             }
-            let id = topic as u16 + 1;
-            offsets = offsets.u16(id).u64(self.written);
-            let entries = RecordFields::default().u64s(&entries);
-            let index = RecordFields::default().u16(id).sized(&entries.0);
-            self.put(&index.record(operation::MESSAGE_INDEX))?;
+            let id = (topic as u16 + 1).to_le_bytes();
+            offsets.extend(id);
+            offsets.extend(self.written.to_le_bytes());
+            let fields = [&id[..], &sized(u64s(&entries))];
+            self.put(&record(operation::MESSAGE_INDEX, &fields))?;
         }
-        let index = RecordFields::default()
-            .u64s(&times)
-            .u64s(&[chunk_start, indexes_start - chunk_start])
-            .sized(&offsets.0)
-            .u64(self.written - indexes_start)
-            .text("")
-            .u64s(&[length, length]);
-        self.chunk_indexes.push(index.record(operation::CHUNK_INDEX));
+        let place = u64s(&[chunk_start, indexes_start - chunk_start]);
+        let indexes = (self.written - indexes_start).to_le_bytes();
+        let fields = [
+            &times[..],
+            &place,
+            &sized(offsets),
+            &indexes,
+            &sized(""),
+            &length,
+            &length,
+        ];
+        self.chunk_indexes.push(record(operation::CHUNK_INDEX, &fields));
         Ok(())
     }
 
     /// Writes a group of the summary. Returns where it is.
-    fn group(&mut self, records: &[Vec<u8>]) -> io::Result<Range<u64>> {
+    fn group(&mut self, records: &[Vec<u8>]) -> Result<Range<u64>, DatasetError> {
         let start = self.written;
         for record in records {
             self.put(record)?;
@@ -197,32 +182,32 @@ impl<W: Write> McapWriter<W> {
         Ok(start..self.written)
     }
 
-    fn statistics(&self) -> Vec<u8> {
-        let messages = self.topics.iter().map(|topic| topic.messages);
-        let counts = messages.clone().zip(1..);
-        let counts = counts.fold(RecordFields::default(), |fields, (count, id)| fields.u16(id).u64(count));
+    fn statistics(&self, chunks: usize) -> Vec<u8> {
+        let counts = (1u16..).zip(self.topics.iter().map(|topic| topic.messages));
+        let counts = counts.flat_map(|(id, count)| [&id.to_le_bytes()[..], &count.to_le_bytes()].concat());
+        let messages: u64 = self.topics.iter().map(|topic| topic.messages).sum();
         let topics = self.topics.len();
-        RecordFields::default()
-            .u64(messages.sum())
-            .u16(topics as u16)
-            .u32(topics as u32)
-            .u32(0)
-            .u32(0)
-            .u32(self.chunk_indexes.len() as u32)
-            .u64s(&self.times.unwrap_or_default())
-            .sized(&counts.0)
-            .record(operation::STATISTICS)
+        let fields = [
+            &messages.to_le_bytes()[..],
+            &(topics as u16).to_le_bytes(),
+            &(topics as u32).to_le_bytes(),
+            // Neither attachments nor metadata.
+            &[0; 8],
+            &(chunks as u32).to_le_bytes(),
+            &u64s(&self.times.unwrap_or_default()),
+            &sized(counts.collect::<Vec<u8>>()),
+        ];
+        record(operation::STATISTICS, &fields)
     }
 
-    /// Writes the indexes; the file is then complete. Errors: those of the writer.
-    pub(super) fn finish(mut self) -> io::Result<()> {
+    /// Writes the indexes; the file is then complete. Errors: `Io`.
+    pub(super) fn finish(mut self) -> Result<(), DatasetError> {
         self.close_chunk()?;
-        self.put(&RecordFields::default().u32(0).record(operation::DATA_END))?;
+        self.put(&record(operation::DATA_END, &[&[0; 4]]))?;
         let summary_start = self.written;
-        let of_topics = |part: usize| self.topics.iter().map(|topic| topic.records[part].clone()).collect();
-        let (schemas, channels): (Vec<_>, Vec<_>) = (of_topics(0), of_topics(1));
-        let statistics = vec![self.statistics()];
+        let (schemas, channels) = (std::mem::take(&mut self.schemas), std::mem::take(&mut self.channels));
         let chunks = std::mem::take(&mut self.chunk_indexes);
+        let statistics = vec![self.statistics(chunks.len())];
         let mut offsets = Vec::new();
         for (operation, records) in [
             (operation::SCHEMA, schemas),
@@ -232,15 +217,15 @@ impl<W: Write> McapWriter<W> {
         ] {
             let group = self.group(&records)?;
             if !group.is_empty() {
-                let fields = RecordFields::default().raw(&[operation]);
-                let fields = fields.u64s(&[group.start, group.end - group.start]);
-                offsets.push(fields.record(operation::SUMMARY_OFFSET));
+                let place = u64s(&[group.start, group.end - group.start]);
+                offsets.push(record(operation::SUMMARY_OFFSET, &[&[operation], &place]));
             }
         }
         let offsets = self.group(&offsets)?;
-        let footer = RecordFields::default().u64s(&[summary_start, offsets.start]).u32(0);
-        self.put(&footer.record(operation::FOOTER))?;
+        let footer = [&u64s(&[summary_start, offsets.start])[..], &[0; 4]];
+        self.put(&record(operation::FOOTER, &footer))?;
         self.put(MAGIC)?;
-        self.out.flush()
+        let saved = self.out.flush().and_then(|()| self.out.get_ref().sync_all());
+        saved.map_err(DatasetError::io("write", self.path))
     }
 }

@@ -11,7 +11,7 @@ use crate::dataset::{Dataset, DatasetError};
 
 /// Writes frames, counted over the whole data set, as an MP4 file; one frame takes the data set's frame period.
 /// Errors: `Program`, `Io`.
-pub(super) fn write(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<(), DatasetError> {
+pub fn to_mp4(dataset: &Dataset, frames: Range<usize>, path: &Path) -> Result<(), DatasetError> {
     write_whole(path, "partial.mp4", |partial| {
         encode(dataset, frames, start(dataset, partial)?)
     })

@@ -2,21 +2,29 @@
 //! locked while a process writes.
 
 use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind;
 use std::path::Path;
 
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use super::files::{is_unused, write_atomically};
+use super::files::{is_unused, pretty_json, write_atomically};
 use super::layout::ARGUMENTS;
 use crate::dataset::error::DatasetError;
 use foreframe_core::files::{remove_stale_partials, try_lock};
 
-/// The arguments that determine a data set's bytes, as they are written to its directory. Errors: `Description`.
-pub(crate) fn arguments_text(arguments: &impl Serialize) -> Result<String, DatasetError> {
-    let text = serde_json::to_string_pretty(arguments);
-    text.map(|text| text + "\n")
-        .map_err(|error| DatasetError::Description(error.to_string()))
+/// The arguments that determine a data set's bytes, as they are written to its directory, with the version of the program.
+pub(crate) fn arguments_text(arguments: &impl Serialize) -> String {
+    #[derive(Serialize)]
+    struct Versioned<'a, T> {
+        program_version: &'static str,
+        #[serde(flatten)]
+        arguments: &'a T,
+    }
+    pretty_json(&Versioned {
+        program_version: env!("CARGO_PKG_VERSION"),
+        arguments,
+    })
 }
 
 /// Whether a directory was begun with these arguments; false for an unused one. Errors: `OutExists`, `OtherArguments`, `Io`.
@@ -28,7 +36,7 @@ pub(crate) fn has_arguments(out: &Path, wanted: &str) -> Result<bool, DatasetErr
             differences: differences(&found, wanted),
         }),
         None if is_unused(out, ARGUMENTS)? => Ok(false),
-        None => Err(DatasetError::OutExists { path: out.to_owned() }),
+        None => Err(DatasetError::OutExists(out.to_owned())),
     }
 }
 
@@ -48,7 +56,7 @@ pub(crate) fn lock_file(path: &Path, out: &Path) -> Result<File, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io("read", path))?;
     match try_lock(&file) {
         Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(DatasetError::Busy { path: out.to_owned() }),
+        Err(TryLockError::WouldBlock) => Err(DatasetError::Busy(out.to_owned())),
         Err(TryLockError::Error(source)) => Err(DatasetError::io("lock", path)(source)),
     }
 }
@@ -58,14 +66,7 @@ fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
     match fs::read_to_string(&path) {
         Ok(text) => Ok(Some(text)),
         // If `out` is a file, `is_unused` reports it.
-        Err(error)
-            if matches!(
-                error.kind(),
-                std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory
-            ) =>
-        {
-            Ok(None)
-        }
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
         Err(error) => Err(DatasetError::io("read", &path)(error)),
     }
 }
@@ -76,16 +77,10 @@ fn differences(found: &str, wanted: &str) -> String {
     let object = |text: &str| serde_json::from_str::<Map<String, Value>>(text).unwrap_or_default();
     let (found, wanted) = (object(found), object(wanted));
     let text = |value: Option<&Value>| value.map_or_else(|| "none".to_owned(), Value::to_string);
-    let differing: Vec<_> = wanted
-        .iter()
-        .filter(|(key, value)| found.get(*key) != Some(value))
-        .map(|(key, value)| {
-            format!(
-                "{key}: {} in the directory, {} requested",
-                text(found.get(key)),
-                text(Some(value))
-            )
-        })
-        .collect();
-    differing.join("; ")
+    let differing = wanted.iter().filter(|(key, value)| found.get(*key) != Some(value));
+    let differing = differing.map(|(key, value)| {
+        let found = text(found.get(key));
+        format!("{key}: {found} in the directory, {value} requested")
+    });
+    differing.collect::<Vec<_>>().join("; ")
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::layout::INFO;
 use crate::dataset::error::DatasetError;
+use foreframe_core::error_text::existing;
 
 /// Whether a directory holds a finished data set. The file that it checks is written last.
 #[must_use]
@@ -31,7 +32,7 @@ pub fn list(datasets_dir: &Path) -> Result<Vec<String>, DatasetError> {
 }
 
 /// The directory of a data set that the user gave as a path or as a name below `datasets_dir`. A path is tried first. The
-/// data set may be unfinished. Errors: `Unknown` with the existing names, `NotADataset`, `Io`.
+/// data set may be unfinished. Errors: `NotFound`, with the existing names; `Io`.
 pub fn find(datasets_dir: &Path, what: &Path) -> Result<PathBuf, DatasetError> {
     if what.join("meta").is_dir() {
         return Ok(what.to_owned());
@@ -42,13 +43,14 @@ pub fn find(datasets_dir: &Path, what: &Path) -> Result<PathBuf, DatasetError> {
         return Ok(named);
     }
     if !is_name || what.exists() {
-        return Err(DatasetError::NotADataset { path: what.to_owned() });
+        return Err(DatasetError::no_dataset(what));
     }
-    Err(DatasetError::Unknown {
-        name: what.display().to_string(),
-        dir: datasets_dir.to_owned(),
-        known: list(datasets_dir)?,
-    })
+    Err(DatasetError::NotFound(format!(
+        "there is no data set {:?} in {}; there {}; `foreframe collect` creates one",
+        what.display().to_string(),
+        datasets_dir.display(),
+        existing(&list(datasets_dir)?)
+    )))
 }
 
 #[cfg(test)]

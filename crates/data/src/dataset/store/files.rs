@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::dataset::error::DatasetError;
@@ -15,6 +16,16 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetE
     fs::create_dir_all(directory)
         .and_then(|()| files::write_atomically(path, bytes))
         .map_err(DatasetError::io("write", path))
+}
+
+/// A value as JSON in one line.
+pub(crate) fn json_text(value: &impl Serialize) -> String {
+    serde_json::to_string(value).expect("a value without JSON is a bug")
+}
+
+/// A value as JSON with line breaks.
+pub(crate) fn pretty_json(value: &impl Serialize) -> String {
+    serde_json::to_string_pretty(value).expect("a value without JSON is a bug") + "\n"
 }
 
 /// Writes a file that appears when it is whole. Creates its directory if it is missing. `write` gets the name of the file to

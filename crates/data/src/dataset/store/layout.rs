@@ -1,14 +1,14 @@
 //! Paths in a data set's directory (LeRobot's v3.0 layout) and the content of its metadata files.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::dataset::{DatasetError, DatasetInfo};
 use foreframe_core::files::sha256_hex;
-use foreframe_core::frame::warp::CameraModel;
-use foreframe_core::types::{Channel, Seed};
+use foreframe_core::types::Channel;
 use foreframe_sim::{CameraConfig, WorldConfig};
 
 /// LeRobot's description. It is written last, so a directory without it is unfinished.
@@ -40,6 +40,31 @@ pub(crate) const INDEX: &str = "index";
 /// Counters that LeRobot stores for every frame.
 pub(crate) const COUNTERS: [&str; 4] = ["frame_index", "episode_index", INDEX, "task_index"];
 
+/// What a column holds.
+pub(crate) enum ColumnKind<'a> {
+    /// Images, as the bytes of PNG files.
+    Images,
+    /// These numbers of 32 bits of each frame.
+    Vectors(&'a [Channel]),
+    /// Seconds since the start of the episode.
+    Times,
+    Counters,
+}
+
+/// The columns of a shard in their order; without images if these are in videos.
+pub(crate) fn columns(info: &DatasetInfo, with_images: bool) -> impl Iterator<Item = (&'static str, ColumnKind<'_>)> {
+    let masks = info.has_masks.then_some((MASK, ColumnKind::Images));
+    let vectors = [(STATE, &info.state_channels), (ACTION, &info.action_channels)].into_iter();
+    let vectors = vectors.filter(|(_, channels)| !channels.is_empty());
+    let images = with_images.then_some((IMAGE, ColumnKind::Images));
+    images
+        .into_iter()
+        .chain(masks)
+        .chain(vectors.map(|(key, channels)| (key, ColumnKind::Vectors(channels))))
+        .chain([(TIMESTAMP, ColumnKind::Times)])
+        .chain(COUNTERS.map(|key| (key, ColumnKind::Counters)))
+}
+
 /// Number of a shard's chunk directory, and of its file in that directory.
 pub(crate) fn shard_location(shard: usize) -> (usize, usize) {
     (shard / CHUNK_FILES, shard % CHUNK_FILES)
@@ -52,7 +77,7 @@ pub(crate) fn shard_path(shard: usize) -> PathBuf {
 }
 
 /// One shard in the metadata.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ShardEntry {
     pub(crate) path: PathBuf,
@@ -62,53 +87,48 @@ pub(crate) struct ShardEntry {
 }
 
 /// The content of `meta/foreframe.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct DatasetMetadata {
     pub(crate) program_version: String,
-    pub(crate) name: String,
-    pub(crate) scenario: Option<String>,
-    pub(crate) seed: Option<Seed>,
-    pub(crate) frame_width_px: u32,
-    pub(crate) frame_height_px: u32,
-    pub(crate) frame_period_s: f64,
-    pub(crate) action_channels: Vec<Channel>,
-    pub(crate) state_channels: Vec<Channel>,
-    pub(crate) has_masks: bool,
-    /// Absent in data sets that were collected before it was recorded.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) camera: Option<CameraModel>,
-    pub(crate) content_hash: String,
+    #[serde(flatten)]
+    info: DatasetInfo,
     pub(crate) episodes_sha256: String,
     pub(crate) shards: Vec<ShardEntry>,
 }
 
 impl DatasetMetadata {
-    /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotADataset`, `OtherTool`,
-    /// `Corrupt`.
+    /// The metadata of a data set with these shards.
+    pub(crate) fn new(info: DatasetInfo, shards: Vec<ShardEntry>, episodes_sha256: String) -> Self {
+        Self {
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+            info: DatasetInfo {
+                content_hash: content_hash(&shards),
+                ..info
+            },
+            episodes_sha256,
+            shards,
+        }
+    }
+
+    /// Reads and checks the metadata of a finished data set. Errors: `Unfinished`, `NotFound`, `OtherTool`, `Corrupt`.
     pub(crate) fn read(directory: &Path) -> Result<Self, DatasetError> {
-        let arguments = directory.join(ARGUMENTS);
         if !directory.join(INFO).exists() {
-            let found = std::fs::read_to_string(arguments);
-            return Err(
-                match found.or_else(|_| std::fs::read_to_string(directory.join(IMPORT_ARGUMENTS))) {
-                    Ok(text) => DatasetError::Unfinished {
-                        path: directory.to_owned(),
-                        arguments: one_line(&text),
-                    },
-                    Err(_) => DatasetError::NotADataset {
-                        path: directory.to_owned(),
-                    },
+            let mut arguments = [ARGUMENTS, IMPORT_ARGUMENTS].into_iter();
+            let found = arguments.find_map(|path| fs::read_to_string(directory.join(path)).ok());
+            return Err(found.map_or_else(
+                || DatasetError::no_dataset(directory),
+                |text| DatasetError::Unfinished {
+                    path: directory.to_owned(),
+                    arguments: one_line(&text),
                 },
-            );
+            ));
         }
         let path = directory.join(METADATA);
         if !path.exists() {
-            return Err(DatasetError::OtherTool {
-                path: directory.to_owned(),
-            });
+            return Err(DatasetError::OtherTool(directory.to_owned()));
         }
-        let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+        let text = fs::read(&path).map_err(DatasetError::io("read", &path))?;
         Self::parse(&path, &text)
     }
 
@@ -125,7 +145,7 @@ impl DatasetMetadata {
     /// Parses and checks the text of a metadata file. Errors: `Corrupt`; they name `path`.
     pub(crate) fn parse(path: &Path, text: &[u8]) -> Result<Self, DatasetError> {
         let metadata: Self = serde_json::from_slice(text).map_err(|error| DatasetError::corrupt(path, &error))?;
-        if metadata.content_hash != content_hash(&metadata.shards) {
+        if metadata.info.content_hash != content_hash(&metadata.shards) {
             let reason = "its content hash does not match the shards that it lists";
             return Err(DatasetError::corrupt(path, &reason));
         }
@@ -135,20 +155,9 @@ impl DatasetMetadata {
     /// The description of the data set.
     pub(crate) fn info(&self) -> DatasetInfo {
         DatasetInfo {
-            name: self.name.clone(),
-            frame_width_px: self.frame_width_px,
-            frame_height_px: self.frame_height_px,
-            frame_period_s: self.frame_period_s,
-            action_channels: self.action_channels.clone(),
-            state_channels: self.state_channels.clone(),
-            content_hash: self.content_hash.clone(),
-            scenario: self.scenario.clone(),
-            seed: self.seed,
             frame_count: self.shards.iter().map(|shard| shard.frames).sum(),
             episode_count: self.shards.iter().map(|shard| shard.episodes).sum(),
-            has_masks: self.has_masks,
-            camera: self.camera,
-            world: None,
+            ..self.info.clone()
         }
     }
 }
@@ -157,7 +166,6 @@ impl DatasetMetadata {
 #[derive(Deserialize)]
 struct CollectedWith {
     /// None where no world was simulated.
-    #[serde(default)]
     world: Option<WorldConfig>,
 }
 
@@ -167,7 +175,7 @@ fn collected_world(directory: &Path) -> Result<Option<WorldConfig>, DatasetError
     if !path.exists() {
         return Ok(None);
     }
-    let text = std::fs::read(&path).map_err(DatasetError::io("read", &path))?;
+    let text = fs::read(&path).map_err(DatasetError::io("read", &path))?;
     let arguments: CollectedWith =
         serde_json::from_slice(&text).map_err(|error| DatasetError::corrupt(&path, &error))?;
     Ok(arguments.world)
@@ -213,57 +221,57 @@ fn frame_rate(period_s: f64) -> Value {
     }
 }
 
-fn lerobot_features(info: &DatasetInfo) -> Value {
-    let image = json!({
-        "dtype": "image",
-        "shape": [info.frame_height_px, info.frame_width_px, 1],
-        "names": ["height", "width", "channels"],
-    });
-    let mut features = serde_json::Map::new();
-    features.insert(IMAGE.to_owned(), image.clone());
-    if info.has_masks {
-        features.insert(MASK.to_owned(), image);
-    }
-    for (key, channels) in [(STATE, &info.state_channels), (ACTION, &info.action_channels)] {
-        if !channels.is_empty() {
-            let names: Vec<_> = channels.iter().map(|channel| &channel.name).collect();
-            features.insert(
-                key.to_owned(),
-                json!({"dtype": "float32", "shape": [channels.len()], "names": names}),
-            );
-        }
-    }
-    let scalar = |dtype: &str| json!({"dtype": dtype, "shape": [1], "names": null});
-    features.insert(TIMESTAMP.to_owned(), scalar("float32"));
-    for key in COUNTERS {
-        features.insert(key.to_owned(), scalar("int64"));
-    }
-    Value::Object(features)
+fn lerobot_features(info: &DatasetInfo) -> Map<String, Value> {
+    let feature = |(key, kind): (&str, _)| {
+        let (dtype, shape, names) = match kind {
+            ColumnKind::Images => (
+                "image",
+                vec![info.frame_height_px as usize, info.frame_width_px as usize, 1],
+                json!(["height", "width", "channels"]),
+            ),
+            ColumnKind::Vectors(channels) => (
+                "float32",
+                vec![channels.len()],
+                channels.iter().map(|channel| channel.name.as_str()).collect(),
+            ),
+            ColumnKind::Times => ("float32", vec![1], Value::Null),
+            ColumnKind::Counters => ("int64", vec![1], Value::Null),
+        };
+        (key.to_owned(), json!({"dtype": dtype, "shape": shape, "names": names}))
+    };
+    columns(info, true).map(feature).collect()
 }
 
 /// The columns in the format of the `datasets` library, for the Parquet schema's `huggingface` entry.
-pub(crate) fn huggingface_features(info: &DatasetInfo) -> Value {
+pub(crate) fn huggingface_features(info: &DatasetInfo, with_images: bool) -> Value {
     let value = |dtype: &str| json!({"dtype": dtype, "_type": "Value"});
-    let mut features = serde_json::Map::new();
-    features.insert(IMAGE.to_owned(), json!({"_type": "Image"}));
-    if info.has_masks {
-        features.insert(MASK.to_owned(), json!({"_type": "Image"}));
-    }
-    for (key, size) in [(STATE, info.state_channels.len()), (ACTION, info.action_channels.len())] {
-        match size {
-            0 => {}
-            1 => {
-                features.insert(key.to_owned(), value("float32"));
+    let feature = |(key, kind): (&str, _)| {
+        let described = match kind {
+            ColumnKind::Images => json!({"_type": "Image"}),
+            ColumnKind::Vectors(channels) if channels.len() > 1 => {
+                json!({"feature": value("float32"), "length": channels.len(), "_type": "Sequence"})
             }
-            _ => {
-                let list = json!({"feature": value("float32"), "length": size, "_type": "Sequence"});
-                features.insert(key.to_owned(), list);
-            }
-        }
-    }
-    features.insert(TIMESTAMP.to_owned(), value("float32"));
-    for key in COUNTERS {
-        features.insert(key.to_owned(), value("int64"));
-    }
+            ColumnKind::Vectors(_) | ColumnKind::Times => value("float32"),
+            ColumnKind::Counters => value("int64"),
+        };
+        (key.to_owned(), described)
+    };
+    let features: Map<String, Value> = columns(info, with_images).map(feature).collect();
     json!({"info": {"features": features}})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unknown_fields_of_the_metadata_are_refused() {
+        let metadata = DatasetMetadata::new(DatasetInfo::default(), Vec::new(), String::new());
+        let text = serde_json::to_string(&metadata).unwrap();
+        let path = Path::new(METADATA);
+        assert!(DatasetMetadata::parse(path, text.as_bytes()).is_ok());
+        let changed = text.replacen("{", "{\"colour\":1,", 1);
+        let error = DatasetMetadata::parse(path, changed.as_bytes()).err().unwrap();
+        assert!(error.to_string().contains("unknown field `colour`"), "{error}");
+    }
 }

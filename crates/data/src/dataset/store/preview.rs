@@ -4,13 +4,13 @@ use std::path::Path;
 
 use super::files::verify;
 use super::layout::{DatasetMetadata, EPISODES};
-use super::shard_reader::{FrameTarget, ShardSlot, read};
+use super::shard_reader::{ImageTarget, Shard};
 use super::tables::read_episodes;
 use crate::dataset::{Dataset, DatasetError, DatasetInfo};
 use foreframe_core::frame::Frame;
 
 /// The description of the finished data set in a directory, without reading its frames.
-/// Errors: `NotADataset`, `Unfinished`, `Corrupt`, `Io`.
+/// Errors: `NotFound`, `Unfinished`, `Corrupt`, `Io`.
 pub fn describe(directory: &Path) -> Result<DatasetInfo, DatasetError> {
     DatasetMetadata::read(directory)?.info_in(directory)
 }
@@ -25,47 +25,35 @@ impl Dataset {
     /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
     pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {
         let metadata = DatasetMetadata::read(directory)?;
-        let info = metadata.info();
-        let missing = || DatasetError::NoEpisode {
-            name: info.name.clone(),
-            episode,
-            count: info.episode_count,
+        let info = DatasetInfo {
+            // They are not read.
+            has_masks: false,
+            ..metadata.info()
         };
-        let (mut first_episode, mut first_frame) = (0, 0);
-        let shard = metadata.shards.iter().find(|shard| {
-            let holds_it = episode < first_episode + shard.episodes;
-            if !holds_it {
-                first_episode += shard.episodes;
-                first_frame += shard.frames;
-            }
-            holds_it
-        });
+        let missing = || {
+            let (name, count) = (&info.name, info.episode_count);
+            DatasetError::NoEpisode(format!(
+                "there is no episode {episode} in \"{name}\"; it has {count}, counted from 0"
+            ))
+        };
+        let shards = Shard::all(directory, &metadata);
+        let shard = shards.iter().find(|shard| shard.episodes.contains(&episode));
         let shard = shard.ok_or_else(missing)?;
         let table = directory.join(EPISODES);
         verify(&table, &metadata.episodes_sha256)?;
-        let wanted = read_episodes(&table, &info)?
-            .into_iter()
-            .nth(episode)
-            .ok_or_else(missing)?;
-        let path = directory.join(&shard.path);
-        verify(&path, &shard.sha256)?;
-        let size = info.frame_pixels();
-        let mut pixels = vec![0; shard.frames * size];
-        let mut slot = ShardSlot {
-            path,
-            frames: shard.frames,
-            first_frame,
-            target: FrameTarget::Memory {
-                pixels: &mut pixels,
-                masks: None,
-            },
-        };
-        read(&info, &mut slot)?;
-        let start = wanted.first_frame.saturating_sub(first_frame);
-        let frames = pixels.chunks(size).skip(start).take(wanted.frame_count);
+        let episodes = read_episodes(&table, &info)?;
+        let wanted = episodes.get(episode).ok_or_else(missing)?;
+        let content = shard.read(&info, ImageTarget::Memory)?;
+        let start = wanted.first_frame.saturating_sub(shard.frames.start);
+        let frames = content.pixels.into_iter().skip(start).take(wanted.frame_count);
         frames
-            .map(|pixels| Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec()))
-            .collect::<Result<_, _>>()
-            .map_err(|error| DatasetError::Description(error.to_string()))
+            .map(|pixels| {
+                Ok(Frame::new(
+                    info.frame_width_px,
+                    info.frame_height_px,
+                    pixels.into_vec(),
+                )?)
+            })
+            .collect()
     }
 }

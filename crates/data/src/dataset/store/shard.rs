@@ -16,7 +16,8 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 use serde::{Deserialize, Serialize};
 
-use super::layout::{ACTION, COUNTERS, IMAGE, MASK, STATE, TIMESTAMP, huggingface_features};
+use super::files::json_text;
+use super::layout::{ACTION, ColumnKind, IMAGE, MASK, STATE, TIMESTAMP, columns, huggingface_features};
 use super::stats::ChannelStats;
 use crate::dataset::check::check_episode;
 use crate::dataset::{DatasetError, DatasetInfo, EpisodeData};
@@ -51,59 +52,46 @@ impl EncodedEpisode {
         check_episode(info, episode, &data)?;
         let frames = data.timestamps_s.len();
         let timestamps_s: Vec<f32> = data.timestamps_s.iter().map(|&time| time as f32).collect();
-        let mut stats = BTreeMap::from([
-            (IMAGE.to_owned(), ChannelStats::of_pixels(&data.pixels, frames)),
-            (TIMESTAMP.to_owned(), rows_stats(&timestamps_s, 1)),
-        ]);
+        let mut stats = BTreeMap::from([(IMAGE.to_owned(), ChannelStats::of_pixels(&data.pixels, frames))]);
         if let Some(masks) = &data.masks {
             stats.insert(MASK.to_owned(), ChannelStats::of_pixels(masks, frames));
         }
         for (key, values, size) in [
             (STATE, &data.states, info.state_channels.len()),
             (ACTION, &data.actions, info.action_channels.len()),
+            (TIMESTAMP, &timestamps_s, 1),
         ] {
             if size > 0 {
-                stats.insert(key.to_owned(), rows_stats(values, size));
+                let values: Vec<f64> = values.iter().map(|&value| f64::from(value)).collect();
+                stats.insert(key.to_owned(), ChannelStats::of_rows(&values, size));
             }
         }
-        let trial = data.trial.as_ref().map(serde_json::to_string).transpose();
+        let masks = data.masks.as_deref().map(|masks| encode_frames(info, masks));
         Ok(Self {
             images: encode_frames(info, &data.pixels)?,
-            masks: data
-                .masks
-                .as_deref()
-                .map(|masks| encode_frames(info, masks))
-                .transpose()?,
+            masks: masks.transpose()?,
             actions: data.actions,
             states: data.states,
             timestamps_s,
             record: EpisodeRecord {
                 frames,
-                trial: trial.map_err(|error| DatasetError::Description(error.to_string()))?,
+                trial: data.trial.as_ref().map(json_text),
                 stats,
             },
         })
     }
 }
 
-fn rows_stats(values: &[f32], size: usize) -> ChannelStats {
-    let values: Vec<f64> = values.iter().map(|&value| f64::from(value)).collect();
-    ChannelStats::of_rows(&values, size)
-}
-
 fn encode_frames(info: &DatasetInfo, pixels: &[u8]) -> Result<Vec<Vec<u8>>, DatasetError> {
-    pixels
-        .chunks(info.frame_pixels())
-        .map(|frame| {
-            Frame::new(info.frame_width_px, info.frame_height_px, frame.to_vec())
-                .and_then(|frame| codec::encode_png(&frame))
-                .map_err(DatasetError::Encode)
-        })
-        .collect()
+    let encode = |pixels: &[u8]| {
+        let frame = Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec())?;
+        Ok(codec::encode_png(&frame)?)
+    };
+    pixels.chunks(info.frame_pixels()).map(encode).collect()
 }
 
 /// Position of a shard in its data set.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ShardStart {
     /// Number of episodes before it.
     pub(crate) episode: usize,
@@ -111,50 +99,39 @@ pub(crate) struct ShardStart {
     pub(crate) frame: usize,
 }
 
-/// The bytes of a shard, and its episode records as JSON.
-pub(crate) struct ShardBytes {
-    pub(crate) bytes: Vec<u8>,
-    pub(crate) records: String,
+impl ShardStart {
+    /// The position after an episode.
+    pub(crate) fn after(self, episode: &EpisodeRecord) -> Self {
+        Self {
+            episode: self.episode + 1,
+            frame: self.frame + episode.frames,
+        }
+    }
 }
 
-/// Writes a shard's episodes as a Parquet file in memory. Errors: `Build`, `Description`.
+/// Writes a shard's episodes as a Parquet file in memory. Returns its bytes, and the episode records as JSON. Errors: `Build`.
 pub(crate) fn build(
     info: &DatasetInfo,
     start: ShardStart,
     episodes: &[EncodedEpisode],
-) -> Result<ShardBytes, DatasetError> {
-    let records: Vec<_> = episodes.iter().map(|episode| &episode.record).collect();
-    let records = serde_json::to_string(&records).map_err(|error| DatasetError::Description(error.to_string()))?;
-    let bytes = write_parquet(info, start, episodes, &records).map_err(DatasetError::Build)?;
-    Ok(ShardBytes { bytes, records })
-}
-
-fn write_parquet(
-    info: &DatasetInfo,
-    start: ShardStart,
-    episodes: &[EncodedEpisode],
-    records: &str,
-) -> Result<Vec<u8>, ParquetError> {
-    let schema = schema(info);
+) -> Result<(Vec<u8>, String), DatasetError> {
+    let records = json_text(&episodes.iter().map(|episode| &episode.record).collect::<Vec<_>>());
+    let schema = schema(info, true);
     let mut writer = ArrowWriter::try_new(Vec::new(), schema.clone(), Some(properties()))?;
     let mut next = start;
     for episode in episodes {
         writer.write(&batch(info, &schema, next, episode)?)?;
         writer.flush()?;
-        next = ShardStart {
-            episode: next.episode + 1,
-            frame: next.frame + episode.record.frames,
-        };
+        next = next.after(&episode.record);
     }
-    writer.append_key_value_metadata(KeyValue::new(RECORDS_KEY.to_owned(), records.to_owned()));
-    writer.into_inner()
+    writer.append_key_value_metadata(KeyValue::new(RECORDS_KEY.to_owned(), records.clone()));
+    Ok((writer.into_inner()?, records))
 }
 
 /// PNG images are already compressed, so their column is not compressed again. Masks often repeat, so their column keeps
 /// its dictionary.
 fn properties() -> WriterProperties {
-    let image = ColumnPath::new(vec![IMAGE.to_owned(), "bytes".to_owned()]);
-    let mask = ColumnPath::new(vec![MASK.to_owned(), "bytes".to_owned()]);
+    let [image, mask] = [IMAGE, MASK].map(|key| ColumnPath::new(vec![key.to_owned(), "bytes".to_owned()]));
     WriterProperties::builder()
         .set_compression(Compression::SNAPPY)
         .set_column_compression(image.clone(), Compression::UNCOMPRESSED)
@@ -175,72 +152,63 @@ fn item_field() -> Arc<Field> {
     Arc::new(Field::new("element", DataType::Float32, true))
 }
 
-/// The type of a column of vectors: a plain number where they have one component, as LeRobot has it.
-fn vector_type(size: usize) -> DataType {
-    match size {
-        1 => DataType::Float32,
-        _ => DataType::FixedSizeList(item_field(), size as i32),
-    }
+/// The columns of a shard. Vectors of one component are plain numbers, as LeRobot has them.
+pub(crate) fn schema(info: &DatasetInfo, with_images: bool) -> SchemaRef {
+    let field = |(key, kind): (&str, _)| {
+        let data_type = match kind {
+            ColumnKind::Images => DataType::Struct(image_fields()),
+            ColumnKind::Vectors(channels) if channels.len() > 1 => {
+                DataType::FixedSizeList(item_field(), channels.len() as i32)
+            }
+            ColumnKind::Vectors(_) | ColumnKind::Times => DataType::Float32,
+            ColumnKind::Counters => DataType::Int64,
+        };
+        Field::new(key, data_type, true)
+    };
+    let metadata = HashMap::from([(
+        "huggingface".to_owned(),
+        huggingface_features(info, with_images).to_string(),
+    )]);
+    Arc::new(Schema::new(columns(info, with_images).map(field).collect::<Fields>()).with_metadata(metadata))
 }
 
-/// The columns of a shard.
-pub(crate) fn schema(info: &DatasetInfo) -> SchemaRef {
-    let mut fields = vec![Field::new(IMAGE, DataType::Struct(image_fields()), true)];
-    if info.has_masks {
-        fields.push(Field::new(MASK, DataType::Struct(image_fields()), true));
-    }
-    for (key, size) in [(STATE, info.state_channels.len()), (ACTION, info.action_channels.len())] {
-        if size > 0 {
-            fields.push(Field::new(key, vector_type(size), true));
-        }
-    }
-    fields.push(Field::new(TIMESTAMP, DataType::Float32, true));
-    fields.extend(COUNTERS.map(|key| Field::new(key, DataType::Int64, true)));
-    let metadata = HashMap::from([("huggingface".to_owned(), huggingface_features(info).to_string())]);
-    Arc::new(Schema::new(fields).with_metadata(metadata))
-}
-
-/// The rows of one episode.
+/// The rows of one episode, with images if the schema has them.
 pub(crate) fn batch(
     info: &DatasetInfo,
     schema: &SchemaRef,
     start: ShardStart,
     episode: &EncodedEpisode,
-) -> Result<RecordBatch, ArrowError> {
+) -> Result<RecordBatch, ParquetError> {
     let frames = episode.record.frames;
-    let mut columns = vec![image_column(&episode.images)?];
+    let mut columns = Vec::new();
+    if schema.index_of(IMAGE).is_ok() {
+        columns.push(image_column(&episode.images)?);
+    }
     if let Some(masks) = &episode.masks {
         columns.push(image_column(masks)?);
     }
     for (values, size) in [
         (&episode.states, info.state_channels.len()),
         (&episode.actions, info.action_channels.len()),
+        (&episode.timestamps_s, 1),
     ] {
         if size > 0 {
             columns.push(vector_column(values, size)?);
         }
     }
-    let counter = |value: fn(usize, usize) -> usize, first: usize| -> ArrayRef {
-        Arc::new(Int64Array::from_iter_values(
-            (0..frames).map(|frame| value(first, frame) as i64),
-        ))
-    };
-    columns.push(Arc::new(Float32Array::from(episode.timestamps_s.clone())));
-    columns.push(counter(|_, frame| frame, 0));
-    columns.push(counter(|first, _| first, start.episode));
-    columns.push(counter(|first, frame| first + frame, start.frame));
-    columns.push(counter(|_, _| 0, 0));
-    RecordBatch::try_new(schema.clone(), columns)
+    // As `COUNTERS`: how each begins, and by how much it grows from frame to frame.
+    for (first, step) in [(0, 1), (start.episode, 0), (start.frame, 1), (0, 0)] {
+        let values = (0..frames).map(|frame| (first + step * frame) as i64);
+        columns.push(Arc::new(Int64Array::from_iter_values(values)));
+    }
+    Ok(RecordBatch::try_new(schema.clone(), columns)?)
 }
 
 fn image_column(images: &[Vec<u8>]) -> Result<ArrayRef, ArrowError> {
     let bytes: ArrayRef = Arc::new(BinaryArray::from_iter_values(images));
     let paths: ArrayRef = Arc::new(StringArray::new_null(images.len()));
-    Ok(Arc::new(StructArray::try_new(
-        image_fields(),
-        vec![bytes, paths],
-        None,
-    )?))
+    let images = StructArray::try_new(image_fields(), vec![bytes, paths], None)?;
+    Ok(Arc::new(images))
 }
 
 fn vector_column(values: &[f32], size: usize) -> Result<ArrayRef, ArrowError> {
@@ -248,10 +216,6 @@ fn vector_column(values: &[f32], size: usize) -> Result<ArrayRef, ArrowError> {
     if size == 1 {
         return Ok(numbers);
     }
-    Ok(Arc::new(FixedSizeListArray::try_new(
-        item_field(),
-        size as i32,
-        numbers,
-        None,
-    )?))
+    let vectors = FixedSizeListArray::try_new(item_field(), size as i32, numbers, None)?;
+    Ok(Arc::new(vectors))
 }

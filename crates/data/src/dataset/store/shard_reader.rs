@@ -1,29 +1,31 @@
 //! Reads a shard: the episode records from its footer, or its frames into memory.
 
+use std::fmt::Display;
 use std::fs::File;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{ArrowPrimitiveType, Float32Type, Int64Type};
-use arrow_array::{Array, BinaryArray, RecordBatch, StructArray};
+use arrow_array::{Array, ArrayRef, RecordBatch, StringArray};
 use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use super::layout::{ACTION, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
-use super::parquet_file;
-use super::parquet_file::Batches;
+use super::files::verify;
+use super::layout::{ACTION, DatasetMetadata, IMAGE, INDEX, MASK, STATE, TIMESTAMP};
+use super::parquet_file::{self, Batches};
 use super::shard::{EpisodeRecord, RECORDS_KEY};
-use crate::dataset::check::Numbers;
-use crate::dataset::frame_store::frame_file::{FrameFileWriter, FrameImage};
-use crate::dataset::{DatasetError, DatasetInfo, Episode};
-use foreframe_core::frame::codec;
+use crate::dataset::frame_store::FrameContent;
+use crate::dataset::frame_store::frame_file::FrameFileWriter;
+use crate::dataset::{DatasetError, DatasetInfo};
+use foreframe_core::frame::{Frame, codec};
 
 /// Rows that are read at a time, with their images.
 const IMAGE_ROWS: usize = 64;
 
 /// The records of a shard's episodes, from its footer. Errors: `Io`, `Corrupt`.
 pub(crate) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
-    let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let builder = parquet_file::open(file).map_err(|error| DatasetError::corrupt(path, &error))?;
+    let builder = open(path)?;
     let pairs = builder.metadata().file_metadata().key_value_metadata();
     let text = pairs
         .and_then(|pairs| pairs.iter().find(|pair| pair.key == RECORDS_KEY))
@@ -34,219 +36,162 @@ pub(crate) fn records(path: &Path) -> Result<Vec<EpisodeRecord>, DatasetError> {
 
 /// Reads all batches of a Parquet file. Errors: `Io`, `Corrupt`.
 pub(crate) fn batches(path: &Path) -> Result<Vec<RecordBatch>, DatasetError> {
-    let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let reader = parquet_file::open(file)
-        .and_then(parquet_file::batches)
-        .map_err(|error| DatasetError::corrupt(path, &error))?;
-    reader
-        .collect::<Result<_, _>>()
-        .map_err(|error| DatasetError::corrupt(path, &error))
+    let reader = parquet_file::batches(open(path)?).map_err(|error| DatasetError::corrupt(path, &error))?;
+    let batches: Result<Vec<_>, _> = reader.collect();
+    batches.map_err(|error| DatasetError::corrupt(path, &error))
 }
 
-/// Where the decoded frames of a shard go.
-pub(crate) enum FrameTarget<'a> {
-    /// The memory of the shard's frames.
-    Memory {
-        pixels: &'a mut [u8],
-        masks: Option<&'a mut [u8]>,
-    },
-    /// The file of all frames.
+fn open(path: &Path) -> Result<ParquetRecordBatchReaderBuilder<File>, DatasetError> {
+    let file = File::open(path).map_err(DatasetError::io("read", path))?;
+    parquet_file::open(file).map_err(|error| DatasetError::corrupt(path, &error))
+}
+
+/// Where the decoded images of shards go.
+#[derive(Clone, Copy)]
+pub(crate) enum ImageTarget<'a> {
+    Memory,
+    /// The file of all images.
     File(&'a FrameFileWriter<'a>),
     /// The images are not read.
     Nothing,
 }
 
-/// A shard to read, the expected number of frames, and where the frames go.
-pub(crate) struct ShardSlot<'a> {
+/// A shard of a data set.
+pub(crate) struct Shard {
     pub(crate) path: PathBuf,
-    pub(crate) frames: usize,
-    /// Its first frame, counted over the whole data set.
-    pub(crate) first_frame: usize,
-    pub(crate) target: FrameTarget<'a>,
+    pub(crate) sha256: String,
+    /// Its episodes, counted over the whole data set.
+    pub(crate) episodes: Range<usize>,
+    /// Its frames, counted over the whole data set.
+    pub(crate) frames: Range<usize>,
 }
 
-/// Actions, states and timestamps of frames.
-#[derive(Default)]
-pub(crate) struct ShardNumbers {
-    pub(crate) actions: Vec<f32>,
-    pub(crate) states: Vec<f32>,
-    pub(crate) timestamps_s: Vec<f64>,
-}
+impl Shard {
+    /// The shards of the data set in a directory.
+    pub(crate) fn all(directory: &Path, metadata: &DatasetMetadata) -> Vec<Self> {
+        let (mut episode, mut frame) = (0, 0);
+        let entries = metadata.shards.iter().map(|entry| {
+            (episode, frame) = (episode + entry.episodes, frame + entry.frames);
+            Self {
+                path: directory.join(&entry.path),
+                sha256: entry.sha256.clone(),
+                episodes: episode - entry.episodes..episode,
+                frames: frame - entry.frames..frame,
+            }
+        });
+        entries.collect()
+    }
 
-impl ShardNumbers {
-    /// The numbers of a whole data set from those of its shards.
-    pub(crate) fn joined(info: &DatasetInfo, parts: Vec<Self>) -> Self {
-        let mut all = Self {
-            actions: Vec::with_capacity(info.frame_count * info.action_channels.len()),
-            states: Vec::with_capacity(info.frame_count * info.state_channels.len()),
-            timestamps_s: Vec::with_capacity(info.frame_count),
+    /// Verifies the shard and reads it, a few rows at a time; decoded images go to the target.
+    /// Errors: `Io`, `HashDiffers`, `Corrupt`, `CorruptFrame`, `FrameFile`.
+    pub(crate) fn read(&self, info: &DatasetInfo, target: ImageTarget<'_>) -> Result<FrameContent, DatasetError> {
+        verify(&self.path, &self.sha256)?;
+        let mut content = FrameContent::default();
+        let wrong_rows = |found: usize| {
+            let stated = self.frames.len();
+            let reason = format!("it has {found} or more rows; its metadata states {stated}");
+            Err(DatasetError::corrupt(&self.path, &reason))
         };
-        for part in parts {
-            all.actions.extend(part.actions);
-            all.states.extend(part.states);
-            all.timestamps_s.extend(part.timestamps_s);
-        }
-        all
-    }
-
-    /// The numbers of an episode from those of its data set.
-    pub(crate) fn of_episode(&self, info: &DatasetInfo, episode: &Episode) -> Numbers<'_> {
-        let frames = episode.frames();
-        let (actions, states) = (info.action_channels.len(), info.state_channels.len());
-        Numbers {
-            actions: &self.actions[frames.start * actions..frames.end * actions],
-            states: &self.states[frames.start * states..frames.end * states],
-            timestamps_s: &self.timestamps_s[frames],
-        }
-    }
-}
-
-/// Reads a shard, a few rows at a time, and decodes its frames into the slot's target.
-/// Errors: `Io`, `Corrupt`, `CorruptFrame`, `FrameFile`.
-pub(crate) fn read(info: &DatasetInfo, slot: &mut ShardSlot<'_>) -> Result<ShardNumbers, DatasetError> {
-    let mut numbers = ShardNumbers::default();
-    let mut row = 0;
-    let with_images = !matches!(slot.target, FrameTarget::Nothing);
-    for batch in reader(&slot.path, with_images)? {
-        let batch = batch.map_err(|error| DatasetError::corrupt(&slot.path, &error))?;
-        if row + batch.num_rows() > slot.frames {
-            return Err(wrong_rows(slot, row + batch.num_rows()));
-        }
-        read_batch(info, slot, &batch, row, &mut numbers)?;
-        row += batch.num_rows();
-    }
-    if row != slot.frames {
-        return Err(wrong_rows(slot, row));
-    }
-    Ok(numbers)
-}
-
-fn reader(path: &Path, with_images: bool) -> Result<Batches, DatasetError> {
-    let file = File::open(path).map_err(DatasetError::io("read", path))?;
-    let built = parquet_file::open(file).and_then(|builder| {
-        if with_images {
-            return parquet_file::batches(builder.with_batch_size(IMAGE_ROWS));
-        }
-        let columns = builder.schema().fields().iter().enumerate();
-        let numbers = columns.filter(|(_, column)| ![IMAGE, MASK].contains(&column.name().as_str()));
-        let numbers = numbers.map(|(index, _)| index).collect::<Vec<usize>>();
-        let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
-        parquet_file::batches(builder.with_projection(columns))
-    });
-    built.map_err(|error| DatasetError::corrupt(path, &error))
-}
-
-fn wrong_rows(slot: &ShardSlot<'_>, found: usize) -> DatasetError {
-    DatasetError::corrupt(
-        &slot.path,
-        &format!("it has {found} or more rows; its metadata states {}", slot.frames),
-    )
-}
-
-fn read_batch(
-    info: &DatasetInfo,
-    slot: &mut ShardSlot<'_>,
-    batch: &RecordBatch,
-    row: usize,
-    numbers: &mut ShardNumbers,
-) -> Result<(), DatasetError> {
-    let images = ImageBatch {
-        info,
-        path: &slot.path,
-        batch,
-        row,
-    };
-    let size = info.frame_pixels();
-    match &mut slot.target {
-        FrameTarget::Memory { pixels, masks } => {
-            let copy =
-                |to: &mut [u8], row: usize, frame: &[u8]| to[row * size..(row + 1) * size].copy_from_slice(frame);
-            images.decode(IMAGE, |row, frame| {
-                copy(pixels, row, frame);
-                Ok(())
-            })?;
-            if let Some(masks) = masks {
-                images.decode(MASK, |row, mask| {
-                    copy(masks, row, mask);
-                    Ok(())
-                })?;
+        for batch in self.batches(target)? {
+            let batch = batch.map_err(|error| DatasetError::corrupt(&self.path, &error))?;
+            let row = content.timestamps_s.len();
+            if row + batch.num_rows() > self.frames.len() {
+                return wrong_rows(row + batch.num_rows());
             }
-        }
-        FrameTarget::File(file) => {
-            let first = slot.first_frame;
-            images.decode(IMAGE, |row, frame| file.write(FrameImage::Pixels, first + row, frame))?;
-            if info.has_masks {
-                images.decode(MASK, |row, mask| file.write(FrameImage::Mask, first + row, mask))?;
+            let column = Column {
+                batch: &batch,
+                path: &self.path,
+            };
+            if !matches!(target, ImageTarget::Nothing) {
+                self.read_images(info, &column, target, &mut content)?;
             }
+            self.read_numbers(info, &column, &mut content)?;
         }
-        FrameTarget::Nothing => {}
+        match content.timestamps_s.len() {
+            rows if rows == self.frames.len() => Ok(content),
+            rows => wrong_rows(rows),
+        }
     }
-    let column = Column {
-        batch,
-        path: &slot.path,
-    };
-    numbers.states.extend(column.vectors(STATE, info.state_channels.len())?);
-    numbers
-        .actions
-        .extend(column.vectors(ACTION, info.action_channels.len())?);
-    let times = column.numbers::<Float32Type>(TIMESTAMP)?;
-    numbers.timestamps_s.extend(times.iter().map(|&time| f64::from(time)));
-    let first = (slot.first_frame + row) as i64;
-    let indexes = column.numbers::<Int64Type>(INDEX)?;
-    if indexes.iter().zip(first..).any(|(&found, expected)| found != expected) {
-        return Err(DatasetError::corrupt(
-            &slot.path,
-            &"its column \"index\" does not number the frames one after another",
-        ));
+
+    fn batches(&self, target: ImageTarget<'_>) -> Result<Batches, DatasetError> {
+        let builder = open(&self.path)?;
+        let builder = if matches!(target, ImageTarget::Nothing) {
+            let columns = builder.schema().fields().iter().enumerate();
+            let numbers = columns.filter(|(_, column)| ![IMAGE, MASK].contains(&column.name().as_str()));
+            let numbers: Vec<usize> = numbers.map(|(index, _)| index).collect();
+            let columns = ProjectionMask::roots(builder.parquet_schema(), numbers);
+            builder.with_projection(columns)
+        } else {
+            builder.with_batch_size(IMAGE_ROWS)
+        };
+        parquet_file::batches(builder).map_err(|error| DatasetError::corrupt(&self.path, &error))
     }
-    Ok(())
-}
 
-/// The images of a batch.
-struct ImageBatch<'a> {
-    info: &'a DatasetInfo,
-    path: &'a Path,
-    batch: &'a RecordBatch,
-    /// The batch's first row in the shard.
-    row: usize,
-}
-
-impl ImageBatch<'_> {
-    /// Decodes a column, and gives each image's row in the shard and its pixels to `take`.
-    fn decode(
+    /// Decodes the images and masks of a batch that follows the content.
+    fn read_images(
         &self,
-        key: &'static str,
-        mut take: impl FnMut(usize, &[u8]) -> Result<(), DatasetError>,
+        info: &DatasetInfo,
+        column: &Column<'_>,
+        target: ImageTarget<'_>,
+        content: &mut FrameContent,
     ) -> Result<(), DatasetError> {
-        let images = image_bytes(self.batch, key)
-            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of images")))?;
-        let (width, height) = (self.info.frame_width_px, self.info.frame_height_px);
-        for index in 0..images.len() {
-            let row = self.row + index;
-            let frame = codec::decode(images.value(index)).map_err(|source| DatasetError::CorruptFrame {
-                path: self.path.to_owned(),
-                row,
-                column: key,
-                source,
-            })?;
-            if (frame.width(), frame.height()) != (width, height) {
-                let reason = format!(
-                    "{key} in row {row} is {}×{} px; the data set has frames of {width}×{height} px",
-                    frame.width(),
-                    frame.height()
-                );
-                return Err(DatasetError::corrupt(self.path, &reason));
+        let first_row = content.timestamps_s.len();
+        let pixels = Some((IMAGE, 0, &mut content.pixels));
+        let masks = info.has_masks.then_some((MASK, info.frame_count, &mut content.masks));
+        for (key, first_image, held) in pixels.into_iter().chain(masks) {
+            for (image, row) in column.images(key)?.zip(first_row..) {
+                let frame = self.decode(info, key, row, image)?;
+                match target {
+                    ImageTarget::Memory => held.push(frame.into_pixels().into_boxed_slice()),
+                    ImageTarget::File(file) => file.write(first_image + self.frames.start + row, frame.pixels())?,
+                    ImageTarget::Nothing => {}
+                }
             }
-            take(row, frame.pixels())?;
         }
         Ok(())
     }
-}
 
-pub(crate) fn image_bytes<'a>(batch: &'a RecordBatch, key: &str) -> Option<&'a BinaryArray> {
-    let images: &StructArray = batch.column_by_name(key)?.as_struct_opt()?;
-    let bytes = images.column_by_name("bytes")?.as_binary_opt::<i32>()?;
-    (bytes.null_count() == 0).then_some(bytes)
+    fn decode(
+        &self,
+        info: &DatasetInfo,
+        column: &'static str,
+        row: usize,
+        image: &[u8],
+    ) -> Result<Frame, DatasetError> {
+        let damaged =
+            |source| DatasetError::CorruptFrame(format!("{}, row {row}: {column}", self.path.display()), source);
+        let frame = codec::decode(image).map_err(damaged)?;
+        let (width, height) = (info.frame_width_px, info.frame_height_px);
+        if (frame.width(), frame.height()) == (width, height) {
+            return Ok(frame);
+        }
+        let reason = format!(
+            "{column} in row {row} is {}×{} px; the data set has frames of {width}×{height} px",
+            frame.width(),
+            frame.height()
+        );
+        Err(DatasetError::corrupt(&self.path, &reason))
+    }
+
+    fn read_numbers(
+        &self,
+        info: &DatasetInfo,
+        column: &Column<'_>,
+        content: &mut FrameContent,
+    ) -> Result<(), DatasetError> {
+        let first = (self.frames.start + content.timestamps_s.len()) as i64;
+        let (states, actions) = (info.state_channels.len(), info.action_channels.len());
+        content.states.extend(column.vectors(STATE, states)?);
+        content.actions.extend(column.vectors(ACTION, actions)?);
+        let times = column.numbers::<Float32Type>(TIMESTAMP)?;
+        content.timestamps_s.extend(times.iter().map(|&time| f64::from(time)));
+        let indexes = column.numbers::<Int64Type>(INDEX)?;
+        if indexes.iter().zip(first..).all(|(&found, expected)| found == expected) {
+            return Ok(());
+        }
+        let reason = "its column \"index\" does not number the frames one after another";
+        Err(DatasetError::corrupt(&self.path, &reason))
+    }
 }
 
 /// The columns of a batch. Errors name the file and the column.
@@ -256,14 +201,32 @@ pub(crate) struct Column<'a> {
 }
 
 impl<'a> Column<'a> {
+    /// What `cast` finds in a column; `what` names it for the error. Errors: `Corrupt`.
+    fn cast<T>(
+        &self,
+        key: &str,
+        what: impl Display,
+        cast: impl FnOnce(&'a ArrayRef) -> Option<T>,
+    ) -> Result<T, DatasetError> {
+        let found = self.batch.column_by_name(key).and_then(cast);
+        found.ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of {what}")))
+    }
+
+    /// The encoded images of a column without null values. Errors: `Corrupt`.
+    pub(crate) fn images(&self, key: &str) -> Result<impl Iterator<Item = &'a [u8]> + use<'a>, DatasetError> {
+        let images = self.cast(key, "images", |column| {
+            let bytes = column.as_struct_opt()?.column_by_name("bytes")?.as_binary_opt::<i32>()?;
+            (bytes.null_count() == 0).then_some(bytes)
+        })?;
+        Ok(images.iter().flatten())
+    }
+
     /// The numbers of a column without null values. Errors: `Corrupt`.
     pub(crate) fn numbers<T: ArrowPrimitiveType>(&self, key: &str) -> Result<&'a [T::Native], DatasetError> {
-        self.batch
-            .column_by_name(key)
-            .and_then(|column| column.as_primitive_opt::<T>())
-            .filter(|column| column.null_count() == 0)
-            .map(|column| &column.values()[..])
-            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of {}", T::DATA_TYPE)))
+        self.cast(key, T::DATA_TYPE, |column| {
+            let numbers = column.as_primitive_opt::<T>()?;
+            (numbers.null_count() == 0).then_some(&numbers.values()[..])
+        })
     }
 
     /// The vectors of a column, `size` numbers each, one after another; empty if `size` is 0. Errors: `Corrupt`.
@@ -273,40 +236,28 @@ impl<'a> Column<'a> {
             1 => return self.numbers::<Float32Type>(key),
             _ => {}
         }
-        let list = self
-            .batch
-            .column_by_name(key)
-            .and_then(|column| column.as_fixed_size_list_opt())
-            .filter(|list| list.null_count() == 0)
-            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of vectors")))?;
-        if list.value_length() as usize != size {
-            let reason = format!(
-                "column \"{key}\" has {} components; the metadata states {size}",
-                list.value_length()
-            );
+        let list = self.cast(key, "vectors", |column| {
+            let list = column.as_fixed_size_list_opt()?;
+            (list.null_count() == 0).then_some(list)
+        })?;
+        let found = list.value_length();
+        if found as usize != size {
+            let reason = format!("column \"{key}\" has {found} components; the metadata states {size}");
             return Err(DatasetError::corrupt(self.path, &reason));
         }
-        let values = list.values().as_primitive_opt::<Float32Type>();
         // A slice of a list array still refers to all values. Select those of its rows.
         let first = list.value_offset_at(0);
         let rows = first..first + list.len() * size;
-        values
-            .filter(|values| values.null_count() == 0)
-            .and_then(|values| values.values().get(rows))
-            .ok_or_else(|| {
-                DatasetError::corrupt(
-                    self.path,
-                    &format!("column \"{key}\" does not contain 32-bit floating-point numbers"),
-                )
-            })
+        let values = list.values().as_primitive_opt::<Float32Type>();
+        let values = values.filter(|values| values.null_count() == 0);
+        values.and_then(|values| values.values().get(rows)).ok_or_else(|| {
+            let reason = format!("column \"{key}\" does not contain 32-bit floating-point numbers");
+            DatasetError::corrupt(self.path, &reason)
+        })
     }
 
     /// The texts of a column; null values become none. Errors: `Corrupt`.
-    pub(crate) fn texts(&self, key: &str) -> Result<Vec<Option<&'a str>>, DatasetError> {
-        self.batch
-            .column_by_name(key)
-            .and_then(|column| column.as_string_opt::<i32>())
-            .map(|column| column.iter().collect())
-            .ok_or_else(|| DatasetError::corrupt(self.path, &format!("it has no column \"{key}\" of text")))
+    pub(crate) fn texts(&self, key: &str) -> Result<&'a StringArray, DatasetError> {
+        self.cast(key, "text", |column| column.as_string_opt::<i32>())
     }
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// Statistics of one column, with one value for each component.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ChannelStats {
     pub(crate) min: Vec<f64>,
     pub(crate) max: Vec<f64>,
@@ -13,21 +13,34 @@ pub(crate) struct ChannelStats {
     pub(crate) count: u64,
 }
 
+/// Minimum, maximum, mean and variance of one component.
+type ComponentStats = [f64; 4];
+
 impl ChannelStats {
-    /// Statistics of rows of `size` numbers, one row for each frame.
-    pub(crate) fn of_rows(rows: &[f64], size: usize) -> Self {
-        let count = rows.len() / size.max(1);
-        let mut stats = Self::with_components(size, count as u64);
-        for component in 0..size {
-            let values = || rows.iter().skip(component).step_by(size);
-            let mean = values().sum::<f64>() / count as f64;
-            let variance = values().map(|value| (value - mean).powi(2)).sum::<f64>() / count as f64;
-            stats.min.push(values().copied().fold(f64::INFINITY, f64::min));
-            stats.max.push(values().copied().fold(f64::NEG_INFINITY, f64::max));
+    fn new(count: u64, components: impl Iterator<Item = ComponentStats>) -> Self {
+        let mut stats = Self {
+            count,
+            ..Self::default()
+        };
+        for [min, max, mean, variance] in components {
+            stats.min.push(min);
+            stats.max.push(max);
             stats.mean.push(mean);
             stats.std.push(variance.sqrt());
         }
         stats
+    }
+
+    /// Statistics of rows of `size` numbers, one row for each frame.
+    pub(crate) fn of_rows(rows: &[f64], size: usize) -> Self {
+        let count = rows.len() / size.max(1);
+        let components = (0..size).map(|component| {
+            let values = || rows.iter().skip(component).step_by(size);
+            let mean = values().sum::<f64>() / count as f64;
+            let variance = values().map(|value| (value - mean).powi(2)).sum::<f64>() / count as f64;
+            [least(values().copied()), greatest(values().copied()), mean, variance]
+        });
+        Self::new(count as u64, components)
     }
 
     /// Statistics of the pixels of `frames` frames, scaled so that 255 is 1.
@@ -39,50 +52,37 @@ impl ChannelStats {
         let total = pixels.len() as f64;
         let levels = || (0..256).map(|level| f64::from(level) / 255.0).zip(histogram);
         let mean = levels().map(|(value, count)| value * count as f64).sum::<f64>() / total;
-        let variance = levels()
-            .map(|(value, count)| (value - mean).powi(2) * count as f64)
-            .sum::<f64>()
-            / total;
+        let squares = levels().map(|(value, count)| (value - mean).powi(2) * count as f64);
+        let variance = squares.sum::<f64>() / total;
         let present = || levels().filter(|&(_, count)| count > 0).map(|(value, _)| value);
-        Self {
-            min: vec![present().fold(f64::INFINITY, f64::min)],
-            max: vec![present().fold(f64::NEG_INFINITY, f64::max)],
-            mean: vec![mean],
-            std: vec![variance.sqrt()],
-            count: frames as u64,
-        }
+        let component = [least(present()), greatest(present()), mean, variance];
+        Self::new(frames as u64, std::iter::once(component))
     }
 
     /// Statistics of all parts together, each weighted by its number of frames.
     pub(crate) fn merged(parts: &[&Self]) -> Self {
         let size = parts.first().map_or(0, |part| part.mean.len());
         let count: u64 = parts.iter().map(|part| part.count).sum();
-        let mut stats = Self::with_components(size, count);
-        for component in 0..size {
+        let components = (0..size).map(|component| {
             let mean_of = |value: &dyn Fn(&Self) -> f64| {
                 parts.iter().map(|part| part.count as f64 * value(part)).sum::<f64>() / count as f64
             };
             let mean = mean_of(&|part| part.mean[component]);
             let variance = mean_of(&|part| part.std[component].powi(2) + (part.mean[component] - mean).powi(2));
-            let all = |column: fn(&Self) -> &Vec<f64>| parts.iter().map(move |part| column(part)[component]);
-            stats.min.push(all(|part| &part.min).fold(f64::INFINITY, f64::min));
-            stats.max.push(all(|part| &part.max).fold(f64::NEG_INFINITY, f64::max));
-            stats.mean.push(mean);
-            stats.std.push(variance.sqrt());
-        }
-        stats
+            let min = least(parts.iter().map(|part| part.min[component]));
+            let max = greatest(parts.iter().map(|part| part.max[component]));
+            [min, max, mean, variance]
+        });
+        Self::new(count, components)
     }
+}
 
-    fn with_components(size: usize, count: u64) -> Self {
-        let empty = || Vec::with_capacity(size);
-        Self {
-            min: empty(),
-            max: empty(),
-            mean: empty(),
-            std: empty(),
-            count,
-        }
-    }
+fn least(values: impl Iterator<Item = f64>) -> f64 {
+    values.fold(f64::INFINITY, f64::min)
+}
+
+fn greatest(values: impl Iterator<Item = f64>) -> f64 {
+    values.fold(f64::NEG_INFINITY, f64::max)
 }
 
 #[cfg(test)]

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
 
-use arrow_array::builder::{Float64Builder, ListBuilder, StringBuilder};
 use arrow_array::types::Int64Type;
-use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
-use arrow_schema::{DataType, Field, Schema};
+use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, ListArray, RecordBatch, StringArray};
+use arrow_buffer::OffsetBuffer;
+use arrow_schema::{Field, Schema};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::Compression;
 use parquet::errors::ParquetError;
@@ -15,24 +15,41 @@ use parquet::file::properties::WriterProperties;
 use serde_json::{Value, json};
 
 use super::layout::{COUNTERS, IMAGE, MASK, shard_location};
-use super::shard::EpisodeRecord;
+use super::shard::{EpisodeRecord, ShardStart};
 use super::shard_reader::{Column, batches};
 use super::stats::ChannelStats;
 use crate::dataset::{DatasetError, DatasetInfo, Episode};
 use foreframe_sim::TrialParameters;
 
-/// One row of the table of episodes: the record, the shard and the first frame.
+/// One row of the table of episodes.
 pub(crate) struct EpisodeRow<'a> {
-    pub(crate) record: &'a EpisodeRecord,
-    pub(crate) shard: usize,
-    pub(crate) first_frame: usize,
+    record: &'a EpisodeRecord,
+    shard: usize,
+    /// The episodes and frames before it.
+    start: ShardStart,
 }
 
-impl EpisodeRow<'_> {
+impl<'a> EpisodeRow<'a> {
+    /// The rows of all episodes in their order, each with the number of its shard.
+    pub(crate) fn all(episodes: impl Iterator<Item = (usize, &'a EpisodeRecord)>) -> Vec<Self> {
+        let mut next = ShardStart::default();
+        let rows = episodes.map(|(shard, record)| {
+            let start = next;
+            next = next.after(record);
+            Self { record, shard, start }
+        });
+        rows.collect()
+    }
+
+    /// The number of the frame after the episode.
+    fn end(&self) -> usize {
+        self.start.frame + self.record.frames
+    }
+
     /// Statistics of every column. Those of the counters follow from the position.
-    fn stats(&self, episode: usize) -> BTreeMap<String, ChannelStats> {
+    fn stats(&self) -> BTreeMap<String, ChannelStats> {
         let mut stats = self.record.stats.clone();
-        let starts = [(0, 1), (episode, 0), (self.first_frame, 1), (0, 0)];
+        let starts = [(0, 1), (self.start.episode, 0), (self.start.frame, 1), (0, 0)];
         for (key, (first, step)) in COUNTERS.iter().zip(starts) {
             let values: Vec<f64> = (0..self.record.frames).map(|i| (first + step * i) as f64).collect();
             stats.insert((*key).to_owned(), ChannelStats::of_rows(&values, 1));
@@ -40,6 +57,9 @@ impl EpisodeRow<'_> {
         stats
     }
 }
+
+/// A column of a table: its name and its values.
+type TableColumn = (String, ArrayRef);
 
 /// A table with one task, in the format of a pandas index named `task`, because LeRobot uses it to find tasks.
 pub(crate) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
@@ -51,111 +71,78 @@ pub(crate) fn tasks(task: &str) -> Result<Vec<u8>, ParquetError> {
         "creator": {"library": "foreframe", "version": env!("CARGO_PKG_VERSION")},
         "pandas_version": "2.0.0",
     });
-    let columns: Vec<(String, ArrayRef)> = vec![
+    let columns: Vec<TableColumn> = vec![
         ("task_index".to_owned(), Arc::new(Int64Array::from(vec![0]))),
         ("task".to_owned(), Arc::new(StringArray::from(vec![task]))),
     ];
-    write(columns, &[("pandas", pandas.to_string())])
+    write(columns, HashMap::from([("pandas".to_owned(), pandas.to_string())]))
 }
 
-/// The table of episodes: position, trial parameters and statistics of every column.
-pub(crate) fn episodes(rows: &[EpisodeRow<'_>], task: &str) -> Result<Vec<u8>, ParquetError> {
-    write(episode_columns(rows, task), &[])
-}
-
-/// The same of a data set whose frames are videos, one for each shard.
-pub(crate) fn episodes_with_videos(
+/// The table of episodes: position, trial parameters and statistics of every column. With a frame period, their frames are videos,
+/// one for each shard.
+pub(crate) fn episodes(
     rows: &[EpisodeRow<'_>],
     task: &str,
-    frame_period_s: f64,
+    video_period_s: Option<f64>,
 ) -> Result<Vec<u8>, ParquetError> {
-    let mut columns = episode_columns(rows, task);
-    let first_frame = |shard: usize| {
-        rows.iter()
-            .find(|row| row.shard == shard)
-            .map_or(0, |row| row.first_frame)
+    let counts = |name: &str, value: &dyn Fn(&EpisodeRow<'_>) -> usize| -> TableColumn {
+        let values = rows.iter().map(|row| value(row) as i64);
+        (name.to_owned(), Arc::new(Int64Array::from_iter_values(values)))
     };
-    let times = |frame: &dyn Fn(&EpisodeRow<'_>) -> usize| -> ArrayRef {
-        let seconds = rows
-            .iter()
-            .map(|row| (frame(row) - first_frame(row.shard)) as f64 * frame_period_s);
-        Arc::new(Float64Array::from_iter_values(seconds))
-    };
-    let places = |place: &dyn Fn((usize, usize)) -> usize| -> ArrayRef {
-        let values = rows.iter().map(|row| place(shard_location(row.shard)) as i64);
-        Arc::new(Int64Array::from_iter_values(values))
-    };
-    columns.extend([
-        (format!("videos/{IMAGE}/chunk_index"), places(&|(chunk, _)| chunk)),
-        (format!("videos/{IMAGE}/file_index"), places(&|(_, file)| file)),
-        (format!("videos/{IMAGE}/from_timestamp"), times(&|row| row.first_frame)),
-        (
-            format!("videos/{IMAGE}/to_timestamp"),
-            times(&|row| row.first_frame + row.record.frames),
-        ),
-    ]);
-    write(columns, &[])
-}
-
-fn episode_columns(rows: &[EpisodeRow<'_>], task: &str) -> Vec<(String, ArrayRef)> {
-    let counts = |value: &dyn Fn(usize, &EpisodeRow<'_>) -> usize| -> ArrayRef {
-        let values = rows.iter().enumerate().map(|(index, row)| value(index, row) as i64);
-        Arc::new(Int64Array::from_iter_values(values))
-    };
-    let mut tasks = ListBuilder::new(StringBuilder::new());
-    for _ in rows {
-        tasks.values().append_value(task);
-        tasks.append(true);
-    }
+    let tasks = Arc::new(StringArray::from(vec![task; rows.len()]));
     let trials: StringArray = rows.iter().map(|row| row.record.trial.as_deref()).collect();
-    let mut columns: Vec<(String, ArrayRef)> = vec![
-        ("episode_index".to_owned(), counts(&|index, _| index)),
-        ("tasks".to_owned(), Arc::new(tasks.finish())),
-        ("length".to_owned(), counts(&|_, row| row.record.frames)),
+    let chunk = |row: &EpisodeRow<'_>| shard_location(row.shard).0;
+    let file = |row: &EpisodeRow<'_>| shard_location(row.shard).1;
+    let mut columns = vec![
+        counts("episode_index", &|row| row.start.episode),
+        ("tasks".to_owned(), singles(tasks)),
+        counts("length", &|row| row.record.frames),
         ("trial".to_owned(), Arc::new(trials)),
-        (
-            "data/chunk_index".to_owned(),
-            counts(&|_, row| shard_location(row.shard).0),
-        ),
-        (
-            "data/file_index".to_owned(),
-            counts(&|_, row| shard_location(row.shard).1),
-        ),
-        ("dataset_from_index".to_owned(), counts(&|_, row| row.first_frame)),
-        (
-            "dataset_to_index".to_owned(),
-            counts(&|_, row| row.first_frame + row.record.frames),
-        ),
-        ("meta/episodes/chunk_index".to_owned(), counts(&|_, _| 0)),
-        ("meta/episodes/file_index".to_owned(), counts(&|_, _| 0)),
+        counts("data/chunk_index", &chunk),
+        counts("data/file_index", &file),
+        counts("dataset_from_index", &|row| row.start.frame),
+        counts("dataset_to_index", &|row| row.end()),
+        counts("meta/episodes/chunk_index", &|_| 0),
+        counts("meta/episodes/file_index", &|_| 0),
     ];
     columns.extend(stats_columns(rows));
-    columns
+    if let Some(period_s) = video_period_s {
+        let times = |name: &str, frame: &dyn Fn(&EpisodeRow<'_>) -> usize| -> TableColumn {
+            let shards = rows.chunk_by(|a, b| a.shard == b.shard);
+            let frames = shards.flat_map(|shard| shard.iter().map(|row| frame(row) - shard[0].start.frame));
+            let seconds = frames.map(|frame| frame as f64 * period_s);
+            let seconds = Arc::new(Float64Array::from_iter_values(seconds));
+            (format!("videos/{IMAGE}/{name}"), seconds)
+        };
+        columns.extend([
+            counts(&format!("videos/{IMAGE}/chunk_index"), &chunk),
+            counts(&format!("videos/{IMAGE}/file_index"), &file),
+            times("from_timestamp", &|row| row.start.frame),
+            times("to_timestamp", &|row| row.end()),
+        ]);
+    }
+    write(columns, HashMap::new())
 }
 
-fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<(String, ArrayRef)> {
-    let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
-    let Some(first) = all.first() else {
-        return Vec::new();
-    };
+fn stats_columns(rows: &[EpisodeRow<'_>]) -> Vec<TableColumn> {
+    let all: Vec<_> = rows.iter().map(EpisodeRow::stats).collect();
     let mut columns = Vec::new();
-    for key in first.keys() {
+    for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
         let stats = || all.iter().filter_map(|stats| stats.get(key));
         for (statistic, values) in STATISTICS {
-            let lists: Vec<&[f64]> = stats().map(|stats| values(stats).as_slice()).collect();
-            let array = if is_image(key) {
-                image_lists(&lists)
+            let lengths = stats().map(|stats| values(stats).len());
+            let numbers = stats().flat_map(|stats| values(stats).iter().copied());
+            let numbers: ArrayRef = Arc::new(Float64Array::from_iter_values(numbers));
+            // Those of an image have LeRobot's shape: channels × 1 × 1.
+            let numbers = if is_image(key) {
+                singles(singles(numbers))
             } else {
-                lists_of(&lists)
+                numbers
             };
-            columns.push((format!("stats/{key}/{statistic}"), array));
+            columns.push((format!("stats/{key}/{statistic}"), lists(numbers, lengths)));
         }
-        let mut counts = ListBuilder::new(Int64Array::builder(rows.len()));
-        for stats in stats() {
-            counts.values().append_value(stats.count as i64);
-            counts.append(true);
-        }
-        columns.push((format!("stats/{key}/count"), Arc::new(counts.finish())));
+        let counts = Int64Array::from_iter_values(stats().map(|stats| stats.count as i64));
+        columns.push((format!("stats/{key}/count"), singles(Arc::new(counts))));
     }
     columns
 }
@@ -174,67 +161,45 @@ fn is_image(key: &str) -> bool {
     key == IMAGE || key == MASK
 }
 
-fn lists_of(lists: &[&[f64]]) -> ArrayRef {
-    let mut builder = ListBuilder::new(Float64Builder::new());
-    for list in lists {
-        builder.values().append_slice(list);
-        builder.append(true);
-    }
-    Arc::new(builder.finish())
+/// Lists of these lengths.
+fn lists(values: ArrayRef, lengths: impl Iterator<Item = usize>) -> ArrayRef {
+    let item = Arc::new(Field::new_list_field(values.data_type().clone(), true));
+    Arc::new(ListArray::new(item, OffsetBuffer::from_lengths(lengths), values, None))
 }
 
-/// Statistics of an image in LeRobot's shape: channels × 1 × 1.
-fn image_lists(lists: &[&[f64]]) -> ArrayRef {
-    let mut builder = ListBuilder::new(ListBuilder::new(ListBuilder::new(Float64Builder::new())));
-    for list in lists {
-        for &value in *list {
-            builder.values().values().values().append_value(value);
-            builder.values().values().append(true);
-            builder.values().append(true);
-        }
-        builder.append(true);
-    }
-    Arc::new(builder.finish())
+/// Lists of one value each.
+fn singles(values: ArrayRef) -> ArrayRef {
+    let count = values.len();
+    lists(values, std::iter::repeat_n(1, count))
 }
 
 /// LeRobot's `stats.json`: the statistics of every column over all episodes.
 pub(crate) fn stats_json(rows: &[EpisodeRow<'_>]) -> Value {
-    let all: Vec<_> = rows.iter().enumerate().map(|(index, row)| row.stats(index)).collect();
+    let all: Vec<_> = rows.iter().map(EpisodeRow::stats).collect();
     let mut features = serde_json::Map::new();
     for key in all.first().map(BTreeMap::keys).into_iter().flatten() {
         let parts: Vec<_> = all.iter().filter_map(|stats| stats.get(key)).collect();
         let merged = ChannelStats::merged(&parts);
-        let mut statistics = serde_json::Map::new();
+        let mut statistics = json!({"count": [merged.count]});
         for (statistic, values) in STATISTICS {
             let values = values(&merged);
-            let value = if is_image(key) {
+            statistics[statistic] = if is_image(key) {
                 values.iter().map(|value| json!([[value]])).collect()
             } else {
                 json!(values)
             };
-            statistics.insert(statistic.to_owned(), value);
         }
-        statistics.insert("count".to_owned(), json!([merged.count]));
-        features.insert(key.clone(), Value::Object(statistics));
+        features.insert(key.clone(), statistics);
     }
     Value::Object(features)
 }
 
-fn write(columns: Vec<(String, ArrayRef)>, metadata: &[(&str, String)]) -> Result<Vec<u8>, ParquetError> {
-    let nullable = |kind: &DataType, name: &String| Field::new(name, kind.clone(), true);
-    let fields: Vec<_> = columns
-        .iter()
-        .map(|(name, array)| nullable(array.data_type(), name))
-        .collect();
-    let metadata: HashMap<_, _> = metadata
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), value.clone()))
-        .collect();
-    let schema = Arc::new(Schema::new(fields).with_metadata(metadata));
-    let arrays = columns.into_iter().map(|(_, array)| array).collect();
-    let batch = RecordBatch::try_new(schema.clone(), arrays)?;
+fn write(columns: Vec<TableColumn>, metadata: HashMap<String, String>) -> Result<Vec<u8>, ParquetError> {
+    let columns = columns.into_iter().map(|(name, values)| (name, values, true));
+    let batch = RecordBatch::try_from_iter_with_nullable(columns)?;
+    let schema = Schema::clone(&batch.schema()).with_metadata(metadata);
     let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
-    let mut writer = ArrowWriter::try_new(Vec::new(), schema, Some(properties))?;
+    let mut writer = ArrowWriter::try_new(Vec::new(), Arc::new(schema), Some(properties))?;
     writer.write(&batch)?;
     writer.into_inner()
 }

@@ -3,9 +3,7 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use parquet::errors::ParquetError;
-
-use super::files::{sha256_of_file, write_atomically};
+use super::files::{pretty_json, sha256_of_file, write_atomically};
 use super::layout::{self, DatasetMetadata, EPISODES, INFO, METADATA, STATS, ShardEntry, TASKS, shard_path};
 use super::shard::{EncodedEpisode, EpisodeRecord, ShardStart, build};
 use super::shard_reader::records;
@@ -31,13 +29,6 @@ struct FinishedShard {
     records: Vec<EpisodeRecord>,
 }
 
-impl FinishedShard {
-    /// Number of frames in the shard.
-    fn frames(&self) -> usize {
-        self.records.iter().map(|record| record.frames).sum()
-    }
-}
-
 impl ShardWriter {
     /// A data set in the directory `out` without shards.
     pub(crate) fn new(out: &Path, info: DatasetInfo) -> Self {
@@ -45,7 +36,7 @@ impl ShardWriter {
             out: out.to_owned(),
             info,
             shards: Vec::new(),
-            start: ShardStart { episode: 0, frame: 0 },
+            start: ShardStart::default(),
         }
     }
 
@@ -68,63 +59,48 @@ impl ShardWriter {
     /// missing, damaged or another.
     pub(crate) fn resume(&mut self, episodes: Option<usize>) -> bool {
         let path = self.out.join(shard_path(self.shards.len()));
-        let Ok(records) = records(&path) else {
+        let Ok((records, sha256)) = records(&path).and_then(|records| Ok((records, sha256_of_file(&path)?))) else {
             return false;
         };
-        if episodes.is_some_and(|episodes| records.len() != episodes) {
-            return false;
+        let is_same = episodes.is_none_or(|episodes| records.len() == episodes);
+        if is_same {
+            self.push(FinishedShard { sha256, records });
         }
-        let Ok(sha256) = sha256_of_file(&path) else {
-            return false;
-        };
-        self.push(FinishedShard { sha256, records });
-        true
+        is_same
     }
 
-    /// Writes the next shard. Errors: `Build`, `Description`, `Io`.
+    /// Writes the next shard. Errors: `Build`, `Invalid`, `Io`.
     pub(crate) fn write(&mut self, episodes: &[EncodedEpisode]) -> Result<(), DatasetError> {
-        let built = build(&self.info, self.start, episodes)?;
-        write_atomically(&self.out.join(shard_path(self.shards.len())), &built.bytes)?;
+        let (bytes, records) = build(&self.info, self.start, episodes)?;
+        write_atomically(&self.out.join(shard_path(self.shards.len())), &bytes)?;
         // Parse the text as a resumed run would, so that a resumed data set has the same digits.
-        let records = serde_json::from_str(&built.records);
-        self.push(FinishedShard {
-            sha256: sha256_hex(&built.bytes),
-            records: records.map_err(|error| DatasetError::Description(error.to_string()))?,
-        });
+        let records = serde_json::from_str(&records).map_err(|error| DatasetError::Invalid(error.to_string()))?;
+        let sha256 = sha256_hex(&bytes);
+        self.push(FinishedShard { sha256, records });
         Ok(())
     }
 
     fn push(&mut self, shard: FinishedShard) {
-        self.start.episode += shard.records.len();
-        self.start.frame += shard.frames();
+        self.start = shard.records.iter().fold(self.start, ShardStart::after);
         self.shards.push(shard);
     }
 
     /// Writes the tables and metadata after all shards are written, `meta/info.json` last. Returns the description with counts and
     /// hash filled in. Errors: `Build`, `Io`.
     pub(crate) fn complete(self) -> Result<DatasetInfo, DatasetError> {
-        let (directory, shards) = (&self.out, &self.shards);
-        let mut rows = Vec::new();
-        let mut first_frame = 0;
-        for (shard, finished) in shards.iter().enumerate() {
-            for record in &finished.records {
-                rows.push(EpisodeRow {
-                    record,
-                    shard,
-                    first_frame,
-                });
-                first_frame += record.frames;
-            }
-        }
-        let episodes = write_tables(directory, &self.info, &rows, tables::episodes)?;
-        let world = self.info.world.clone();
-        let metadata = metadata(self.info, shards, sha256_hex(&episodes));
-        let info = DatasetInfo {
-            world,
-            ..metadata.info()
-        };
-        write_json(&directory.join(METADATA), &metadata)?;
-        write_json(&directory.join(INFO), &layout::lerobot_info(&info))?;
+        let shards = || self.shards.iter().enumerate();
+        let records = shards().flat_map(|(shard, finished)| finished.records.iter().map(move |record| (shard, record)));
+        let episodes = write_tables(&self.out, &self.info, &EpisodeRow::all(records), None)?;
+        let entries = shards().map(|(shard, finished)| ShardEntry {
+            path: shard_path(shard),
+            sha256: finished.sha256.clone(),
+            episodes: finished.records.len(),
+            frames: finished.records.iter().map(|record| record.frames).sum(),
+        });
+        let metadata = DatasetMetadata::new(self.info, entries.collect(), sha256_hex(&episodes));
+        let info = metadata.info();
+        write_json(&self.out.join(METADATA), &metadata)?;
+        write_json(&self.out.join(INFO), &layout::lerobot_info(&info))?;
         Ok(info)
     }
 }
@@ -142,56 +118,25 @@ pub(crate) fn shard_ranges(lengths: impl ExactSizeIterator<Item = usize>) -> Vec
     shards
 }
 
-/// Writes the tables of episodes (made by `episodes`), tasks and statistics. Returns the bytes of the first.
-/// Errors: `Build`, `Io`.
+/// Writes the tables of episodes, tasks and statistics. With a frame period, the frames are videos. Returns the bytes of the
+/// first table. Errors: `Build`, `Io`.
 pub(crate) fn write_tables(
     directory: &Path,
     info: &DatasetInfo,
     rows: &[EpisodeRow<'_>],
-    episodes: impl FnOnce(&[EpisodeRow<'_>], &str) -> Result<Vec<u8>, ParquetError>,
+    video_period_s: Option<f64>,
 ) -> Result<Vec<u8>, DatasetError> {
     let task = info.scenario.as_ref().unwrap_or(&info.name);
-    let episodes = episodes(rows, task).map_err(DatasetError::Build)?;
+    let episodes = tables::episodes(rows, task, video_period_s)?;
     write_atomically(&directory.join(EPISODES), &episodes)?;
-    let tasks = tables::tasks(task).map_err(DatasetError::Build)?;
+    let tasks = tables::tasks(task)?;
     write_atomically(&directory.join(TASKS), &tasks)?;
     write_json(&directory.join(STATS), &tables::stats_json(rows))?;
     Ok(episodes)
 }
 
-fn metadata(info: DatasetInfo, shards: &[FinishedShard], episodes_sha256: String) -> DatasetMetadata {
-    let entries: Vec<_> = shards
-        .iter()
-        .enumerate()
-        .map(|(shard, finished)| ShardEntry {
-            path: layout::shard_path(shard),
-            sha256: finished.sha256.clone(),
-            episodes: finished.records.len(),
-            frames: finished.frames(),
-        })
-        .collect();
-    DatasetMetadata {
-        program_version: env!("CARGO_PKG_VERSION").to_owned(),
-        name: info.name,
-        scenario: info.scenario,
-        seed: info.seed,
-        frame_width_px: info.frame_width_px,
-        frame_height_px: info.frame_height_px,
-        frame_period_s: info.frame_period_s,
-        action_channels: info.action_channels,
-        state_channels: info.state_channels,
-        has_masks: info.has_masks,
-        camera: info.camera,
-        content_hash: layout::content_hash(&entries),
-        episodes_sha256,
-        shards: entries,
-    }
-}
-
 pub(crate) fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), DatasetError> {
-    let mut text = serde_json::to_string_pretty(value).map_err(|error| DatasetError::Description(error.to_string()))?;
-    text.push('\n');
-    write_atomically(path, text.as_bytes())
+    write_atomically(path, pretty_json(value).as_bytes())
 }
 
 #[cfg(test)]
@@ -307,9 +252,9 @@ mod tests {
         let read = open_changed(info(), |_| {}, |_| {}).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let encoded = EncodedEpisode::new(&info(), 0, episode(5)).unwrap();
-        let built = build(&info(), ShardStart { episode: 0, frame: 0 }, &[encoded]).unwrap();
+        let (bytes, _) = build(&info(), ShardStart::default(), &[encoded]).unwrap();
         let path = directory.path().join("shard");
-        std::fs::write(&path, &built.bytes).unwrap();
+        std::fs::write(&path, &bytes).unwrap();
         let digest = sha256_hex(super::super::files::sha256_of_file(&path).unwrap().as_bytes());
         assert_eq!(read.info().content_hash, digest);
     }
