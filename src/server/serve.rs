@@ -74,7 +74,11 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     app.event_streams().stop();
     let answered = async {
         connections.ended().await;
-        tokio::join!(app.requests().ended(), app.streams().ended(), app.event_streams().ended())
+        tokio::join!(
+            app.requests().ended(),
+            app.streams().ended(),
+            app.event_streams().ended()
+        )
     };
     if timeout_at(deadline.into(), answered).await.is_err() {
         warn!("some requests or streams did not end within the deadline");

@@ -22,7 +22,8 @@ static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
 /// Starts recording. Values recorded earlier are lost. A second call changes nothing.
 pub fn install_recorder() {
     HANDLE.get_or_init(|| {
-        let failed = |error: &BuildError| error!(%error, "could not install the metrics recorder; no metrics are recorded");
+        let failed =
+            |error: &BuildError| error!(%error, "could not install the metrics recorder; no metrics are recorded");
         install().inspect_err(failed).ok()
     });
 }

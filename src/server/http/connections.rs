@@ -88,7 +88,7 @@ struct ConnectionHandler {
 
 impl ConnectionHandler {
     async fn run(self, connection: BoundedConnection) {
-        let Some(place) = connection.place() else { return };
+        let place = Arc::clone(&connection.place);
         match self.tls.clone() {
             None => self.answer(connection, place).await,
             #[cfg(feature = "tls")]

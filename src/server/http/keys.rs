@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, header};
 use axum::middleware::Next;
 use axum::response::Response;
@@ -15,7 +15,7 @@ use metrics::counter;
 use tokio::sync::watch;
 use tracing::warn;
 
-use super::access::required_scope;
+use super::access::{required_scope, route};
 use super::problem::ApiError;
 use super::rate::RateLimit;
 use crate::server::token::{RandomError, TokenHash};
@@ -254,9 +254,7 @@ pub(in crate::server) async fn check(
     mut request: Request,
     next: Next,
 ) -> Result<Response, ApiError> {
-    let route = request.extensions().get::<MatchedPath>().cloned();
-    let route = route.as_ref().map_or("", MatchedPath::as_str);
-    let needed = required_scope(request.method(), route);
+    let needed = required_scope(request.method(), route(&request));
     let checked = keys.check(presented(request.headers()), needed);
     let (caller, author) = checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))?;
     request.extensions_mut().insert(caller);

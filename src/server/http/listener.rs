@@ -113,7 +113,8 @@ async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
 /// dropped, the client still has time to read the last response.
 pub(in crate::server) struct BoundedConnection {
     /// `None` after the drop.
-    open: Option<(TcpStream, Arc<ConnectionPlace>)>,
+    stream: Option<TcpStream>,
+    pub(super) place: Arc<ConnectionPlace>,
     write_stall: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
 }
@@ -122,28 +123,23 @@ impl BoundedConnection {
     fn new(stream: TcpStream, place: Arc<ConnectionPlace>, write_stall: Duration) -> Self {
         gauge!(metric_names::HTTP_CONNECTIONS).increment(1.0);
         Self {
-            open: Some((stream, place)),
+            stream: Some(stream),
+            place,
             write_stall,
             stalled: None,
         }
     }
 
-    /// Its place.
-    pub(super) fn place(&self) -> Option<Arc<ConnectionPlace>> {
-        self.open.as_ref().map(|(_, place)| Arc::clone(place))
-    }
-
     /// The first byte that has arrived and is still to be read; `None` at the end.
     #[cfg(feature = "tls")]
     pub(super) async fn peek(&self) -> io::Result<Option<u8>> {
-        let (stream, _) = self.open.as_ref().ok_or(io::ErrorKind::NotConnected)?;
+        let stream = self.stream.as_ref().ok_or(io::ErrorKind::NotConnected)?;
         let mut byte = [0];
         Ok((stream.peek(&mut byte).await? > 0).then_some(byte[0]))
     }
 
     fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
-        let (stream, _) = self.open.as_mut().ok_or(io::ErrorKind::NotConnected)?;
-        Ok(Pin::new(stream))
+        Ok(Pin::new(self.stream.as_mut().ok_or(io::ErrorKind::NotConnected)?))
     }
 
     /// Passes on the result of a write. A write that makes no progress fails after the limit.
@@ -154,19 +150,19 @@ impl BoundedConnection {
         }
         let limit = self.write_stall;
         let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(limit)));
-        sleep
-            .as_mut()
-            .poll(cx)
-            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "the client does not read")))
+        let late = || io::Error::new(io::ErrorKind::TimedOut, "the client does not read");
+        sleep.as_mut().poll(cx).map(|()| Err(late()))
     }
 }
 
 impl Drop for BoundedConnection {
     fn drop(&mut self) {
         gauge!(metric_names::HTTP_CONNECTIONS).decrement(1.0);
-        let open = self.open.take().filter(|(_, place)| !place.is_evicted());
+        let place = Arc::clone(&self.place);
         // Without a runtime, the connection is closed at once.
-        if let (Some((stream, place)), Ok(runtime)) = (open, Handle::try_current()) {
+        if !place.is_evicted()
+            && let (Some(stream), Ok(runtime)) = (self.stream.take(), Handle::try_current())
+        {
             runtime.spawn(async move {
                 let _ = tokio::time::timeout(LINGER, close_gently(stream)).await;
                 drop(place);

@@ -4,13 +4,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
+use super::access::route;
 use super::problem::{self, ApiError};
 use crate::server::config::ServerConfig;
 use foreframe_core::metric_names;
@@ -57,7 +58,10 @@ fn request_id(headers: &HeaderMap) -> String {
 pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request: Request, next: Next) -> Response {
     let id = request_id(request.headers());
     let span = info_span!("request", id = %id, method = %request.method(), path = request.uri().path());
-    let (method, route, limit) = (method(request.method()), route(&request), trace.limit);
+    // Labels with few values, whatever clients send.
+    let (method, route) = (method(request.method()), route(&request));
+    let route = if route.is_empty() { "none" } else { route }.to_owned();
+    let limit = trace.limit;
     let work = async move {
         let started = Instant::now();
         let answered = async {
@@ -105,16 +109,10 @@ fn refuse_encoded(headers: &HeaderMap) -> Result<(), ApiError> {
     }
 }
 
-/// A label with few values, whatever clients send.
+/// The method, or `other` for one that no route has.
 fn method(method: &Method) -> &'static str {
     let known = ["GET", "HEAD", "POST", "DELETE", "OPTIONS"];
     known.into_iter().find(|known| *known == method).unwrap_or("other")
-}
-
-/// The route's template: a label with few values.
-fn route(request: &Request) -> String {
-    let matched = request.extensions().get::<MatchedPath>();
-    matched.map_or_else(|| "none".to_owned(), |path| path.as_str().to_owned())
 }
 
 #[cfg(test)]

@@ -1,12 +1,12 @@
 //! How many requests are processed at the same time. Those that change state for good are completed, also if the client closes
 //! its connection before the answer.
 
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{Request, State};
 use axum::middleware::Next;
 use axum::response::Response;
 use tracing::Instrument as _;
 
-use super::access::is_audited;
+use super::access::{is_audited, route};
 use super::problem::ApiError;
 use super::task_limit::TaskLimit;
 
@@ -18,8 +18,7 @@ pub(in crate::server) async fn answer(
     next: Next,
 ) -> Result<Response, ApiError> {
     let place = requests.enter()?;
-    let route = request.extensions().get::<MatchedPath>();
-    let is_audited = is_audited(request.method(), route.map_or("", MatchedPath::as_str));
+    let is_audited = is_audited(request.method(), route(&request));
     let work = async move {
         let response = next.run(request).await;
         drop(place);
