@@ -33,7 +33,9 @@ struct ThreadsOwner(Option<Runtime>);
 impl Drop for ThreadsOwner {
     fn drop(&mut self) {
         // This may be an async thread, which must not wait for work that runs.
-        self.0.take().map(Runtime::shutdown_background);
+        if let Some(runtime) = self.0.take() {
+            runtime.shutdown_background();
+        }
     }
 }
 

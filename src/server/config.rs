@@ -54,6 +54,7 @@ macro_rules! settings {
         impl ServerConfig {
             /// Every number with the range it must be in.
             #[must_use]
+            #[expect(clippy::cast_lossless, reason = "the types of the numbers differ")]
             pub fn bounds(&self) -> Vec<Bound> {
                 let $config = self;
                 vec![$($((stringify!($name), $config.$name as u64, $range),)?)*]

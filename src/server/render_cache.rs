@@ -97,10 +97,11 @@ impl RenderedFiles {
         if added > self.limit {
             return;
         }
-        self.bytes += added;
-        if let Some(replaced) = self.by_use.insert(key.clone(), file) {
+        if let Some(replaced) = self.by_use.remove(&key) {
             self.bytes -= size(&key, &replaced);
         }
+        self.bytes += added;
+        self.by_use.insert(key, file);
         while self.bytes > self.limit
             && let Some((key, file)) = self.by_use.remove_lru()
         {

@@ -92,7 +92,7 @@ pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: 
 
 /// The exceeded budget among the causes of an error.
 pub(in crate::server) fn cause<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a BodyBudgetError> {
-    let mut causes = successors(Some(error), |error| {
+    let mut causes = successors(Some(error), |&error| {
         // An I/O error's source is that of the error within it.
         let within = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
         within.map_or_else(|| error.source(), |within| Some(within as &(dyn Error + 'static)))

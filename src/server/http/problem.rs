@@ -43,7 +43,7 @@ impl Problem {
             kind: format!("urn:foreframe:problem:{slug}"),
             title: status.canonical_reason().unwrap_or_default(),
             status: status.as_u16(),
-            detail: without_middle(detail),
+            detail: without_middle(&detail),
             instance: String::new(),
         }
     }
