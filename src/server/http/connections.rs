@@ -132,7 +132,10 @@ impl ConnectionHandler {
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let (evicted, messages) = (place.evicted(), MessageBytes::default());
-        let stream = TokioIo::new(HttpStream::new(stream, messages.clone()));
+        let stream = TokioIo::new(HttpStream {
+            inner: stream,
+            messages: messages.clone(),
+        });
         let router = TowerToHyperService::new(self.router);
         let service = service_fn(move |mut request: Request<Incoming>| {
             let busy = place.begin();
