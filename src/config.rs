@@ -5,11 +5,11 @@ mod bind;
 mod print;
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::server::ServerConfig;
+use crate::server::{ServerConfig, SettingError};
 use crate::telemetry::LogFormat;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_train::settings::{LayeredSettings, SettingsError, SettingsLayer};
@@ -37,34 +37,9 @@ pub enum ConfigError {
     /// A file, a key or a value cannot be used.
     #[error(transparent)]
     Settings(#[from] SettingsError),
-    /// The value is out of range.
-    #[error("{field} is {value} ({origin}); it must be {least} to {most}")]
-    Range {
-        /// The setting.
-        field: &'static str,
-        /// Where it was given.
-        origin: String,
-        /// Its value.
-        value: u64,
-        /// The least it may be.
-        least: u64,
-        /// The most it may be.
-        most: u64,
-    },
-    /// The directory does not exist, or it is a file.
-    #[error("{field} is \"{}\" ({origin}), which {wrong}; {right}", path.display())]
-    Directory {
-        /// The setting.
-        field: &'static str,
-        /// Where it was given.
-        origin: String,
-        /// Its value.
-        path: PathBuf,
-        /// What is wrong with it.
-        wrong: &'static str,
-        /// What would be right.
-        right: &'static str,
-    },
+    /// A value is out of range, or it names a directory that does not exist or is a file.
+    #[error("{0}")]
+    Value(String),
 }
 
 impl HasErrorKind for ConfigError {
@@ -138,7 +113,7 @@ pub struct LoadedConfig {
 
 impl LoadedConfig {
     /// Reads the file (`file`, or [`DEFAULT_FILE`] if it exists) and the environment, and puts the flags over them.
-    /// Errors: every [`ConfigError`] but `Directory`.
+    /// Errors: see [`LoadedConfig::from_layers`].
     pub fn read(file: Option<&Path>, flags: Vec<SettingsLayer>) -> Result<Self, ConfigError> {
         let default = Path::new(DEFAULT_FILE);
         let file = file.or_else(|| default.is_file().then_some(default));
@@ -149,19 +124,15 @@ impl LoadedConfig {
         Self::from_layers(file.into_iter().chain(environment_layers(texts)).chain(flags))
     }
 
-    /// The defaults under the layers, later ones over earlier ones. Errors: `Settings`, `Range`.
+    /// The defaults under the layers, later ones over earlier ones. Errors: `Settings`, `Value`.
     pub fn from_layers(layers: impl IntoIterator<Item = SettingsLayer>) -> Result<Self, ConfigError> {
         let values = LayeredSettings::merge(defaults(), layers, LISTING)?;
         let mut server: ServerConfig = values.extract(expected)?;
-        if let Some((field, value, range)) = server.out_of_bounds() {
-            return Err(ConfigError::Range {
-                field,
-                origin: values.origin(field),
-                value,
-                least: *range.start(),
-                most: *range.end(),
-            });
-        }
+        server.validate().map_err(|error| {
+            let SettingError { field, value, range } = error;
+            let (origin, least, most) = (values.origin(field), range.start(), range.end());
+            ConfigError::Value(format!("{field} is {value} ({origin}); it must be {least} to {most}"))
+        })?;
         let mut config: Config = values.extract(expected)?;
         for url in [
             &mut server.database_url,
@@ -170,8 +141,7 @@ impl LoadedConfig {
         ] {
             url.take_if(|url| url.is_empty());
         }
-        server.import_dir.take_if(|dir| dir.as_os_str().is_empty());
-        for path in [&mut server.tls_certificate, &mut server.tls_key] {
+        for path in [&mut server.import_dir, &mut server.tls_certificate, &mut server.tls_key] {
             path.take_if(|path| path.as_os_str().is_empty());
         }
         if let Some(port) = config.port {
@@ -188,35 +158,26 @@ impl LoadedConfig {
     }
 
     /// Checks the directories. The data directory is created later if it does not exist. The models directory may be
-    /// missing only if it is the default. Errors: `Directory`.
+    /// missing only if it is the default. Errors: `Value`.
     pub fn check_directories(&self) -> Result<(), ConfigError> {
-        let ServerConfig {
-            data_dir,
-            models_dir,
-            import_dir,
-            ..
-        } = &self.config.server;
-        let missing_import_dir = import_dir.as_ref().filter(|dir| !dir.is_dir());
-        let is_default = self.is_default("models_dir");
-        let (field, path, right) = if data_dir.exists() && !data_dir.is_dir() {
+        let server = &self.config.server;
+        let is_wrong = |path: &Path, may_be_absent: bool| !path.is_dir() && (path.exists() || !may_be_absent);
+        let (field, path, right) = if is_wrong(&server.data_dir, true) {
             let right = "name a directory; it is created if it does not exist";
-            ("data_dir", data_dir, right)
-        } else if !models_dir.is_dir() && (!is_default || models_dir.exists()) {
+            ("data_dir", &server.data_dir, right)
+        } else if is_wrong(&server.models_dir, self.is_default("models_dir")) {
             let right = "name a directory that holds models, or leave the setting out to serve those in ./models";
-            ("models_dir", models_dir, right)
-        } else if let Some(import_dir) = missing_import_dir {
+            ("models_dir", &server.models_dir, right)
+        } else if let Some(import_dir) = server.import_dir.as_ref().filter(|dir| is_wrong(dir, false)) {
             let right = "name the directory with the recordings, or leave the setting out to turn imports off";
             ("import_dir", import_dir, right)
         } else {
             return Ok(());
         };
-        Err(ConfigError::Directory {
-            field,
-            origin: self.values.origin(field),
-            path: path.clone(),
-            wrong: if path.exists() { "is a file" } else { "does not exist" },
-            right,
-        })
+        let wrong = if path.exists() { "is a file" } else { "does not exist" };
+        let (origin, path) = (self.values.origin(field), path.display());
+        let sentence = format!("{field} is \"{path}\" ({origin}), which {wrong}; {right}");
+        Err(ConfigError::Value(sentence))
     }
 
     /// The settings as TOML, each with its meaning and origin; passwords in URLs are hidden.
@@ -246,12 +207,13 @@ pub fn environment_layers(variables: impl Iterator<Item = (String, String)>) -> 
 
 /// What a setting must be, where its type does not say it well.
 fn expected(field: &str) -> Option<String> {
-    match field {
-        "bind" => Some("HOST:PORT, as in 127.0.0.1:8642 or localhost:8642".to_owned()),
-        "admin_bind" => Some("HOST:PORT, as in 127.0.0.1:8643, or off".to_owned()),
-        "port" => Some("0 to 65535".to_owned()),
-        _ => range(field),
-    }
+    let what = match field {
+        "bind" => "HOST:PORT, as in 127.0.0.1:8642 or localhost:8642",
+        "admin_bind" => "HOST:PORT, as in 127.0.0.1:8643, or off",
+        "port" => "0 to 65535",
+        _ => return range(field),
+    };
+    Some(what.to_owned())
 }
 
 /// The range of a number.

@@ -68,18 +68,17 @@ pub fn init(format: LogFormat, otlp_endpoint: Option<&str>) -> Result<Telemetry,
     };
     let registry = tracing_subscriber::registry().with(lines).with(filter);
     #[cfg(feature = "otlp")]
-    {
-        let traces = otlp_endpoint.map(otlp::Traces::new).transpose()?;
-        // This fails only if a subscriber is already installed, as in tests.
-        let _ = registry.with(traces.as_ref().map(otlp::Traces::layer)).try_init();
-        Ok(Telemetry { _traces: traces })
-    }
+    let traces = otlp_endpoint.map(otlp::Traces::new).transpose()?;
+    #[cfg(feature = "otlp")]
+    let registry = registry.with(traces.as_ref().map(otlp::Traces::layer));
     #[cfg(not(feature = "otlp"))]
-    {
-        if otlp_endpoint.is_some() {
-            return Err(TelemetryError::NoOtlp);
-        }
-        let _ = registry.try_init();
-        Ok(Telemetry {})
+    if otlp_endpoint.is_some() {
+        return Err(TelemetryError::NoOtlp);
     }
+    // This fails only if a subscriber is already installed, as in tests.
+    let _ = registry.try_init();
+    Ok(Telemetry {
+        #[cfg(feature = "otlp")]
+        _traces: traces,
+    })
 }

@@ -23,9 +23,9 @@ pub(super) fn deserialize_or_off<'de, D: Deserializer<'de>>(deserializer: D) -> 
         return Ok(None);
     }
     let address = resolve(&text, DEFAULT_ADMIN_PORT);
-    address
-        .map(Some)
-        .ok_or_else(|| D::Error::custom("neither HOST:PORT nor off"))
+    Ok(Some(
+        address.ok_or_else(|| D::Error::custom("neither HOST:PORT nor off"))?,
+    ))
 }
 
 /// Writes what [`deserialize_or_off`] reads.
@@ -43,12 +43,12 @@ fn resolve(text: &str, default_port: u16) -> Option<SocketAddr> {
     if let Ok(ip) = text.parse::<IpAddr>() {
         return Some(SocketAddr::new(ip, default_port));
     }
-    let has_port = text.contains(':');
-    let addresses: Vec<SocketAddr> = if has_port {
-        text.to_socket_addrs().ok()?.collect()
+    let found = if text.contains(':') {
+        text.to_socket_addrs()
     } else {
-        (text, default_port).to_socket_addrs().ok()?.collect()
+        (text, default_port).to_socket_addrs()
     };
+    let addresses: Vec<SocketAddr> = found.ok()?.collect();
     let first_ipv4 = addresses.iter().find(|address| address.is_ipv4());
     first_ipv4.or_else(|| addresses.first()).copied()
 }

@@ -48,20 +48,17 @@ fn masked(text: &str) -> String {
     let Some((scheme, rest)) = text.split_once("://") else {
         return text.to_owned();
     };
-    let rest = match rest.rsplit_once('@') {
-        Some((user, host)) if user.contains(':') => format!("{}:***@{host}", user.split(':').next().unwrap_or("")),
-        _ => rest.to_owned(),
-    };
-    let rest = match rest.split_once("password=") {
-        Some((before, after)) => {
-            let others = after
-                .split_once('&')
-                .map_or_else(String::new, |(_, others)| format!("&{others}"));
-            format!("{before}password=***{others}")
-        }
-        None => rest,
-    };
-    format!("{scheme}://{rest}")
+    let mut shown = rest.to_owned();
+    if let Some((login, host)) = rest.rsplit_once('@')
+        && let Some((user, _)) = login.split_once(':')
+    {
+        shown = format!("{user}:***@{host}");
+    }
+    if let Some((before, after)) = shown.split_once("password=") {
+        let others = after.find('&').map_or("", |end| &after[end..]);
+        shown = format!("{before}password=***{others}");
+    }
+    format!("{scheme}://{shown}")
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use axum::Router;
 use axum::extract::State;
 use axum::http::header;
-use axum::middleware::{from_fn, from_fn_with_state};
+use axum::middleware::from_fn_with_state;
 use axum::response::IntoResponse;
 use axum::routing::get;
 use tokio::net::TcpListener;
@@ -55,8 +55,9 @@ pub async fn serve_worker_health(
 /// Answers on the listener until the future is dropped.
 pub(super) async fn answer(listener: TcpListener, router: Router, config: &ServerConfig) {
     let (_running, stopping) = watch::channel(false);
-    let listener = BoundedListener::for_admin(listener, config);
-    let mut connections = Connections::new(router, config, stopping);
+    let places = config.max_admin_connections;
+    let listener = BoundedListener::new(listener, config, places, places);
+    let mut connections = Connections::new(router, config, stopping, None);
     match connections.accept(&listener).await {}
 }
 
@@ -67,9 +68,7 @@ fn finish(router: Router, config: &ServerConfig, keys: Keys) -> Router {
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there are /livez, /readyz and /metrics".to_owned()))
         .layer(from_fn_with_state(origins, origin::check))
-        .layer(from_fn(move |request, next| {
-            middleware::trace(trace.clone(), request, next)
-        }))
+        .layer(from_fn_with_state(trace, middleware::trace))
 }
 
 async fn worker_readyz(State(worker): State<WorkerHealth>) -> Result<impl IntoResponse, ApiError> {

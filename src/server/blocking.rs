@@ -1,24 +1,17 @@
 //! Work outside a request's own task: what would block the async runtime, and what must not stop half-way.
 
-use std::io;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::Arc;
 
-use tokio::sync::{Semaphore, oneshot};
+use tokio::runtime::{Builder, Handle, Runtime};
+use tokio::sync::Semaphore;
 
 use super::http::problem::ApiError;
 use foreframe_jobs::jobs::priority;
 
-/// Work that could not be done.
+/// Work that panicked.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum TaskError {
-    #[error("a task of the server failed: {0}")]
-    Join(#[from] tokio::task::JoinError),
-    #[error("a task of the server panicked; the reason is in the log")]
-    Panicked,
-    #[error("could not start a thread: {0}")]
-    Thread(io::Error),
-}
+#[error("a task of the server panicked; the reason is in the log")]
+pub(super) struct TaskError;
 
 impl From<TaskError> for ApiError {
     fn from(error: TaskError) -> Self {
@@ -26,80 +19,52 @@ impl From<TaskError> for ApiError {
     }
 }
 
-/// A bounded number of threads for work that would block the async runtime. Clones share the threads.
+/// A bounded number of threads for work that would block the async runtime. They start when they are needed. Clones share them.
 #[derive(Clone)]
 pub(super) struct BlockingWork {
     places: Arc<Semaphore>,
-    threads: Arc<WorkerThreads>,
+    threads: Handle,
+    _owner: Arc<ThreadsOwner>,
 }
 
-type Work = Box<dyn FnOnce() + Send>;
+/// The runtime that has the threads; it runs nothing else.
+struct ThreadsOwner(Option<Runtime>);
 
-/// Threads that start with the first work and end with the last clone of their owner.
-struct WorkerThreads {
-    name: &'static str,
-    count: usize,
-    has_low_priority: bool,
-    work: Mutex<Option<mpsc::Sender<Work>>>,
-}
-
-impl WorkerThreads {
-    /// Errors: `Thread` if the system starts no thread.
-    fn run(&self, work: Work) -> Result<(), TaskError> {
-        let mut sender = self.work.lock().unwrap_or_else(PoisonError::into_inner);
-        let sender = match &mut *sender {
-            Some(sender) => sender,
-            absent => absent.insert(self.start().map_err(TaskError::Thread)?),
-        };
-        // The threads wait for work as long as there is a sender.
-        sender.send(work).map_err(|_| TaskError::Panicked)
-    }
-
-    fn start(&self) -> io::Result<mpsc::Sender<Work>> {
-        let (sender, receiver) = mpsc::channel::<Work>();
-        let receiver = Arc::new(Mutex::new(receiver));
-        for _ in 0..self.count {
-            let (receiver, has_low_priority) = (Arc::clone(&receiver), self.has_low_priority);
-            std::thread::Builder::new().name(self.name.to_owned()).spawn(move || {
-                if has_low_priority {
-                    priority::lower();
-                }
-                loop {
-                    let next = receiver.lock().unwrap_or_else(PoisonError::into_inner).recv();
-                    let Ok(work) = next else { return };
-                    // The hook for panics has logged it, and the one who waits gets an error.
-                    let _ = catch_unwind(AssertUnwindSafe(work));
-                }
-            })?;
+impl Drop for ThreadsOwner {
+    fn drop(&mut self) {
+        // This may be an async thread, which must not wait for work that runs.
+        if let Some(runtime) = self.0.take() {
+            runtime.shutdown_background();
         }
-        Ok(sender)
     }
 }
 
 impl BlockingWork {
-    pub(super) fn new(name: &'static str, threads: usize) -> Self {
-        Self::with(name, threads, false)
-    }
-
-    /// With threads that, on Linux, run at lower priority.
-    pub(super) fn with_low_priority(name: &'static str, threads: usize) -> Self {
-        Self::with(name, threads, true)
-    }
-
-    fn with(name: &'static str, count: usize, has_low_priority: bool) -> Self {
+    /// `has_low_priority`: on Linux, the threads run at lower priority.
+    #[expect(
+        clippy::expect_used,
+        reason = "only input, output and timers of a runtime can fail to start"
+    )]
+    pub(super) fn new(name: &str, threads: usize, has_low_priority: bool) -> Self {
+        let runtime = Builder::new_current_thread()
+            .thread_name(name)
+            .max_blocking_threads(threads)
+            .on_thread_start(move || {
+                if has_low_priority {
+                    priority::lower();
+                }
+            })
+            .build()
+            .expect("a runtime of threads alone that does not start is a bug");
         Self {
-            places: Arc::new(Semaphore::new(count)),
-            threads: Arc::new(WorkerThreads {
-                name,
-                count,
-                has_low_priority,
-                work: Mutex::default(),
-            }),
+            places: Arc::new(Semaphore::new(threads)),
+            threads: runtime.handle().clone(),
+            _owner: Arc::new(ThreadsOwner(Some(runtime))),
         }
     }
 
-    /// Waits for a free thread and runs the work on it. Work that has begun ends even if the future is dropped.
-    /// Errors: `Panicked`, `Thread`.
+    /// Waits for a free thread and runs the work on it. Work that has begun ends even if the future is dropped; work that waits is
+    /// dropped with it. Errors: the work panicked.
     pub(super) async fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
@@ -107,13 +72,11 @@ impl BlockingWork {
         // Never closed, so there is always a permit in the end.
         let place = Arc::clone(&self.places).acquire_owned().await;
         let span = tracing::Span::current();
-        let (done, result) = oneshot::channel();
-        self.threads.run(Box::new(move || {
+        let work = move || {
             let _place = place;
-            // Nobody waits any more if the client has gone.
-            let _ = done.send(span.in_scope(work));
-        }))?;
-        result.await.map_err(|_| TaskError::Panicked)
+            span.in_scope(work)
+        };
+        self.threads.spawn_blocking(work).await.map_err(|_| TaskError)
     }
 }
 
@@ -127,7 +90,7 @@ mod tests {
 
     #[tokio::test]
     async fn work_beyond_the_bound_waits_for_a_thread() {
-        let blocking = BlockingWork::new("test", 1);
+        let blocking = BlockingWork::new("test", 1, false);
         let (release, released) = mpsc::channel::<()>();
         let mut first = Box::pin(blocking.run(move || released.recv().is_ok()));
         assert!(first.as_mut().now_or_never().is_none());
@@ -140,7 +103,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_panic_becomes_an_internal_error() {
-        let error = BlockingWork::new("test", 1).run(|| panic!("test")).await.unwrap_err();
+        let error = BlockingWork::new("test", 1, false)
+            .run(|| panic!("test"))
+            .await
+            .unwrap_err();
         assert!(matches!(ApiError::from(error), ApiError::Internal(_)));
     }
 }

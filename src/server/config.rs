@@ -1,13 +1,12 @@
 //! The settings of the server. Every bound is checked before the server starts, and has a test that exceeds it.
 
-mod bounds;
-
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-pub use self::bounds::SettingError;
+use foreframe_core::nn::spec::MAX_STEPS;
 use foreframe_core::serving::PredictorConfig;
 use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
 use foreframe_jobs::jobs::JobLimits;
@@ -15,213 +14,195 @@ use foreframe_jobs::jobs::child::JobProcess;
 use foreframe_jobs::jobs::memory::{self, JobMemory};
 use foreframe_jobs::store::StoreConfig;
 
-/// All settings of the server, with their defaults.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(default)]
-pub struct ServerConfig {
+/// A setting out of range.
+#[derive(Debug, thiserror::Error)]
+#[error("{field} is {value}; it must be {} to {}", range.start(), range.end())]
+pub struct SettingError {
+    /// The setting.
+    pub field: &'static str,
+    /// Its value.
+    pub value: u64,
+    /// What it may be.
+    pub range: RangeInclusive<u64>,
+}
+
+/// A field with its value and the range it must be in.
+type Bound = (&'static str, u64, RangeInclusive<u64>);
+
+/// A day: no deadline is longer.
+const MAX_DEADLINE_MS: u64 = 86_400_000;
+/// The most of what the server counts.
+const MAX_COUNT: u64 = 1_000_000;
+
+/// Declares the settings: for each its documentation, its type, its default and, for a number, the range that it must be in. A
+/// range can depend on other settings of `$config`.
+macro_rules! settings {
+    (of $config:ident; $($(#[$attribute:meta])* $name:ident: $type:ty = $default:expr $(, $range:expr)?;)*) => {
+        /// All settings of the server, with their defaults.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+        #[serde(default)]
+        pub struct ServerConfig {
+            $($(#[$attribute])* pub $name: $type,)*
+        }
+
+        impl Default for ServerConfig {
+            fn default() -> Self {
+                Self { $($name: $default,)* }
+            }
+        }
+
+        impl ServerConfig {
+            /// Every number with the range it must be in.
+            #[must_use]
+            #[expect(clippy::cast_lossless, reason = "the types of the numbers differ")]
+            pub fn bounds(&self) -> Vec<Bound> {
+                let $config = self;
+                vec![$($((stringify!($name), $config.$name as u64, $range),)?)*]
+            }
+        }
+    };
+}
+
+settings! {
+    of config;
     /// Where jobs write: in its folders `datasets`, `runs`, `reports` and `models`.
     #[schema(value_type = String)]
-    pub data_dir: PathBuf,
+    data_dir: PathBuf = PathBuf::from("data");
     /// The directory of the models that were not published by a job of this server.
     #[schema(value_type = String)]
-    pub models_dir: PathBuf,
+    models_dir: PathBuf = PathBuf::from("models");
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
-    pub database_url: Option<String>,
+    database_url: Option<String> = None;
     /// How long a starting server or worker waits for its PostgreSQL, in seconds.
-    pub database_wait_s: u64,
+    database_wait_s: u64 = 60, 0..=86_400;
     /// A directory or `s3://BUCKET/PREFIX` for the files that several machines share. Default: the data directory.
-    pub objects_url: Option<String>,
+    objects_url: Option<String> = None;
     /// The directory with the recordings that import jobs may read. Default: none, so imports are off.
     #[schema(value_type = Option<String>)]
-    pub import_dir: Option<PathBuf>,
+    import_dir: Option<PathBuf> = None;
     /// The certificate chain of the public address as a PEM file, for HTTPS; needs the Cargo feature `tls`. The file is read
     /// again when it changes.
     #[schema(value_type = Option<String>)]
-    pub tls_certificate: Option<PathBuf>,
+    tls_certificate: Option<PathBuf> = None;
     /// The private key of that certificate as a PEM file.
     #[schema(value_type = Option<String>)]
-    pub tls_key: Option<PathBuf>,
+    tls_key: Option<PathBuf> = None;
     /// Whether this server runs jobs. If false, it accepts jobs and leaves the work to workers.
-    pub run_jobs: bool,
+    run_jobs: bool = true;
     /// Maximum size of a request body and of a message of a stream, in bytes.
-    pub max_body_bytes: usize,
+    max_body_bytes: usize = 8 << 20, 1024..=1 << 30;
     /// Maximum size of the request body of a job, in bytes.
-    pub max_job_bytes: usize,
+    max_job_bytes: usize = 64 << 10, 1024..=16 << 20;
     /// Maximum number of images in one request.
-    pub max_frames: usize,
+    max_frames: usize = 64, 1..=4096;
     /// Maximum number of predictions that wait; more are refused with 503.
-    pub max_queued_predictions: usize,
+    max_queued_predictions: usize = 256, 1..=MAX_COUNT;
     /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch.
-    pub max_batch: usize,
+    max_batch: usize = 64, 1..=4096;
     /// Maximum size of all request bodies and messages of streams that the server reads or works with at the same time, in
     /// bytes; more requests are refused with 503, more streams closed with 1013. At least `max_body_bytes`.
-    pub max_total_body_bytes: usize,
+    max_total_body_bytes: usize = 256 << 20, config.max_body_bytes as u64..=1 << 40;
     /// Maximum number of connections. If all are open, a new one replaces the one that was idle the longest; see
     /// `connection_evict_ms`. If none is idle, it is refused with 503 and closed.
-    pub max_connections: usize,
+    max_connections: usize = 512, 1..=MAX_COUNT;
     /// Maximum number of connections from one IPv4 address or one /64 network of IPv6. Behind a reverse proxy, all come from
     /// the same address: set it to `max_connections`.
-    pub max_connections_per_address: usize,
+    max_connections_per_address: usize = 256, 1..=MAX_COUNT;
     /// How long a connection must have been idle, without a request that is being answered, to be replaced by a new one, in
     /// milliseconds.
-    pub connection_evict_ms: u64,
+    connection_evict_ms: u64 = 1_000, 0..=MAX_DEADLINE_MS;
     /// Maximum number of connections to `admin_bind`.
-    pub max_admin_connections: usize,
+    max_admin_connections: usize = 32, 1..=MAX_COUNT;
     /// Maximum number of requests that are processed at the same time; more are refused with 503. Streams and event streams
     /// are not counted.
-    pub max_requests: usize,
+    max_requests: usize = 384, 1..=MAX_COUNT;
     /// Maximum number of streams; more are refused with 503.
-    pub max_streams: usize,
+    max_streams: usize = 128, 1..=MAX_COUNT;
     /// Maximum number of event streams of jobs; more are refused with 503.
-    pub max_event_streams: usize,
+    max_event_streams: usize = 128, 1..=MAX_COUNT;
     /// Maximum number of simulated environments; see `environment_evict_ms`.
-    pub max_environments: usize,
+    max_environments: usize = 16, 1..=10_000;
     /// Maximum number of sessions; more are refused with 503.
-    pub max_sessions: usize,
+    max_sessions: usize = 1024, 1..=MAX_COUNT;
     /// Maximum number of frames of a stream that are read before the earlier ones are answered; more are read later.
-    pub max_pipelined_frames: usize,
+    max_pipelined_frames: usize = 16, 1..=4096;
     /// Maximum size of the messages that wait for a slow reader of a stream, in bytes. Beyond it, the oldest predictions
     /// are dropped.
-    pub max_stream_buffer_bytes: usize,
+    max_stream_buffer_bytes: usize = 4 << 20, 1024..=1 << 30;
     /// Maximum number of plans in one rollout request.
-    pub max_plans: usize,
+    max_plans: usize = 512, 1..=100_000;
     /// Maximum size of the predicted images of one rollout request, in bytes before encoding.
-    pub max_rollout_bytes: usize,
+    max_rollout_bytes: usize = 64 << 20, 1024..=1 << 32;
     /// Maximum number of frames that a request can ask to predict, if that is more than the model's horizon.
-    pub max_steps: usize,
+    max_steps: usize = 50, 1..=MAX_STEPS as u64;
     /// Maximum number of jobs that wait; more are refused with 503.
-    pub max_queued_jobs: usize,
+    max_queued_jobs: usize = 16, 1..=10_000;
     /// Maximum number of ended jobs in the list; older ones are removed.
-    pub max_ended_jobs: usize,
+    max_ended_jobs: usize = 100, 1..=10_000;
     /// Maximum number of lines of a job's log; older ones are removed.
-    pub max_job_log_lines: usize,
+    max_job_log_lines: usize = 1000, 1..=100_000;
     /// Number of threads for jobs.
-    pub job_threads: usize,
+    job_threads: usize = spare_cores(), 1..=1024;
     /// Number of threads that decode and encode the images of predictions; more such work waits. A second pool of the
     /// same size simulates and reads files.
-    pub request_threads: usize,
+    request_threads: usize = 4, 1..=1024;
     /// Number of threads that make pictures of data sets, models and predictions, and read reports; more such work waits. On
     /// Linux, they run at lower priority.
-    pub picture_threads: usize,
+    picture_threads: usize = 1, 1..=1024;
     /// Maximum size of the pictures and reports that are kept to answer the same request again, in bytes; 0 keeps none.
-    pub max_cached_bytes: usize,
+    max_cached_bytes: usize = 64 << 20, 0..=1 << 36;
     /// Memory that one job can use, in MiB; 0 for no limit. Needs Linux.
-    pub job_memory_mib: u64,
+    job_memory_mib: u64 = memory::default_limit_mib(), 0..=1 << 30;
     /// Memory for the frames of one data set, in MiB, in commands and jobs; in a job, at most a third of `job_memory_mib`. The
     /// frames of a larger data set are decoded once into a file in its directory (`.cache`) and read from there.
-    pub dataset_memory_mib: u64,
+    dataset_memory_mib: u64 = memory::default_dataset_mib(), 0..=1 << 30;
     /// After this many attempts in a row that ended abnormally without progress, a job fails.
-    pub job_max_attempts: u32,
+    job_max_attempts: u32 = 3, 1..=1_000_000;
     /// How long one attempt of a job can run, in seconds; 0 for no limit.
-    pub job_time_limit_s: u64,
+    job_time_limit_s: u64 = 0, 0..=100_000_000;
     /// How long a running job may report no progress, in seconds; 0 for no limit. After this time its process is killed, and the
     /// next attempt resumes from the last checkpoint. An import reports no progress while it reads the recording: raise this limit
     /// for recordings that take longer.
-    pub job_stall_limit_s: u64,
+    job_stall_limit_s: u64 = 7_200, 0..=100_000_000;
     /// Disk space for the frames of a compressed `.npz` file while they are imported, in MiB. An import that needs more is refused;
     /// 0 refuses all compressed frames.
-    pub import_disk_mib: u64,
+    import_disk_mib: u64 = DEFAULT_DISK_MIB, 0..=1 << 30;
     /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
     #[serde(skip)]
-    pub job_program: Option<PathBuf>,
+    job_program: Option<PathBuf> = None;
     /// How long a lease of a job lasts without renewal, in milliseconds. After that, another process can claim the job.
-    pub job_lease_ms: u64,
+    job_lease_ms: u64 = 30_000, 1000..=MAX_DEADLINE_MS;
     /// How long a prediction may take, including its time in the queue, in milliseconds.
-    pub prediction_deadline_ms: u64,
+    prediction_deadline_ms: u64 = 10_000, 1..=MAX_DEADLINE_MS;
     /// How long a request may take to arrive and be answered, in milliseconds.
-    pub request_deadline_ms: u64,
+    request_deadline_ms: u64 = 30_000, 1..=MAX_DEADLINE_MS;
     /// How long an environment is kept that nobody steps, in milliseconds.
-    pub environment_idle_ms: u64,
+    environment_idle_ms: u64 = 600_000, 1..=MAX_DEADLINE_MS;
     /// At the limit of environments, a new one replaces the one that was idle the longest, if that was idle for at least
     /// this time, in milliseconds.
-    pub environment_evict_ms: u64,
+    environment_evict_ms: u64 = 5_000, 0..=MAX_DEADLINE_MS;
     /// How long a stream may be idle, in milliseconds.
-    pub stream_idle_ms: u64,
+    stream_idle_ms: u64 = 60_000, 1..=MAX_DEADLINE_MS;
     /// How long a client may take to read a message of its stream, in milliseconds.
-    pub stream_send_ms: u64,
+    stream_send_ms: u64 = 10_000, 1..=MAX_DEADLINE_MS;
     /// Maximum size of a request's head, in bytes; a longer one is refused with 431.
-    pub max_header_bytes: usize,
+    max_header_bytes: usize = 32 << 10, 8192..=1 << 20;
     /// How long a request's head may take to arrive, counted from the start of the connection or from the previous
     /// response, in milliseconds. So this is also how long a connection may be idle. A TLS handshake may take as long.
-    pub header_read_ms: u64,
+    header_read_ms: u64 = 30_000, 1..=MAX_DEADLINE_MS;
     /// How long a client may read nothing while a response is written to it, in milliseconds.
-    pub write_stall_ms: u64,
+    write_stall_ms: u64 = 30_000, 1..=MAX_DEADLINE_MS;
     /// How long the server drains: it accepts requests while `/readyz` answers 503, in milliseconds.
-    pub drain_ms: u64,
+    drain_ms: u64 = 0, 0..=config.shutdown_deadline_ms;
     /// How long a session is kept without an open stream and without use, in milliseconds.
-    pub session_grace_ms: u64,
+    session_grace_ms: u64 = 60_000, 1..=MAX_DEADLINE_MS;
     /// How long stopping may take, including draining, in milliseconds.
-    pub shutdown_deadline_ms: u64,
+    shutdown_deadline_ms: u64 = 10_000, 1..=MAX_DEADLINE_MS;
     /// How often the API keys are read, in milliseconds. A revoked key may be valid for that long.
-    pub key_refresh_ms: u64,
+    key_refresh_ms: u64 = 5_000, 100..=MAX_DEADLINE_MS;
     /// Origins of other web pages that may call this server, for example `https://robots.example`. If authentication is
     /// off, their hosts are also the only names with a dot that the server answers to.
-    pub cors_origins: Vec<String>,
-}
-
-impl Default for ServerConfig {
-    fn default() -> Self {
-        Self {
-            data_dir: PathBuf::from("data"),
-            models_dir: PathBuf::from("models"),
-            database_url: None,
-            database_wait_s: 60,
-            objects_url: None,
-            import_dir: None,
-            tls_certificate: None,
-            tls_key: None,
-            run_jobs: true,
-            max_body_bytes: 8 << 20,
-            max_job_bytes: 64 << 10,
-            max_frames: 64,
-            max_queued_predictions: 256,
-            max_batch: 64,
-            max_total_body_bytes: 256 << 20,
-            max_connections: 512,
-            max_connections_per_address: 256,
-            connection_evict_ms: 1_000,
-            max_admin_connections: 32,
-            max_requests: 384,
-            max_streams: 128,
-            max_event_streams: 128,
-            max_environments: 16,
-            max_sessions: 1024,
-            max_pipelined_frames: 16,
-            max_stream_buffer_bytes: 4 << 20,
-            max_plans: 512,
-            max_rollout_bytes: 64 << 20,
-            max_steps: 50,
-            max_queued_jobs: 16,
-            max_ended_jobs: 100,
-            max_job_log_lines: 1000,
-            job_threads: spare_cores(),
-            request_threads: 4,
-            picture_threads: 1,
-            max_cached_bytes: 64 << 20,
-            job_memory_mib: memory::default_limit_mib(),
-            dataset_memory_mib: memory::default_dataset_mib(),
-            job_max_attempts: 3,
-            job_time_limit_s: 0,
-            job_stall_limit_s: 7_200,
-            import_disk_mib: DEFAULT_DISK_MIB,
-            job_program: None,
-            job_lease_ms: 30_000,
-            prediction_deadline_ms: 10_000,
-            request_deadline_ms: 30_000,
-            environment_idle_ms: 600_000,
-            environment_evict_ms: 5_000,
-            stream_idle_ms: 60_000,
-            stream_send_ms: 10_000,
-            max_header_bytes: 32 << 10,
-            header_read_ms: 30_000,
-            write_stall_ms: 30_000,
-            drain_ms: 0,
-            session_grace_ms: 60_000,
-            shutdown_deadline_ms: 10_000,
-            key_refresh_ms: 5_000,
-            cors_origins: Vec::new(),
-        }
-    }
+    cors_origins: Vec<String> = Vec::new();
 }
 
 /// All cores but one, which is left for predictions; at least one.
@@ -230,6 +211,15 @@ fn spare_cores() -> usize {
 }
 
 impl ServerConfig {
+    /// Errors: a setting is out of its range.
+    pub fn validate(&self) -> Result<(), SettingError> {
+        let mut bounds = self.bounds().into_iter();
+        match bounds.find(|(_, value, range)| !range.contains(value)) {
+            None => Ok(()),
+            Some((field, value, range)) => Err(SettingError { field, value, range }),
+        }
+    }
+
     pub(in crate::server) fn predictor(&self) -> PredictorConfig {
         PredictorConfig {
             queue_capacity: self.max_queued_predictions,
@@ -284,5 +274,73 @@ impl ServerConfig {
             database: self.database_url.clone(),
             objects: self.objects_url.clone(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_defaults_are_valid() {
+        ServerConfig::default().validate().unwrap();
+    }
+
+    #[test]
+    fn a_bound_of_zero_is_refused_with_its_name_and_range() {
+        let config = ServerConfig {
+            max_streams: 0,
+            ..ServerConfig::default()
+        };
+        let error = config.validate().unwrap_err().to_string();
+        assert_eq!(error, "max_streams is 0; it must be 1 to 1000000");
+    }
+
+    #[test]
+    fn no_bound_of_a_session_may_be_zero() {
+        type Field = fn(&mut ServerConfig);
+        let fields: [(&str, Field); 7] = [
+            ("max_sessions", |config| config.max_sessions = 0),
+            ("max_pipelined_frames", |config| config.max_pipelined_frames = 0),
+            ("max_stream_buffer_bytes", |config| config.max_stream_buffer_bytes = 0),
+            ("max_plans", |config| config.max_plans = 0),
+            ("max_steps", |config| config.max_steps = 0),
+            ("max_rollout_bytes", |config| config.max_rollout_bytes = 0),
+            ("session_grace_ms", |config| config.session_grace_ms = 0),
+        ];
+        for (name, clear) in fields {
+            let mut config = ServerConfig::default();
+            clear(&mut config);
+            let error = config.validate().unwrap_err().to_string();
+            assert!(error.starts_with(&format!("{name} is 0; it must be")), "{error}");
+        }
+    }
+
+    #[test]
+    fn bounds_of_jobs_and_threads_are_checked() {
+        let roomless = ServerConfig {
+            max_job_bytes: 0,
+            ..ServerConfig::default()
+        };
+        let error = roomless.validate().unwrap_err().to_string();
+        assert_eq!(error, "max_job_bytes is 0; it must be 1024 to 16777216");
+        let threadless = ServerConfig {
+            job_threads: 0,
+            ..ServerConfig::default()
+        };
+        let error = threadless.validate().unwrap_err().to_string();
+        assert_eq!(error, "job_threads is 0; it must be 1 to 1024");
+        let handless = ServerConfig {
+            request_threads: 0,
+            ..ServerConfig::default()
+        };
+        let error = handless.validate().unwrap_err().to_string();
+        assert_eq!(error, "request_threads is 0; it must be 1 to 1024");
+        let hasty = ServerConfig {
+            job_lease_ms: 10,
+            ..ServerConfig::default()
+        };
+        let error = hasty.validate().unwrap_err().to_string();
+        assert_eq!(error, "job_lease_ms is 10; it must be 1000 to 86400000");
     }
 }

@@ -15,28 +15,6 @@ use foreframe_sim::Environment;
 /// An environment that one request at a time can step.
 pub(super) type SharedEnvironment = Arc<Mutex<Environment>>;
 
-/// Why an environment is not available.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-pub(super) enum EnvironmentTableError {
-    #[error("there is no environment \"{}\"; one that nobody steps for {idle_s} s is dropped", .id.escape_default())]
-    Unknown { id: String, idle_s: u64 },
-    #[error("{0} environments are in use already; delete one, or try again later")]
-    Full(usize),
-    #[error("the system gave no random bytes: {0}")]
-    Random(getrandom::Error),
-}
-
-impl From<EnvironmentTableError> for ApiError {
-    fn from(error: EnvironmentTableError) -> Self {
-        let detail = error.to_string();
-        match error {
-            EnvironmentTableError::Unknown { .. } => Self::NotFound(detail),
-            EnvironmentTableError::Full(_) => Self::unavailable(detail),
-            EnvironmentTableError::Random(_) => Self::Internal(detail),
-        }
-    }
-}
-
 struct Entry {
     environment: SharedEnvironment,
     maker: Caller,
@@ -63,14 +41,9 @@ impl Environments {
     }
 
     /// Adds an environment and gives its random id. If the table is full, it replaces the environment that was idle the
-    /// longest, if that was long enough. Errors: `Full`, `Random`.
-    pub(super) fn add(
-        &self,
-        environment: Environment,
-        maker: Caller,
-        now: Instant,
-    ) -> Result<String, EnvironmentTableError> {
-        let id = Token::random().map_err(EnvironmentTableError::Random)?.id();
+    /// longest, if that was long enough. Errors: `Unavailable` if there is none, `Internal`.
+    pub(super) fn add(&self, environment: Environment, maker: Caller, now: Instant) -> Result<String, ApiError> {
+        let id = Token::random()?.id();
         let mut table = self.table(now);
         if table.len() >= self.limit {
             self.evict_idlest(&mut table, now)?;
@@ -84,24 +57,22 @@ impl Environments {
         Ok(id)
     }
 
-    fn evict_idlest(&self, table: &mut BTreeMap<String, Entry>, now: Instant) -> Result<(), EnvironmentTableError> {
+    fn evict_idlest(&self, table: &mut BTreeMap<String, Entry>, now: Instant) -> Result<(), ApiError> {
         let idlest = table.iter().min_by_key(|(_, entry)| entry.used);
         let idlest = idlest.map(|(id, entry)| (id.clone(), now.saturating_duration_since(entry.used)));
-        let (id, idle) = idlest
-            .filter(|(_, idle)| *idle >= self.evict_after)
-            .ok_or(EnvironmentTableError::Full(self.limit))?;
+        let (id, idle) = idlest.filter(|(_, idle)| *idle >= self.evict_after).ok_or_else(|| {
+            let limit = self.limit;
+            ApiError::unavailable(format!(
+                "{limit} environments are in use already; delete one, or try again later"
+            ))
+        })?;
         table.remove(&id);
         info!(environment.id = %id, idle_s = idle.as_secs(), "environment replaced by a new one");
         Ok(())
     }
 
-    /// The environment; counts as use. Errors: `Unknown`, also if it is another caller's.
-    pub(super) fn get(
-        &self,
-        id: &str,
-        caller: Caller,
-        now: Instant,
-    ) -> Result<SharedEnvironment, EnvironmentTableError> {
+    /// The environment; counts as use. Errors: `NotFound`, also if it is another caller's.
+    pub(super) fn get(&self, id: &str, caller: Caller, now: Instant) -> Result<SharedEnvironment, ApiError> {
         let mut table = self.table(now);
         let entry = table.get_mut(id).filter(|entry| caller.may_use(entry.maker));
         let entry = entry.ok_or_else(|| self.unknown(id))?;
@@ -109,19 +80,19 @@ impl Environments {
         Ok(Arc::clone(&entry.environment))
     }
 
-    /// Errors: `Unknown`, also if it is another caller's.
-    pub(super) fn remove(&self, id: &str, caller: Caller, now: Instant) -> Result<(), EnvironmentTableError> {
-        let mut table = self.table(now);
-        let is_usable = table.get(id).is_some_and(|entry| caller.may_use(entry.maker));
-        let removed = is_usable.then(|| table.remove(id)).flatten();
-        removed.map(drop).ok_or_else(|| self.unknown(id))
+    /// Errors: `NotFound`, also if it is another caller's.
+    pub(super) fn remove(&self, id: &str, caller: Caller, now: Instant) -> Result<(), ApiError> {
+        self.get(id, caller, now)?;
+        self.table(now).remove(id);
+        Ok(())
     }
 
-    fn unknown(&self, id: &str) -> EnvironmentTableError {
-        EnvironmentTableError::Unknown {
-            id: id.to_owned(),
-            idle_s: self.idle.as_secs(),
-        }
+    fn unknown(&self, id: &str) -> ApiError {
+        ApiError::NotFound(format!(
+            "there is no environment \"{}\"; one that nobody steps for {} s is dropped",
+            id.escape_default(),
+            self.idle.as_secs()
+        ))
     }
 
     /// The table without the environments that have been idle for too long.
@@ -173,7 +144,7 @@ mod tests {
         let error = table
             .add(environment(), Caller::default(), start + Duration::from_secs(2))
             .unwrap_err();
-        assert_eq!(error, EnvironmentTableError::Full(1));
+        assert!(matches!(error, ApiError::Unavailable { .. }));
     }
 
     #[test]

@@ -3,7 +3,6 @@
 pub(super) mod access;
 pub(super) mod admission;
 pub(super) mod body_budget;
-pub(super) mod changes;
 mod connection_table;
 pub(super) mod connections;
 pub(super) mod extract;
@@ -16,7 +15,7 @@ pub(super) mod origin;
 pub(super) mod page;
 pub(super) mod problem;
 mod rate;
-pub(super) mod request_limit;
+pub(super) mod requests;
 pub(super) mod task_limit;
 pub(super) mod tls;
 

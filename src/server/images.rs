@@ -8,10 +8,8 @@ use super::http::problem::ApiError;
 use foreframe_core::error_text::with_causes;
 use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, FrameError, codec};
-use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
-use foreframe_core::serving::{InputError, check_size};
-use foreframe_core::types::ModelName;
+use foreframe_core::serving::check_size;
 
 /// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
 /// small body can take.
@@ -80,9 +78,8 @@ impl de::Visitor<'_> for ImageVisitor {
 
     fn visit_str<E: de::Error>(self, text: &str) -> Result<ImageBytes, E> {
         let bytes = STANDARD.decode(text);
-        bytes
-            .map(ImageBytes)
-            .map_err(|error| E::custom(format_args!("the image is not base64: {error}")))
+        let bytes = bytes.map_err(|error| E::custom(format_args!("the image is not base64: {error}")))?;
+        Ok(ImageBytes(bytes))
     }
 
     fn visit_bytes<E: de::Error>(self, bytes: &[u8]) -> Result<ImageBytes, E> {
@@ -97,21 +94,9 @@ impl de::Visitor<'_> for ImageVisitor {
 /// Why an image was refused or could not be made.
 #[derive(Debug, thiserror::Error)]
 pub(in crate::server) enum ImageError {
-    #[error("{field} is {source}")]
-    Decode { field: String, source: FrameError },
-    #[error("{field} holds {found} raw bytes; model \"{model}\" takes {width}×{height} px, {expected} bytes")]
-    RawLength {
-        field: String,
-        model: ModelName,
-        found: usize,
-        expected: usize,
-        width: u32,
-        height: u32,
-    },
-    #[error("{0}; set resize to crop, letterbox or stretch")]
-    Size(InputError),
-    #[error("{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels")]
-    TooManyPixels { field: String, width: u32, height: u32 },
+    /// What is wrong with an image of the request.
+    #[error("{0}")]
+    Refused(String),
     #[error("an image of the answer could not be encoded")]
     Encode(#[source] FrameError),
 }
@@ -120,7 +105,7 @@ impl From<ImageError> for ApiError {
     fn from(error: ImageError) -> Self {
         match error {
             ImageError::Encode(_) => Self::Internal(with_causes(&error)),
-            _ => Self::Unprocessable(error.to_string()),
+            ImageError::Refused(reason) => Self::Unprocessable(reason),
         }
     }
 }
@@ -140,44 +125,31 @@ pub(in crate::server) fn decode(
     input: ImageInput,
     manifest: &Manifest,
 ) -> Result<Frame, ImageError> {
-    let decode_error = |source| ImageError::Decode {
-        field: field.to_owned(),
-        source,
-    };
+    let refused = |error: FrameError| ImageError::Refused(format!("{field} is {error}"));
     let (model, spec) = (&manifest.name, &manifest.spec);
+    let (model_width, model_height) = (spec.frame_width_px, spec.frame_height_px);
     if input.format == ImageFormat::Raw {
-        return raw(field, bytes, model, spec);
+        let (found, expected) = (bytes.len(), model_width as usize * model_height as usize);
+        if found != expected {
+            return Err(ImageError::Refused(format!(
+                "{field} holds {found} raw bytes; model \"{model}\" takes {model_width}×{model_height} px, {expected} bytes"
+            )));
+        }
+        return Frame::new(model_width, model_height, bytes).map_err(refused);
     }
-    let (width, height) = codec::dimensions(&bytes).map_err(decode_error)?;
+    let (width, height) = codec::dimensions(&bytes).map_err(refused)?;
     let Some(way) = input.resize else {
-        check_size(field, model, spec, (width, height)).map_err(ImageError::Size)?;
-        return codec::decode(&bytes).map_err(decode_error);
+        let checked = check_size(field, model, spec, (width, height));
+        checked.map_err(|error| ImageError::Refused(format!("{error}; set resize to crop, letterbox or stretch")))?;
+        return codec::decode(&bytes).map_err(refused);
     };
     if width.saturating_mul(height) > MAX_FIT_PIXELS {
-        let field = field.to_owned();
-        return Err(ImageError::TooManyPixels { field, width, height });
+        return Err(ImageError::Refused(format!(
+            "{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels"
+        )));
     }
-    let frame = codec::decode(&bytes).map_err(decode_error)?;
-    resize(&frame, spec.frame_width_px, spec.frame_height_px, way).map_err(decode_error)
-}
-
-fn raw(field: &str, bytes: Vec<u8>, model: &ModelName, spec: &ModelSpec) -> Result<Frame, ImageError> {
-    let (width, height) = (spec.frame_width_px, spec.frame_height_px);
-    let expected = width as usize * height as usize;
-    if bytes.len() != expected {
-        return Err(ImageError::RawLength {
-            field: field.to_owned(),
-            model: model.clone(),
-            found: bytes.len(),
-            expected,
-            width,
-            height,
-        });
-    }
-    Frame::new(width, height, bytes).map_err(|source| ImageError::Decode {
-        field: field.to_owned(),
-        source,
-    })
+    let frame = codec::decode(&bytes).map_err(refused)?;
+    resize(&frame, model_width, model_height, way).map_err(refused)
 }
 
 /// The frames in that format.
@@ -188,10 +160,7 @@ pub(in crate::server) fn encode(frames: &[Frame], format: ImageFormat) -> Result
 /// As [`encode`]; raw pixels are not copied.
 pub(in crate::server) fn encode_owned(frames: Vec<Frame>, format: ImageFormat) -> Result<Vec<ImageBytes>, ImageError> {
     match format {
-        ImageFormat::Raw => Ok(frames
-            .into_iter()
-            .map(|frame| ImageBytes(frame.into_pixels()))
-            .collect()),
+        ImageFormat::Raw => Ok(frames.into_iter().map(Frame::into_pixels).map(ImageBytes).collect()),
         ImageFormat::Png | ImageFormat::Jpeg => encode(&frames, format),
     }
 }

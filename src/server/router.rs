@@ -1,19 +1,18 @@
 //! All routes with the layers around them. A route is declared once, at its handler; this also makes the contract.
 
 use axum::extract::DefaultBodyLimit;
-use axum::middleware::{from_fn, from_fn_with_state};
+use axum::middleware::from_fn_with_state;
 use axum::{Extension, Router};
 use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::config::ServerConfig;
 use super::http::body_budget;
-use super::http::changes;
 use super::http::keys;
 use super::http::middleware::{self, RequestTrace};
 use super::http::origin::{self, OriginPolicy};
 use super::http::problem::ApiError;
-use super::http::request_limit::{self, RequestLimit};
+use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict,
@@ -24,10 +23,8 @@ use super::state::App;
 /// Every route of the service.
 pub fn router(app: App) -> Router {
     let config = app.config();
-    let limit = RequestLimit::new(config);
     let api = request_routes(config)
-        .route_layer(from_fn_with_state(limit, request_limit::check))
-        .route_layer(from_fn_with_state(app.changes().clone(), changes::complete))
+        .route_layer(from_fn_with_state(app.requests().clone(), requests::answer))
         .merge(stream_routes())
         .route_layer(from_fn_with_state(app.keys().clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();
@@ -42,9 +39,7 @@ pub fn router(app: App) -> Router {
         .layer(DefaultBodyLimit::max(config.max_body_bytes))
         .layer(from_fn_with_state(app.body_budget().clone(), body_budget::count))
         .layer(from_fn_with_state(origins, origin::check))
-        .layer(from_fn(move |request, next| {
-            middleware::trace(trace.clone(), request, next)
-        }))
+        .layer(from_fn_with_state(trace, middleware::trace))
         .with_state(app)
 }
 

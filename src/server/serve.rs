@@ -36,29 +36,26 @@ impl From<TcpListener> for ServerListeners {
 /// another `drain_ms`. After that it accepts no connections, answers the requests it has, closes every stream with code
 /// 1001, lets the running job write its checkpoint, and returns when all have ended or the deadline has passed.
 pub async fn serve(listeners: impl Into<ServerListeners>, app: App, shutdown: impl Future<Output = ()>) {
-    let ServerListeners {
-        public: listener,
-        admin,
-    } = listeners.into();
+    let ServerListeners { public, admin } = listeners.into();
     // Until the end, also while the server stops.
-    let admin = admin.map(|admin| tokio::spawn(answer_admin(admin, app.clone())));
-    serve_public(listener, app, shutdown).await;
+    let admin = admin.map(|listener| {
+        let app = app.clone();
+        tokio::spawn(async move { admin::answer(listener, admin::server_router(&app), app.config()).await })
+    });
+    serve_public(public, app, shutdown).await;
     if let Some(admin) = admin {
         admin.abort();
     }
-}
-
-async fn answer_admin(listener: TcpListener, app: App) {
-    admin::answer(listener, admin::server_router(&app), app.config()).await;
 }
 
 async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Output = ()>) {
     let config = app.config();
     let limit = Duration::from_millis(config.shutdown_deadline_ms);
     let drain = Duration::from_millis(config.drain_ms);
-    let listener = BoundedListener::new(listener, config);
-    let connections = Connections::new(router(app.clone()), config, app.streams().stopping());
-    let mut connections = connections.with_tls(app.tls().cloned());
+    let (total, per_address) = (config.max_connections, config.max_connections_per_address);
+    let listener = BoundedListener::new(listener, config, total, per_address);
+    let stopping = app.streams().stopping();
+    let mut connections = Connections::new(router(app.clone()), config, stopping, app.tls().cloned());
     tokio::select! {
         never = connections.accept(&listener) => match never {},
         never = metrics::keep_folded() => match never {},
@@ -75,18 +72,16 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     drop(listener);
     app.streams().stop();
     app.event_streams().stop();
-    if timeout_at(deadline.into(), connections.ended()).await.is_err() {
-        warn!("some requests were not answered within the deadline");
-    }
-    let tasks = async {
+    let answered = async {
+        connections.ended().await;
         tokio::join!(
+            app.requests().ended(),
             app.streams().ended(),
-            app.event_streams().ended(),
-            app.changes().ended()
+            app.event_streams().ended()
         )
     };
-    if timeout_at(deadline.into(), tasks).await.is_err() {
-        warn!("some streams or changes did not end within the deadline");
+    if timeout_at(deadline.into(), answered).await.is_err() {
+        warn!("some requests or streams did not end within the deadline");
     }
     let ended = async {
         let jobs_ended = app.jobs().finish_stop(deadline).await;

@@ -82,7 +82,7 @@ struct AppState {
     parts: AppParts,
     streams: TaskLimit,
     event_streams: TaskLimit,
-    changes: TaskLimit,
+    requests: TaskLimit,
     admission: Admission,
     body_budget: BodyBudget,
     predictions: BlockingWork,
@@ -149,14 +149,14 @@ impl App {
     pub fn with_parts(config: ServerConfig, parts: AppParts) -> Self {
         Self {
             shared: Arc::new(AppState {
-                streams: TaskLimit::new("streams", config.max_streams),
-                event_streams: TaskLimit::new("event streams", config.max_event_streams),
-                changes: TaskLimit::new("changing requests", config.max_requests),
+                streams: TaskLimit::new("streams are open", config.max_streams),
+                event_streams: TaskLimit::new("event streams are open", config.max_event_streams),
+                requests: TaskLimit::new("requests are being processed", config.max_requests),
                 admission: Admission::new(&config),
                 body_budget: BodyBudget::new(&config),
-                predictions: BlockingWork::new("predictions", config.request_threads),
+                predictions: BlockingWork::new("predictions", config.request_threads, false),
                 render_cache: RenderCache::new(&config),
-                blocking: BlockingWork::new("requests", config.request_threads),
+                blocking: BlockingWork::new("requests", config.request_threads, false),
                 environments: Environments::new(&config),
                 draining: Arc::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
@@ -234,9 +234,9 @@ impl App {
         &self.shared.event_streams
     }
 
-    /// The requests that change state and are being completed.
-    pub(super) fn changes(&self) -> &TaskLimit {
-        &self.shared.changes
+    /// The requests that are being processed.
+    pub(super) fn requests(&self) -> &TaskLimit {
+        &self.shared.requests
     }
 
     pub(super) fn admission(&self) -> &Admission {

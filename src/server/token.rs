@@ -6,13 +6,18 @@ use sha2::{Digest as _, Sha256};
 #[derive(Clone)]
 pub(in crate::server) struct Token([u8; 32]);
 
-/// SHA-256 of a token's text: what the server keeps.
-#[derive(Clone, Copy, PartialEq, Eq)]
+/// The system gave no random bytes.
+#[derive(Debug, thiserror::Error)]
+#[error("the system gave no random bytes: {0}")]
+pub struct RandomError(#[from] getrandom::Error);
+
+/// SHA-256 of a token's or key's text: what the server keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(in crate::server) struct TokenHash([u8; 32]);
 
 impl Token {
     /// Errors: the system gave no random bytes.
-    pub(in crate::server) fn random() -> Result<Self, getrandom::Error> {
+    pub(in crate::server) fn random() -> Result<Self, RandomError> {
         let mut bytes = [0; 32];
         getrandom::fill(&mut bytes)?;
         Ok(Self(bytes))
@@ -42,5 +47,16 @@ impl TokenHash {
     /// Hash of a token's text. Comparing hashes takes no time that depends on the token.
     pub(in crate::server) fn of(text: &str) -> Self {
         Self(Sha256::digest(text.as_bytes()).into())
+    }
+
+    /// From hexadecimal; `None` if the text is something else.
+    pub(in crate::server) fn from_hex(text: &str) -> Option<Self> {
+        let mut hash = [0; 32];
+        hex::decode_to_slice(text, &mut hash).ok()?;
+        Some(Self(hash))
+    }
+
+    pub(in crate::server) fn to_hex(self) -> String {
+        hex::encode(self.0)
     }
 }

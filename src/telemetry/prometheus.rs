@@ -21,12 +21,10 @@ static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
 
 /// Starts recording. Values recorded earlier are lost. A second call changes nothing.
 pub fn install_recorder() {
-    HANDLE.get_or_init(|| match install() {
-        Ok(handle) => Some(handle),
-        Err(error) => {
-            error!(%error, "could not install the metrics recorder; no metrics are recorded");
-            None
-        }
+    HANDLE.get_or_init(|| {
+        let failed =
+            |error: &BuildError| error!(%error, "could not install the metrics recorder; no metrics are recorded");
+        install().inspect_err(failed).ok()
     });
 }
 

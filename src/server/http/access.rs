@@ -1,8 +1,14 @@
 //! Which scope each operation needs, and which operations change state for good, so that they are audited.
 
+use axum::extract::{MatchedPath, Request};
 use axum::http::Method;
 
 use foreframe_jobs::store::KeyScope;
+
+/// The template of the route that a request takes; empty if there is none.
+pub(super) fn route(request: &Request) -> &str {
+    request.extensions().get().map_or("", MatchedPath::as_str)
+}
 
 /// The scope that a request needs, by its method and its route's template. A route without a rule needs `admin`.
 pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScope {

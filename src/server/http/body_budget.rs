@@ -3,18 +3,16 @@
 
 use std::error::Error;
 use std::io;
-use std::pin::Pin;
+use std::iter::successors;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::task::{Context, Poll};
 
-use axum::body::{Body, Bytes, HttpBody};
+use axum::body::{Body, Bytes, HttpBody as _};
 use axum::extract::{Request, State};
 use axum::middleware::Next;
 use axum::response::Response;
-use hyper::body::{Frame, SizeHint};
+use futures_util::StreamExt as _;
 
-use super::problem::ApiError;
 use crate::server::config::ServerConfig;
 
 /// The bytes that are left; clones share them.
@@ -46,13 +44,6 @@ impl BodyBudget {
             taken: AtomicUsize::new(0),
         }
     }
-
-    fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
-        let limit = self.limit;
-        let sum = |used: usize| used.checked_add(bytes).filter(|&sum| sum <= limit);
-        let taken = self.used.fetch_update(Ordering::AcqRel, Ordering::Acquire, sum);
-        taken.map(drop).map_err(|_| BodyBudgetError { limit })
-    }
 }
 
 /// What one request or stream has taken; given back on drop.
@@ -63,7 +54,10 @@ pub(super) struct BodyShare {
 
 impl BodyShare {
     pub(super) fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
-        self.budget.take(bytes)?;
+        let BodyBudget { used, limit } = &self.budget;
+        let sum = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
+        let taken = used.fetch_update(Ordering::AcqRel, Ordering::Acquire, sum);
+        taken.map_err(|_| BodyBudgetError { limit: *limit })?;
         self.taken.fetch_add(bytes, Ordering::AcqRel);
         Ok(())
     }
@@ -76,37 +70,7 @@ impl Drop for BodyShare {
     }
 }
 
-/// A body whose bytes count from their arrival until the request is answered.
-struct CountedBody {
-    body: Body,
-    share: Arc<BodyShare>,
-}
-
-impl HttpBody for CountedBody {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        let polled = Pin::new(&mut self.body).poll_frame(cx);
-        if let Poll::Ready(Some(Ok(frame))) = &polled
-            && let Some(bytes) = frame.data_ref()
-            && let Err(error) = self.share.take(bytes.len())
-        {
-            return Poll::Ready(Some(Err(axum::Error::new(error))));
-        }
-        polled
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
-/// Counts the body of the request until it is answered.
+/// Counts the body of the request, from the arrival of its bytes until the request is answered.
 pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: Request, next: Next) -> Response {
     if request.body().is_end_stream() {
         return next.run(request).await;
@@ -114,32 +78,26 @@ pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: 
     let share = Arc::new(budget.share());
     // The bytes outlive the body: the handler works with them.
     let held = Arc::clone(&share);
+    let counted = move |bytes: Result<Bytes, axum::Error>| {
+        let bytes = bytes?;
+        share.take(bytes.len()).map_err(axum::Error::new)?;
+        Ok::<_, axum::Error>(bytes)
+    };
     let response = next
-        .run(request.map(|body| Body::new(CountedBody { body, share })))
+        .run(request.map(|body| Body::from_stream(body.into_data_stream().map(counted))))
         .await;
     drop(held);
     response
 }
 
-/// The answer to a request whose body could not be read, if the budget is the cause.
-pub(super) fn exceeded(error: &(dyn Error + 'static)) -> Option<ApiError> {
-    cause(error).map(|exceeded| ApiError::unavailable(exceeded.to_string()))
-}
-
 /// The exceeded budget among the causes of an error.
 pub(in crate::server) fn cause<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a BodyBudgetError> {
-    let mut cause = Some(error);
-    while let Some(error) = cause {
-        if let Some(exceeded) = error.downcast_ref::<BodyBudgetError>() {
-            return Some(exceeded);
-        }
+    let mut causes = successors(Some(error), |&error| {
         // An I/O error's source is that of the error within it.
         let within = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
-        cause = within
-            .map(|error| error as &(dyn Error + 'static))
-            .or_else(|| error.source());
-    }
-    None
+        within.map_or_else(|| error.source(), |within| Some(within as &(dyn Error + 'static)))
+    });
+    causes.find_map(|error| error.downcast_ref())
 }
 
 #[cfg(test)]
@@ -155,7 +113,7 @@ mod tests {
         let (first, second) = (budget.share(), budget.share());
         first.take(60).unwrap();
         let error = axum::Error::new(second.take(50).unwrap_err());
-        assert!(matches!(exceeded(&error), Some(ApiError::Unavailable { .. })));
+        assert!(cause(&error).is_some());
         second.take(40).unwrap();
         drop(first);
         second.take(60).unwrap();

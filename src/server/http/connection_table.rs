@@ -28,7 +28,6 @@ pub(super) struct ConnectionTable {
 #[derive(Default)]
 struct OpenConnections {
     by_id: HashMap<u64, OpenConnection>,
-    by_address: HashMap<IpAddr, usize>,
     next_id: u64,
 }
 
@@ -50,9 +49,9 @@ impl ConnectionTable {
 
     /// A place for a connection from that address. If there is none, the connection that was idle the longest gives its
     /// place, if that was long enough; `None` if there is no such connection.
-    pub(super) fn admit(self: &Arc<Self>, address: IpAddr, now: Instant) -> Option<ConnectionPlace> {
+    pub(super) fn admit(self: &Arc<Self>, address: IpAddr, now: Instant) -> Option<Arc<ConnectionPlace>> {
         let (mut open, address) = (self.open(), counted(address));
-        let of_address = open.by_address.get(&address).copied().unwrap_or(0);
+        let of_address = open.by_id.values().filter(|open| open.address == address).count();
         if of_address >= self.limits.per_address {
             open.evict_idlest(Some(address), now, self.limits.evict_after)?;
         } else if open.by_id.len() >= self.limits.total {
@@ -60,7 +59,6 @@ impl ConnectionTable {
         }
         let (id, evicted) = (open.next_id, Arc::new(Notify::new()));
         open.next_id += 1;
-        *open.by_address.entry(address).or_default() += 1;
         let connection = OpenConnection {
             address,
             busy: 0,
@@ -69,7 +67,7 @@ impl ConnectionTable {
         };
         open.by_id.insert(id, connection);
         let table = Arc::clone(self);
-        Some(ConnectionPlace { table, id, evicted })
+        Some(Arc::new(ConnectionPlace { table, id, evicted }))
     }
 
     fn open(&self) -> MutexGuard<'_, OpenConnections> {
@@ -83,22 +81,10 @@ impl OpenConnections {
             let is_of_address = of.is_none_or(|address| address == connection.address);
             is_of_address && connection.busy == 0 && now.saturating_duration_since(connection.idle_since) >= after
         });
-        let idlest = candidates.min_by_key(|(_, connection)| connection.idle_since)?;
-        let id = *idlest.0;
-        self.remove(id)?.evicted.notify_one();
+        let (&id, _) = candidates.min_by_key(|(_, connection)| connection.idle_since)?;
+        self.by_id.remove(&id)?.evicted.notify_one();
         counter!(metric_names::HTTP_CONNECTIONS_EVICTED).increment(1);
         Some(())
-    }
-
-    fn remove(&mut self, id: u64) -> Option<OpenConnection> {
-        let connection = self.by_id.remove(&id)?;
-        if let Some(count) = self.by_address.get_mut(&connection.address) {
-            *count -= 1;
-            if *count == 0 {
-                self.by_address.remove(&connection.address);
-            }
-        }
-        Some(connection)
     }
 }
 
@@ -119,13 +105,12 @@ pub(in crate::server) struct ConnectionPlace {
 
 impl ConnectionPlace {
     /// Marks the connection as busy until the result is dropped.
-    pub(super) fn begin(&self) -> BusyConnection {
+    pub(super) fn begin(self: &Arc<Self>) -> BusyConnection {
         if let Some(connection) = self.table.open().by_id.get_mut(&self.id) {
             connection.busy += 1;
         }
         BusyConnection {
-            table: Arc::clone(&self.table),
-            id: self.id,
+            place: Arc::clone(self),
             is_kept: false,
         }
     }
@@ -143,21 +128,21 @@ impl ConnectionPlace {
 
 impl Drop for ConnectionPlace {
     fn drop(&mut self) {
-        self.table.open().remove(self.id);
+        self.table.open().by_id.remove(&self.id);
     }
 }
 
 /// A connection that is being used, and so is not evicted.
 pub(super) struct BusyConnection {
-    table: Arc<ConnectionTable>,
-    id: u64,
+    place: Arc<ConnectionPlace>,
     is_kept: bool,
 }
 
 impl BusyConnection {
-    /// The connection stays busy until its end.
-    pub(super) fn keep(mut self) {
+    /// The connection stays busy until its end; so there is nothing left to hold.
+    pub(super) fn keep(mut self) -> Option<Self> {
         self.is_kept = true;
+        None
     }
 }
 
@@ -166,7 +151,7 @@ impl Drop for BusyConnection {
         if self.is_kept {
             return;
         }
-        if let Some(connection) = self.table.open().by_id.get_mut(&self.id) {
+        if let Some(connection) = self.place.table.open().by_id.get_mut(&self.place.id) {
             connection.busy = connection.busy.saturating_sub(1);
             connection.idle_since = Instant::now();
         }

@@ -1,18 +1,16 @@
 //! Open connections, one task each, so that the server can ask all to end, wait for them, and cut them off.
 
 use std::convert::Infallible;
-use std::pin::{Pin, pin};
+use std::pin::pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::{Body, Bytes, HttpBody};
 use axum::http::{Request, StatusCode};
-use axum::response::Response;
-use hyper::body::{Frame, Incoming, SizeHint};
+use http_body_util::BodyExt as _;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
-use hyper::service::Service;
+use hyper::service::{Service as _, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -20,7 +18,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::debug;
 
-use super::connection_table::{BusyConnection, ConnectionPlace};
+use super::connection_table::ConnectionPlace;
 use super::http_stream::HttpStream;
 use super::listener::{BoundedConnection, BoundedListener};
 use super::message_bytes::MessageBytes;
@@ -35,28 +33,27 @@ pub(in crate::server) struct Connections {
 }
 
 impl Connections {
-    pub(in crate::server) fn new(router: Router, config: &ServerConfig, stopping: watch::Receiver<bool>) -> Self {
+    /// `stopping`: becomes true when the server stops. `tls`: none for plain HTTP.
+    pub(in crate::server) fn new(
+        router: Router,
+        config: &ServerConfig,
+        stopping: watch::Receiver<bool>,
+        tls: Option<ServerTls>,
+    ) -> Self {
         let mut http = http1::Builder::new();
         http.timer(TokioTimer::new())
             .header_read_timeout(Duration::from_millis(config.header_read_ms))
             .max_header_size(config.max_header_bytes);
-        let handler = ConnectionHandler {
-            http,
-            router,
-            stopping,
-            tls: None,
-            handshake_limit: Duration::from_millis(config.header_read_ms),
-        };
         Self {
             tasks: JoinSet::new(),
-            handler,
+            handler: ConnectionHandler {
+                http,
+                router,
+                stopping,
+                tls,
+                handshake_limit: Duration::from_millis(config.header_read_ms),
+            },
         }
-    }
-
-    /// The same with TLS, if there is one.
-    pub(in crate::server) fn with_tls(mut self, tls: Option<ServerTls>) -> Self {
-        self.handler.tls = tls;
-        self
     }
 
     /// Accepts connections until the future is dropped.
@@ -91,7 +88,7 @@ struct ConnectionHandler {
 
 impl ConnectionHandler {
     async fn run(self, connection: BoundedConnection) {
-        let Some(place) = connection.place() else { return };
+        let place = Arc::clone(&connection.place);
         match self.tls.clone() {
             None => self.answer(connection, place).await,
             #[cfg(feature = "tls")]
@@ -101,7 +98,7 @@ impl ConnectionHandler {
                 }
             }
             #[cfg(not(feature = "tls"))]
-            Some(tls) => match tls.never() {},
+            Some(never) => match never {},
         }
     }
 
@@ -114,23 +111,16 @@ impl ConnectionHandler {
         place: &ConnectionPlace,
     ) -> Option<impl AsyncRead + AsyncWrite + Send + Unpin + 'static> {
         let mut stopping = self.stopping.clone();
-        let accepted = tokio::time::timeout(self.handshake_limit, tls.acceptor().accept(connection));
+        let accepted = tokio::time::timeout(self.handshake_limit, tls.0.accept(connection));
         let accepted = tokio::select! {
             accepted = accepted => accepted,
             () = place.evicted() => return None,
             () = stop_requested(&mut stopping) => return None,
         };
-        match accepted {
-            Ok(Ok(encrypted)) => Some(encrypted),
-            Ok(Err(error)) => {
-                debug!(%error, "TLS handshake failed");
-                None
-            }
-            Err(_) => {
-                debug!("TLS handshake took too long");
-                None
-            }
-        }
+        let accepted = accepted.unwrap_or_else(|late| Err(late.into()));
+        accepted
+            .inspect_err(|error| debug!(%error, "TLS handshake failed"))
+            .ok()
     }
 
     /// Answers a connection's requests. After the stop signal, it answers only requests that have arrived.
@@ -142,13 +132,29 @@ impl ConnectionHandler {
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let (evicted, messages) = (place.evicted(), MessageBytes::default());
-        let stream = TokioIo::new(HttpStream::new(stream, messages.clone()));
+        let stream = TokioIo::new(HttpStream {
+            inner: stream,
+            messages: messages.clone(),
+        });
         let router = TowerToHyperService::new(self.router);
-        let service = BusyService {
-            router,
-            place,
-            messages,
-        };
+        let service = service_fn(move |mut request: Request<Incoming>| {
+            let busy = place.begin();
+            request.extensions_mut().insert(messages.clone());
+            let answered = router.call(request);
+            async move {
+                let response = answered.await?;
+                // The connection of a stream is busy until its end, others until the response was sent.
+                let busy = match response.status() {
+                    StatusCode::SWITCHING_PROTOCOLS => busy.keep(),
+                    _ => Some(busy),
+                };
+                let held_by_body = move |error| {
+                    let _ = &busy;
+                    error
+                };
+                Ok::<_, Infallible>(response.map(|body| body.map_err(held_by_body)))
+            }
+        });
         let mut connection = pin!(self.http.serve_connection(stream, service).with_upgrades());
         let result = tokio::select! {
             // The connection first: it reads what has arrived before an idle connection is closed.
@@ -164,55 +170,5 @@ impl ConnectionHandler {
         if let Err(error) = result {
             debug!(%error, "connection failed");
         }
-    }
-}
-
-/// Answers requests, and marks the connection as busy until the response was sent.
-struct BusyService {
-    router: TowerToHyperService<Router>,
-    place: Arc<ConnectionPlace>,
-    messages: MessageBytes,
-}
-
-impl Service<Request<Incoming>> for BusyService {
-    type Response = Response;
-    type Error = Infallible;
-    type Future = Pin<Box<dyn Future<Output = Result<Response, Infallible>> + Send>>;
-
-    fn call(&self, mut request: Request<Incoming>) -> Self::Future {
-        let busy = self.place.begin();
-        request.extensions_mut().insert(self.messages.clone());
-        let answered = self.router.call(request);
-        Box::pin(async move {
-            let response = answered.await?;
-            if response.status() == StatusCode::SWITCHING_PROTOCOLS {
-                busy.keep();
-                return Ok(response);
-            }
-            Ok(response.map(|body| Body::new(BusyBody { body, _busy: busy })))
-        })
-    }
-}
-
-/// A response body; the connection is busy as long as it exists.
-struct BusyBody {
-    body: Body,
-    _busy: BusyConnection,
-}
-
-impl HttpBody for BusyBody {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(cx)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }

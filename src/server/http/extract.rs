@@ -1,13 +1,13 @@
 //! Extractors: the parts of a request as typed values. Errors are problem details.
 
-use std::error::Error as _;
+use std::error::Error;
 use std::marker::PhantomData;
 
 use axum::extract::path::ErrorKind;
 use axum::extract::rejection::{BytesRejection, JsonRejection, PathRejection};
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderValue, StatusCode, header};
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
@@ -107,12 +107,8 @@ impl<S: Send + Sync> FromRequestParts<S> for ResponseFormat {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
-        let accept = parts.headers.get(header::ACCEPT).map_or(Ok("*/*"), |accept| {
-            accept
-                .to_str()
-                .map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))
-        })?;
-        Self::from_accept(accept)
+        let accept = parts.headers.get(header::ACCEPT).map_or(Ok("*/*"), HeaderValue::to_str);
+        Self::from_accept(accept.map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))?)
     }
 }
 
@@ -134,28 +130,27 @@ impl From<JsonRejection> for ApiError {
 
 impl From<BytesRejection> for ApiError {
     fn from(rejection: BytesRejection) -> Self {
-        if rejection.status() == StatusCode::PAYLOAD_TOO_LARGE {
-            Self::TooLarge("the body is longer than this server takes".to_owned())
-        } else if let Some(refused) = body_budget::exceeded(&rejection) {
-            refused
-        } else {
-            Self::Malformed(rejection.body_text())
-        }
+        too_long(rejection.status(), &rejection).unwrap_or_else(|| Self::Malformed(rejection.body_text()))
     }
+}
+
+/// The answer to a request whose body was not read because it, or all bodies together, are too long; `None` if that is not why.
+pub(super) fn too_long(status: StatusCode, error: &(dyn Error + 'static)) -> Option<ApiError> {
+    if status == StatusCode::PAYLOAD_TOO_LARGE {
+        let detail = "the body is longer than this server takes".to_owned();
+        return Some(ApiError::TooLarge(detail));
+    }
+    body_budget::cause(error).map(|exceeded| ApiError::unavailable(exceeded.to_string()))
 }
 
 impl From<PathRejection> for ApiError {
     fn from(rejection: PathRejection) -> Self {
-        let detail = match &rejection {
-            PathRejection::FailedToDeserializePathParams(error) => match error.kind() {
-                ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } => {
-                    Some(format!("\"{value}\" in the path is not a whole number, or too large"))
-                }
-                _ => None,
-            },
-            _ => None,
-        };
-        Self::Malformed(detail.unwrap_or_else(|| rejection.body_text()))
+        if let PathRejection::FailedToDeserializePathParams(error) = &rejection
+            && let ErrorKind::ParseErrorAtIndex { value, .. } | ErrorKind::ParseErrorAtKey { value, .. } = error.kind()
+        {
+            return Self::Malformed(format!("\"{value}\" in the path is not a whole number, or too large"));
+        }
+        Self::Malformed(rejection.body_text())
     }
 }
 

@@ -11,14 +11,8 @@ use super::problem;
 
 /// Counts what is read, and replaces the responses that hyper writes itself by problem details.
 pub(super) struct HttpStream<S> {
-    inner: S,
-    messages: MessageBytes,
-}
-
-impl<S> HttpStream<S> {
-    pub(super) fn new(inner: S, messages: MessageBytes) -> Self {
-        Self { inner, messages }
-    }
+    pub(super) inner: S,
+    pub(super) messages: MessageBytes,
 }
 
 impl<S: AsyncRead + Unpin> AsyncRead for HttpStream<S> {

@@ -2,23 +2,23 @@
 
 use std::collections::HashMap;
 use std::convert::Infallible;
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, header};
 use axum::middleware::Next;
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use metrics::counter;
-use sha2::{Digest as _, Sha256};
 use tokio::sync::watch;
 use tracing::warn;
 
-use super::access::required_scope;
+use super::access::{required_scope, route};
 use super::problem::ApiError;
 use super::rate::RateLimit;
+use crate::server::token::{RandomError, TokenHash};
 use foreframe_core::metric_names;
 use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreError};
 
@@ -28,14 +28,6 @@ const PREFIX: &str = "ffk";
 const SUBPROTOCOL_PREFIX: &str = "foreframe.key.";
 const ID_BYTES: usize = 6;
 const SECRET_BYTES: usize = 32;
-
-/// Why no key could be made.
-#[derive(Debug, thiserror::Error)]
-pub enum KeyError {
-    /// The system gave no random bytes.
-    #[error("the system gave no random bytes: {0}")]
-    Random(getrandom::Error),
-}
 
 /// A new key: its text for the caller, its hash for the store.
 pub struct NewKey {
@@ -48,42 +40,22 @@ pub struct NewKey {
 }
 
 impl NewKey {
-    /// A random key. Errors: `Random`.
-    pub fn generate() -> Result<Self, KeyError> {
-        let mut random = [0; ID_BYTES + SECRET_BYTES];
-        getrandom::fill(&mut random).map_err(KeyError::Random)?;
-        let (id, secret) = random.split_at(ID_BYTES);
+    /// A random key. Errors: the system gave no random bytes.
+    pub fn generate() -> Result<Self, RandomError> {
+        let (mut id, mut secret) = ([0; ID_BYTES], [0; SECRET_BYTES]);
+        getrandom::fill(&mut id)?;
+        getrandom::fill(&mut secret)?;
         let id = hex::encode(id);
         let text = format!("{PREFIX}_{id}_{}", URL_SAFE_NO_PAD.encode(secret));
-        Ok(Self {
-            hash: hex::encode(KeyHash::of(&text).0),
-            text,
-            id,
-        })
-    }
-}
-
-/// SHA-256 of a key's whole text.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-struct KeyHash([u8; 32]);
-
-impl KeyHash {
-    fn of(text: &str) -> Self {
-        Self(Sha256::digest(text).into())
-    }
-
-    /// `None` for a hash that an older version stored in another form.
-    fn from_row(row: &KeyRow) -> Option<Self> {
-        let mut hash = [0; 32];
-        hex::decode_to_slice(&row.hash, &mut hash).ok()?;
-        Some(Self(hash))
+        let hash = TokenHash::of(&text).to_hex();
+        Ok(Self { id, text, hash })
     }
 }
 
 /// Who sent a request: the key that it presented, or nobody if authentication was off.
 #[derive(Clone, Copy, Debug, Default)]
 pub(in crate::server) struct Caller {
-    key: Option<KeyHash>,
+    key: Option<TokenHash>,
     is_admin: bool,
 }
 
@@ -102,50 +74,21 @@ impl Caller {
 /// Who may call; clones share it.
 #[derive(Clone)]
 pub struct Keys {
-    shared: Arc<KeyCache>,
-}
-
-struct KeyCache {
     store: Option<Store>,
     is_required: bool,
-    known: RwLock<KnownKeys>,
-    /// Notified when the keys were read.
-    refreshed: watch::Sender<()>,
+    known: watch::Sender<KnownKeys>,
 }
 
-#[derive(Default)]
 struct KnownKeys {
     /// The keys that were not revoked or expired when they were read.
-    valid: HashMap<KeyHash, Arc<KnownKey>>,
+    valid: HashMap<TokenHash, Arc<KnownKey>>,
     /// Whether the store has any key, revoked or not.
     exist: bool,
     /// Keys that an older version stored in a form that is no longer accepted.
     outdated: usize,
-    clock: StoreClock,
-}
-
-/// The store's clock since it was read: this machine's clock can be wrong, and can jump.
-#[derive(Clone, Copy)]
-struct StoreClock {
+    /// The store's clock when they were read, and when that was: this machine's clock can be wrong, and can jump.
     read_s: f64,
     read_at: Instant,
-}
-
-impl StoreClock {
-    fn at(read_s: f64) -> Self {
-        let read_at = Instant::now();
-        Self { read_s, read_at }
-    }
-
-    fn now_s(self) -> f64 {
-        self.read_s + self.read_at.elapsed().as_secs_f64()
-    }
-}
-
-impl Default for StoreClock {
-    fn default() -> Self {
-        Self::at(0.0)
-    }
 }
 
 /// A key and what was used of its rate.
@@ -155,11 +98,6 @@ struct KnownKey {
 }
 
 impl KnownKey {
-    fn new(row: KeyRow) -> Self {
-        let rate = row.requests_per_s.map(|per_s| RateLimit::new(per_s, Instant::now()));
-        Self { row, rate }
-    }
-
     /// Errors: `Unauthorized` if it has expired, `Forbidden` if its scope is too small, `TooMany`.
     fn check(&self, needed: KeyScope, now_s: f64) -> Result<(), ApiError> {
         if !self.row.is_valid(now_s) {
@@ -199,54 +137,61 @@ impl Keys {
     }
 
     fn with(store: Option<Store>, is_required: bool) -> Self {
+        let known = KnownKeys {
+            valid: HashMap::new(),
+            exist: false,
+            outdated: 0,
+            read_s: 0.0,
+            read_at: Instant::now(),
+        };
         Self {
-            shared: Arc::new(KeyCache {
-                store,
-                is_required,
-                known: RwLock::default(),
-                refreshed: watch::Sender::new(()),
-            }),
+            store,
+            is_required,
+            known: watch::Sender::new(known),
         }
     }
 
     /// How many are valid.
     #[must_use]
     pub fn count(&self) -> usize {
-        self.known().valid.len()
+        self.known.borrow().valid.len()
     }
 
     /// Reads the keys again: adds new ones and drops revoked ones. Errors: `Query`; then the keys stay as they were.
     pub async fn refresh(&self) -> Result<(), StoreError> {
-        let Some(store) = &self.shared.store else { return Ok(()) };
-        let rows = store.list_keys().await?;
+        let Some(store) = &self.store else { return Ok(()) };
+        let mut rows = store.list_keys().await?;
         let exist = !rows.is_empty() || store.keys_were_created();
-        let clock = StoreClock::at(store.now_s().await?);
-        let now_s = clock.now_s();
-        let usable: Vec<KeyRow> = rows.into_iter().filter(|row| row.is_valid(now_s)).collect();
-        let mut known = self.shared.known.write().unwrap_or_else(PoisonError::into_inner);
-        let (count, mut valid) = (usable.len(), HashMap::new());
-        for row in usable {
-            let Some(hash) = KeyHash::from_row(&row) else { continue };
-            // A key that has not changed keeps what was used of its rate.
-            let before = known.valid.get(&hash).filter(|before| before.row == row).cloned();
-            valid.insert(hash, before.unwrap_or_else(|| Arc::new(KnownKey::new(row))));
-        }
-        let outdated = count - valid.len();
-        if outdated > known.outdated {
-            warn!(
-                keys = outdated,
-                "some API keys were made by an older version and are no longer accepted; create new ones with foreframe \
-                 keys create, and revoke the old ones"
-            );
-        }
-        *known = KnownKeys {
-            valid,
-            exist,
-            outdated,
-            clock,
-        };
-        drop(known);
-        self.shared.refreshed.send_replace(());
+        let (read_s, read_at) = (store.now_s().await?, Instant::now());
+        rows.retain(|row| row.is_valid(read_s));
+        self.known.send_modify(|known| {
+            let (count, mut valid) = (rows.len(), HashMap::new());
+            for row in rows {
+                let Some(hash) = TokenHash::from_hex(&row.hash) else { continue };
+                // A key that has not changed keeps what was used of its rate.
+                let before = known.valid.get(&hash).filter(|before| before.row == row).cloned();
+                let fresh = || {
+                    let rate = row.requests_per_s.map(|per_s| RateLimit::new(per_s, read_at));
+                    Arc::new(KnownKey { row, rate })
+                };
+                valid.insert(hash, before.unwrap_or_else(fresh));
+            }
+            let outdated = count - valid.len();
+            if outdated > known.outdated {
+                warn!(
+                    keys = outdated,
+                    "some API keys were made by an older version and are no longer accepted; create new ones with foreframe \
+                     keys create, and revoke the old ones"
+                );
+            }
+            *known = KnownKeys {
+                valid,
+                exist,
+                outdated,
+                read_s,
+                read_at,
+            };
+        });
         Ok(())
     }
 
@@ -255,9 +200,12 @@ impl Keys {
         let Some(key) = caller.key else {
             return std::future::pending().await;
         };
-        let mut refreshed = self.shared.refreshed.subscribe();
         // The sender lives as long as these keys.
-        while self.known().valid.contains_key(&key) && refreshed.changed().await.is_ok() {}
+        let _ = self
+            .known
+            .subscribe()
+            .wait_for(|known| !known.valid.contains_key(&key))
+            .await;
     }
 
     /// Reads the keys again and again, so that no request has to wait for the store.
@@ -273,7 +221,7 @@ impl Keys {
     /// Whether a request needs a key.
     #[must_use]
     pub fn are_required(&self) -> bool {
-        self.shared.is_required || self.known().exist
+        self.is_required || self.known.borrow().exist
     }
 
     /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown
@@ -286,43 +234,32 @@ impl Keys {
             "this server requires an API key: send the header Authorization: Bearer KEY; create a key with foreframe keys \
              create NAME",
         ))?;
-        let hash = KeyHash::of(key);
-        let (known, clock) = {
-            let keys = self.known();
-            (keys.valid.get(&hash).cloned(), keys.clock)
-        };
-        let known = known.ok_or(ApiError::Unauthorized(
+        let (keys, hash) = (self.known.borrow(), TokenHash::of(key));
+        let known = keys.valid.get(&hash).ok_or(ApiError::Unauthorized(
             "the API key is not valid: it is unknown, was revoked or has expired",
         ))?;
-        known.check(needed, clock.now_s())?;
+        known.check(needed, keys.read_s + keys.read_at.elapsed().as_secs_f64())?;
         let caller = Caller {
             key: Some(hash),
             is_admin: known.row.scope == KeyScope::Admin,
         };
         Ok((caller, Author::of_key(&known.row.id)))
     }
-
-    fn known(&self) -> RwLockReadGuard<'_, KnownKeys> {
-        self.shared.known.read().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 /// Refuses a request without a key that allows it, if authentication is on. Others get their [`Caller`] and [`Author`] as
 /// extensions.
-pub(in crate::server) async fn check(State(keys): State<Keys>, mut request: Request, next: Next) -> Response {
-    let route = request.extensions().get::<MatchedPath>().cloned();
-    let route = route.as_ref().map_or("", MatchedPath::as_str);
-    let needed = required_scope(request.method(), route);
-    let (caller, author) = match keys.check(presented(request.headers()), needed) {
-        Ok(caller) => caller,
-        Err(refused) => {
-            counter!(metric_names::AUTH_REFUSED).increment(1);
-            return refused.into_response();
-        }
-    };
+pub(in crate::server) async fn check(
+    State(keys): State<Keys>,
+    mut request: Request,
+    next: Next,
+) -> Result<Response, ApiError> {
+    let needed = required_scope(request.method(), route(&request));
+    let checked = keys.check(presented(request.headers()), needed);
+    let (caller, author) = checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))?;
     request.extensions_mut().insert(caller);
     request.extensions_mut().insert(author);
-    next.run(request).await
+    Ok(next.run(request).await)
 }
 
 /// The key that a request presents.
@@ -344,30 +281,17 @@ mod tests {
 
     use super::*;
 
-    fn row(hash: &str) -> KeyRow {
-        KeyRow {
-            id: String::new(),
-            name: String::new(),
-            hash: hash.to_owned(),
-            created_s: 0.0,
-            revoked_s: None,
-            scope: KeyScope::Admin,
-            expires_s: None,
-            requests_per_s: None,
-        }
-    }
-
     #[test]
     fn a_new_key_matches_its_hash_and_no_other() {
         let (one, other) = (NewKey::generate().unwrap(), NewKey::generate().unwrap());
         assert!(one.text.starts_with(&format!("ffk_{}_", one.id)));
-        assert!(KeyHash::from_row(&row(&one.hash)) == Some(KeyHash::of(&one.text)));
-        assert!(KeyHash::from_row(&row(&other.hash)) != Some(KeyHash::of(&one.text)));
+        assert!(TokenHash::from_hex(&one.hash) == Some(TokenHash::of(&one.text)));
+        assert!(TokenHash::from_hex(&other.hash) != Some(TokenHash::of(&one.text)));
     }
 
     #[test]
     fn a_hash_of_an_older_version_is_not_accepted() {
-        assert!(KeyHash::from_row(&row("$argon2id$v=19$m=19456,t=2,p=1$c2FsdA$aGFzaA")).is_none());
+        assert!(TokenHash::from_hex("$argon2id$v=19$m=19456,t=2,p=1$c2FsdA$aGFzaA").is_none());
     }
 
     #[test]

@@ -1,15 +1,15 @@
 //! A listener with a bounded number of connections. A connection over the bound takes the place of one that is idle. If there
 //! is none, it gets a 503 response and is closed.
 
-use std::future::poll_fn;
 use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
+use axum::http::StatusCode;
 use metrics::{counter, gauge};
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt as _, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
@@ -17,7 +17,7 @@ use tokio::time::Sleep;
 use tracing::warn;
 
 use super::connection_table::{ConnectionLimits, ConnectionPlace, ConnectionTable};
-use super::problem::CONNECTIONS_FULL_RESPONSE;
+use super::problem::last_response;
 use crate::server::config::ServerConfig;
 use foreframe_core::metric_names;
 
@@ -36,26 +36,8 @@ pub(in crate::server) struct BoundedListener {
 }
 
 impl BoundedListener {
-    pub(in crate::server) fn new(inner: TcpListener, config: &ServerConfig) -> Self {
-        Self::with(
-            inner,
-            config,
-            config.max_connections,
-            config.max_connections_per_address,
-        )
-    }
-
-    /// The listener of [`super::super::admin`], whose connections have places of their own.
-    pub(in crate::server) fn for_admin(inner: TcpListener, config: &ServerConfig) -> Self {
-        Self::with(
-            inner,
-            config,
-            config.max_admin_connections,
-            config.max_admin_connections,
-        )
-    }
-
-    fn with(inner: TcpListener, config: &ServerConfig, total: usize, per_address: usize) -> Self {
+    /// `total` and `per_address`: how many connections have a place at the same time.
+    pub(in crate::server) fn new(inner: TcpListener, config: &ServerConfig, total: usize, per_address: usize) -> Self {
         let limits = ConnectionLimits {
             total,
             per_address,
@@ -114,63 +96,50 @@ async fn pause_after(error: &io::Error) {
     }
 }
 
-async fn refuse_and_close(stream: TcpStream) -> io::Result<()> {
-    stream.writable().await?;
-    // Shorter than any socket's send buffer, so one write is enough.
-    stream.try_write(CONNECTIONS_FULL_RESPONSE.as_bytes())?;
+async fn refuse_and_close(mut stream: TcpStream) -> io::Result<()> {
+    let (status, detail) = (StatusCode::SERVICE_UNAVAILABLE, "too many connections; try again later");
+    stream.write_all(&last_response(status, "unavailable", detail)).await?;
     close_gently(stream).await
 }
 
 /// Closes the writing side, and discards input until the client closes too. Closing with unread input would reset the
 /// connection before the client has read the response.
 async fn close_gently(mut stream: TcpStream) -> io::Result<()> {
-    poll_fn(|cx| Pin::new(&mut stream).poll_shutdown(cx)).await?;
-    let mut unread = [0; 4096];
-    loop {
-        stream.readable().await?;
-        match stream.try_read(&mut unread) {
-            Ok(0) => return Ok(()),
-            Err(error) if error.kind() != io::ErrorKind::WouldBlock => return Err(error),
-            _ => {}
-        }
-    }
+    stream.shutdown().await?;
+    tokio::io::copy(&mut stream, &mut tokio::io::sink()).await.map(drop)
 }
 
 /// A connection that holds its place until it has ended, and fails if its client reads nothing for too long. After it is
 /// dropped, the client still has time to read the last response.
 pub(in crate::server) struct BoundedConnection {
     /// `None` after the drop.
-    open: Option<(TcpStream, Arc<ConnectionPlace>)>,
+    stream: Option<TcpStream>,
+    pub(super) place: Arc<ConnectionPlace>,
     write_stall: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
 impl BoundedConnection {
-    fn new(stream: TcpStream, place: ConnectionPlace, write_stall: Duration) -> Self {
+    fn new(stream: TcpStream, place: Arc<ConnectionPlace>, write_stall: Duration) -> Self {
         gauge!(metric_names::HTTP_CONNECTIONS).increment(1.0);
         Self {
-            open: Some((stream, Arc::new(place))),
+            stream: Some(stream),
+            place,
             write_stall,
             stalled: None,
         }
     }
 
-    /// Its place.
-    pub(super) fn place(&self) -> Option<Arc<ConnectionPlace>> {
-        self.open.as_ref().map(|(_, place)| Arc::clone(place))
-    }
-
     /// The first byte that has arrived and is still to be read; `None` at the end.
     #[cfg(feature = "tls")]
     pub(super) async fn peek(&self) -> io::Result<Option<u8>> {
-        let (stream, _) = self.open.as_ref().ok_or(io::ErrorKind::NotConnected)?;
+        let stream = self.stream.as_ref().ok_or(io::ErrorKind::NotConnected)?;
         let mut byte = [0];
         Ok((stream.peek(&mut byte).await? > 0).then_some(byte[0]))
     }
 
     fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
-        let (stream, _) = self.open.as_mut().ok_or(io::ErrorKind::NotConnected)?;
-        Ok(Pin::new(stream))
+        Ok(Pin::new(self.stream.as_mut().ok_or(io::ErrorKind::NotConnected)?))
     }
 
     /// Passes on the result of a write. A write that makes no progress fails after the limit.
@@ -181,19 +150,19 @@ impl BoundedConnection {
         }
         let limit = self.write_stall;
         let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(limit)));
-        sleep
-            .as_mut()
-            .poll(cx)
-            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "the client does not read")))
+        let late = || io::Error::new(io::ErrorKind::TimedOut, "the client does not read");
+        sleep.as_mut().poll(cx).map(|()| Err(late()))
     }
 }
 
 impl Drop for BoundedConnection {
     fn drop(&mut self) {
         gauge!(metric_names::HTTP_CONNECTIONS).decrement(1.0);
-        let open = self.open.take().filter(|(_, place)| !place.is_evicted());
+        let place = Arc::clone(&self.place);
         // Without a runtime, the connection is closed at once.
-        if let (Some((stream, place)), Ok(runtime)) = (open, Handle::try_current()) {
+        if !place.is_evicted()
+            && let (Some(stream), Ok(runtime)) = (self.stream.take(), Handle::try_current())
+        {
             runtime.spawn(async move {
                 let _ = tokio::time::timeout(LINGER, close_gently(stream)).await;
                 drop(place);

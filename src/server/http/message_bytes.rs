@@ -1,7 +1,7 @@
 //! How much memory the messages of one WebSocket take: part of the budget for all bodies in flight.
 
 use std::io;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use super::body_budget::{BodyBudget, BodyShare};
 
@@ -14,12 +14,13 @@ pub(in crate::server) const UNCOUNTED_BYTES: usize = 16 << 10;
 /// library keeps a buffer of that size. Clones share the count.
 #[derive(Clone, Default)]
 pub(in crate::server) struct MessageBytes {
-    share: Arc<OnceLock<BodyShare>>,
     counts: Arc<Mutex<Counts>>,
 }
 
 #[derive(Default)]
 struct Counts {
+    /// `None` before the stream begins.
+    share: Option<BodyShare>,
     unfinished: usize,
     largest: usize,
 }
@@ -27,19 +28,18 @@ struct Counts {
 impl MessageBytes {
     /// Counts from here on.
     pub(in crate::server) fn begin(&self, budget: &BodyBudget) {
-        self.share.get_or_init(|| budget.share());
+        self.counts().share.get_or_insert_with(|| budget.share());
     }
 
     /// Adds bytes that have arrived. Errors: they exceed the budget.
     pub(super) fn add(&self, bytes: usize) -> io::Result<()> {
-        let Some(share) = self.share.get() else { return Ok(()) };
-        let mut counts = self.counts();
+        let counts = &mut *self.counts();
+        let Some(share) = &counts.share else { return Ok(()) };
         counts.unfinished += bytes;
         let counted = |bytes: usize| bytes.saturating_sub(UNCOUNTED_BYTES);
         let largest = counts.largest.max(counts.unfinished);
-        share
-            .take(counted(largest) - counted(counts.largest))
-            .map_err(io::Error::other)?;
+        let more = counted(largest) - counted(counts.largest);
+        share.take(more).map_err(io::Error::other)?;
         counts.largest = largest;
         Ok(())
     }

@@ -1,16 +1,17 @@
 //! What every request gets: an id, a span in the log, a deadline, and metrics.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
+use super::access::route;
 use super::problem::{self, ApiError};
 use crate::server::config::ServerConfig;
 use foreframe_core::metric_names;
@@ -19,10 +20,17 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// The maximum length of a client's own id; a longer one is replaced.
 const MAX_ID_LEN: usize = 64;
 
+/// When the first request came, in seconds since 1970, and how many ids were given: routers of the same process give different ids.
+static FIRST_S: LazyLock<u64> = LazyLock::new(|| {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    // A clock before 1970 gives 0: ids then are still unique within this process.
+    since_1970.map_or(0, |time| time.as_secs())
+});
+static NEXT_ID: AtomicU64 = AtomicU64::new(1);
+
 /// What [`trace`] needs; clones share it.
 #[derive(Clone)]
 pub(in crate::server) struct RequestTrace {
-    ids: Arc<RequestIds>,
     limit: Duration,
     draining: Arc<AtomicBool>,
 }
@@ -30,61 +38,43 @@ pub(in crate::server) struct RequestTrace {
 impl RequestTrace {
     /// `draining` is true while the server stops.
     pub(in crate::server) fn new(config: &ServerConfig, draining: Arc<AtomicBool>) -> Self {
-        Self {
-            ids: Arc::new(RequestIds::new()),
-            limit: Duration::from_millis(config.request_deadline_ms),
-            draining,
-        }
+        let limit = Duration::from_millis(config.request_deadline_ms);
+        Self { limit, draining }
     }
 }
 
-/// Makes ids for requests that have none: the start time of the server, and a count.
-struct RequestIds {
-    started: u64,
-}
-
-/// The count is one per process: routers of the same process give different ids.
-static NEXT_ID: AtomicU64 = AtomicU64::new(1);
-
-impl RequestIds {
-    fn new() -> Self {
-        let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-        Self {
-            // A clock before 1970 gives the time 0: ids then are still unique within this process.
-            started: since_1970.map_or(0, |time| time.as_secs()),
-        }
-    }
-
-    /// The client's own id if it is short and of plain characters, else a new one. (`tower-http`'s request ids would keep
-    /// any id of a client.)
-    fn of(&self, headers: &HeaderMap) -> String {
-        let allowed = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.' | b':');
-        let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok());
-        match given.filter(|id| (1..=MAX_ID_LEN).contains(&id.len()) && id.bytes().all(allowed)) {
-            Some(id) => id.to_owned(),
-            None => format!("{:x}-{}", self.started, NEXT_ID.fetch_add(1, Ordering::Relaxed)),
-        }
+/// The client's own id if it is short and of plain characters, else a new one. (`tower-http`'s request ids would keep any id
+/// of a client.)
+fn request_id(headers: &HeaderMap) -> String {
+    let allowed = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.' | b':');
+    let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok());
+    match given.filter(|id| (1..=MAX_ID_LEN).contains(&id.len()) && id.bytes().all(allowed)) {
+        Some(id) => id.to_owned(),
+        None => format!("{:x}-{}", *FIRST_S, NEXT_ID.fetch_add(1, Ordering::Relaxed)),
     }
 }
 
 /// Runs the request in a span with its id, within the deadline; writes the body of an error; counts the response.
-pub(in crate::server) async fn trace(trace: RequestTrace, request: Request, next: Next) -> Response {
-    let id = trace.ids.of(request.headers());
+pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request: Request, next: Next) -> Response {
+    let id = request_id(request.headers());
     let span = info_span!("request", id = %id, method = %request.method(), path = request.uri().path());
-    let (method, route, limit) = (method(request.method()), route(&request), trace.limit);
+    // Labels with few values, whatever clients send.
+    let (method, route) = (method(request.method()), route(&request));
+    let route = if route.is_empty() { "none" } else { route }.to_owned();
+    let limit = trace.limit;
     let work = async move {
         let started = Instant::now();
-        let response = match refuse_encoded(request.headers()) {
-            Ok(()) => tokio::time::timeout(limit, next.run(request)).await,
-            Err(refused) => Ok(refused.into_response()),
+        let answered = async {
+            refuse_encoded(request.headers())?;
+            let late = |_| {
+                let limit_ms = limit.as_millis();
+                ApiError::Timeout(format!(
+                    "the request took longer than {limit_ms} ms to arrive and be answered"
+                ))
+            };
+            tokio::time::timeout(limit, next.run(request)).await.map_err(late)
         };
-        let response = response.unwrap_or_else(|_| {
-            let limit_ms = limit.as_millis();
-            ApiError::Timeout(format!(
-                "the request took longer than {limit_ms} ms to arrive and be answered"
-            ))
-            .into_response()
-        });
+        let response = answered.await.into_response();
         let (elapsed, status) = (started.elapsed(), response.status());
         debug!(
             status = status.as_u16(),
@@ -119,22 +109,10 @@ fn refuse_encoded(headers: &HeaderMap) -> Result<(), ApiError> {
     }
 }
 
-/// A label with few values, whatever clients send.
+/// The method, or `other` for one that no route has.
 fn method(method: &Method) -> &'static str {
-    match *method {
-        Method::GET => "GET",
-        Method::HEAD => "HEAD",
-        Method::POST => "POST",
-        Method::DELETE => "DELETE",
-        Method::OPTIONS => "OPTIONS",
-        _ => "other",
-    }
-}
-
-/// The route's template: a label with few values.
-fn route(request: &Request) -> String {
-    let matched = request.extensions().get::<MatchedPath>();
-    matched.map_or_else(|| "none".to_owned(), |path| path.as_str().to_owned())
+    let known = ["GET", "HEAD", "POST", "DELETE", "OPTIONS"];
+    known.into_iter().find(|known| *known == method).unwrap_or("other")
 }
 
 #[cfg(test)]

@@ -4,12 +4,11 @@ use std::sync::Arc;
 
 use axum::extract::multipart::MultipartError;
 use axum::extract::{FromRef, FromRequest, Multipart, Request};
-use axum::http::{StatusCode, header};
+use axum::http::header;
 use serde::de::DeserializeOwned;
 
 use super::admission::Admission;
-use super::body_budget;
-use super::extract::Json;
+use super::extract::{Json, too_long};
 use super::problem::ApiError;
 use crate::server::config::ServerConfig;
 
@@ -57,11 +56,8 @@ where
 
     async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
         let request = Admission::from_ref(state).check(request).await?;
-        let media_type = request
-            .headers()
-            .get(header::CONTENT_TYPE)
-            .map_or(&[][..], |value| value.as_bytes());
-        if !media_type.starts_with(b"multipart/form-data") {
+        let media_type = request.headers().get(header::CONTENT_TYPE);
+        if !media_type.is_some_and(|media_type| media_type.as_bytes().starts_with(b"multipart/form-data")) {
             let Json(body) = Json::from_request(request, state).await?;
             return Ok(Self(body));
         }
@@ -95,12 +91,7 @@ where
 
 impl From<MultipartError> for ApiError {
     fn from(error: MultipartError) -> Self {
-        if error.status() == StatusCode::PAYLOAD_TOO_LARGE {
-            Self::TooLarge("the body is longer than this server takes".to_owned())
-        } else if let Some(refused) = body_budget::exceeded(&error) {
-            refused
-        } else {
-            Self::Malformed(format!("the body is not a multipart form: {}", error.body_text()))
-        }
+        let malformed = || Self::Malformed(format!("the body is not a multipart form: {}", error.body_text()));
+        too_long(error.status(), &error).unwrap_or_else(malformed)
     }
 }

@@ -39,37 +39,37 @@ impl OriginPolicy {
 
 /// Refuses requests to a foreign host and requests of a foreign page, unless they are configured. Answers preflight
 /// requests.
-pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request: Request, next: Next) -> Response {
-    let host = match requested_host(&request) {
-        Ok(host) => host,
-        Err(wrong) => return wrong.into_response(),
-    };
+pub(in crate::server) async fn check(
+    State(policy): State<OriginPolicy>,
+    request: Request,
+    next: Next,
+) -> Result<Response, ApiError> {
+    let host = requested_host(&request)?;
     let allowed = &policy.allowed;
     if !policy.keys.are_required()
         && let Some(host) = host.as_ref().filter(|host| is_foreign(host, allowed))
     {
-        return ApiError::Forbidden(format!(
+        return Err(ApiError::Forbidden(format!(
             "authentication is off, so this server answers only to localhost, IP addresses and names without a dot, not to \
              {host}; create an API key (foreframe keys create NAME), or add http://{host} to the setting cors_origins"
-        ))
-        .into_response();
+        )));
     }
     let mut origins = request.headers().get_all(header::ORIGIN).iter().cloned();
     let Some(origin) = origins.next() else {
-        return next.run(request).await;
+        return Ok(next.run(request).await);
     };
     if origins.next().is_some() {
-        return ApiError::Malformed("there is more than one Origin header".to_owned()).into_response();
+        let detail = "there is more than one Origin header".to_owned();
+        return Err(ApiError::Malformed(detail));
     }
     if host.is_some_and(|host| is_own(&origin, &host)) {
-        return next.run(request).await;
+        return Ok(next.run(request).await);
     }
     if !allowed.iter().any(|allowed| allowed.as_bytes() == origin.as_bytes()) {
-        return ApiError::Forbidden(format!(
+        return Err(ApiError::Forbidden(format!(
             "pages of the origin {} may not call this server; allow it with the setting cors_origins",
             String::from_utf8_lossy(origin.as_bytes())
-        ))
-        .into_response();
+        )));
     }
     let is_preflight = request.method() == Method::OPTIONS;
     let mut response = if is_preflight {
@@ -84,7 +84,7 @@ pub(in crate::server) async fn check(State(policy): State<OriginPolicy>, request
         headers.insert(header::ACCESS_CONTROL_ALLOW_METHODS, METHODS);
         headers.insert(header::ACCESS_CONTROL_ALLOW_HEADERS, HEADERS);
     }
-    response
+    Ok(response)
 }
 
 /// The host that is asked; `None` in HTTP/1.0, which need not name one. Errors: `Malformed` unless the request has one valid Host

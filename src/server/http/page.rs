@@ -19,22 +19,17 @@ pub(in crate::server) struct Page {
     /// The maximum number of entries, 1 to 1000. Default: 100.
     #[serde(default)]
     #[param(minimum = 1, maximum = 1000)]
-    limit: Option<usize>,
+    pub(in crate::server) limit: Option<usize>,
 }
 
 impl Page {
-    /// The maximum number of entries. Errors: `Unprocessable` if it is out of range.
-    pub(in crate::server) fn limit(&self) -> Result<usize, ApiError> {
-        checked_limit(self.limit)
-    }
-
-    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`Page::limit`].
+    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`checked_limit`].
     pub(in crate::server) fn of<T>(
         &self,
         all: impl IntoIterator<Item = T>,
         key: impl Fn(&T) -> &str,
     ) -> Result<(Vec<T>, Option<String>), ApiError> {
-        let limit = self.limit()?;
+        let limit = checked_limit(self.limit)?;
         let mut rest = all.into_iter().filter(|entry| key(entry) > self.after.as_str());
         let page: Vec<T> = rest.by_ref().take(limit).collect();
         let next = rest.next().and_then(|_| page.last().map(|last| key(last).to_owned()));

@@ -8,12 +8,15 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tracing::{error, warn};
 
+use crate::server::token::RandomError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text::{with_causes, without_middle};
 use foreframe_core::files::is_transient;
 
 /// When the client may try again if nothing better is known, in seconds.
 const RETRY_AFTER_S: u64 = 1;
+
+const MEDIA_TYPE: &str = "application/problem+json";
 
 const FILES_AWAY: &str =
     "the server cannot read or write its files now, for example because its disk is full; try again later";
@@ -32,6 +35,23 @@ pub struct Problem {
     pub detail: String,
     /// The request's id, as in the header `x-request-id`.
     pub instance: String,
+}
+
+impl Problem {
+    fn new(status: StatusCode, slug: &str, detail: &str) -> Self {
+        Self {
+            kind: format!("urn:foreframe:problem:{slug}"),
+            title: status.canonical_reason().unwrap_or_default(),
+            status: status.as_u16(),
+            detail: without_middle(&detail),
+            instance: String::new(),
+        }
+    }
+
+    #[expect(clippy::expect_used, reason = "a struct of texts and a number is always valid JSON")]
+    fn json(&self) -> Vec<u8> {
+        serde_json::to_vec(self).expect("a problem that is not JSON is a bug")
+    }
 }
 
 /// Why a request failed.
@@ -89,154 +109,110 @@ impl ApiError {
         }
     }
 
-    fn status(&self) -> (StatusCode, &'static str) {
+    /// The status, the end of the problem's URN, and what was wrong.
+    fn into_parts(self) -> (StatusCode, &'static str, String) {
         match self {
-            Self::Malformed(_) => (StatusCode::BAD_REQUEST, "malformed"),
-            Self::Unauthorized(_) => (StatusCode::UNAUTHORIZED, "unauthorized"),
-            Self::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
-            Self::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
-            Self::MethodNotAllowed => (StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed"),
-            Self::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable"),
-            Self::Timeout(_) => (StatusCode::REQUEST_TIMEOUT, "timeout"),
-            Self::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
-            Self::Gone(_) => (StatusCode::GONE, "gone"),
-            Self::TooLarge(_) => (StatusCode::PAYLOAD_TOO_LARGE, "too-large"),
-            Self::UnsupportedMedia(_) => (StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported-media-type"),
-            Self::Unprocessable(_) => (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable"),
-            Self::UpgradeRequired => (StatusCode::UPGRADE_REQUIRED, "upgrade-required"),
-            Self::Internal(_) => (StatusCode::INTERNAL_SERVER_ERROR, "internal"),
-            Self::Unavailable { .. } => (StatusCode::SERVICE_UNAVAILABLE, "unavailable"),
-            Self::TooMany { .. } => (StatusCode::TOO_MANY_REQUESTS, "too-many"),
+            Self::Malformed(detail) => (StatusCode::BAD_REQUEST, "malformed", detail),
+            Self::Unauthorized(detail) => (StatusCode::UNAUTHORIZED, "unauthorized", detail.to_owned()),
+            Self::Forbidden(detail) => (StatusCode::FORBIDDEN, "forbidden", detail),
+            Self::NotFound(detail) => (StatusCode::NOT_FOUND, "not-found", detail),
+            Self::MethodNotAllowed => {
+                let detail = "this path does not support that method; see /openapi.json".to_owned();
+                (StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed", detail)
+            }
+            Self::NotAcceptable(detail) => (StatusCode::NOT_ACCEPTABLE, "not-acceptable", detail),
+            Self::Timeout(detail) => (StatusCode::REQUEST_TIMEOUT, "timeout", detail),
+            Self::Conflict(detail) => (StatusCode::CONFLICT, "conflict", detail),
+            Self::Gone(detail) => (StatusCode::GONE, "gone", detail),
+            Self::TooLarge(detail) => (StatusCode::PAYLOAD_TOO_LARGE, "too-large", detail),
+            Self::UnsupportedMedia(detail) => (StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported-media-type", detail),
+            Self::Unprocessable(detail) => (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable", detail),
+            Self::UpgradeRequired => {
+                let detail = "this path is a WebSocket; connect with a WebSocket handshake".to_owned();
+                (StatusCode::UPGRADE_REQUIRED, "upgrade-required", detail)
+            }
+            Self::Internal(cause) => {
+                error!(cause, "request failed");
+                let detail = "the server failed; the reason is in its log, under the id of this request".to_owned();
+                (StatusCode::INTERNAL_SERVER_ERROR, "internal", detail)
+            }
+            Self::Unavailable { detail, .. } => (StatusCode::SERVICE_UNAVAILABLE, "unavailable", detail),
+            Self::TooMany { detail, .. } => (StatusCode::TOO_MANY_REQUESTS, "too-many", detail),
         }
     }
+}
 
-    fn detail(self) -> String {
-        match self {
-            Self::Malformed(detail)
-            | Self::Forbidden(detail)
-            | Self::NotFound(detail)
-            | Self::NotAcceptable(detail)
-            | Self::Timeout(detail)
-            | Self::Conflict(detail)
-            | Self::Gone(detail)
-            | Self::TooLarge(detail)
-            | Self::UnsupportedMedia(detail)
-            | Self::Unprocessable(detail)
-            | Self::Unavailable { detail, .. }
-            | Self::TooMany { detail, .. } => detail,
-            Self::Unauthorized(detail) => detail.to_owned(),
-            Self::MethodNotAllowed => "this path does not support that method; see /openapi.json".to_owned(),
-            Self::UpgradeRequired => "this path is a WebSocket; connect with a WebSocket handshake".to_owned(),
-            // The cause is in the log, under the request's id.
-            Self::Internal(_) => "the server failed; the reason is in its log, under the id of this request".to_owned(),
-        }
+impl From<RandomError> for ApiError {
+    fn from(error: RandomError) -> Self {
+        Self::Internal(error.to_string())
     }
 }
 
 impl IntoResponse for ApiError {
     /// A response without body: [`finish`] writes the body, because it knows the request's id.
     fn into_response(self) -> Response {
-        if let Self::Internal(cause) = &self {
-            error!(cause, "request failed");
-        }
-        let (status, slug) = self.status();
+        let retry_after = match &self {
+            Self::Unavailable { retry_after_s, .. } | Self::TooMany { retry_after_s, .. } => Some(*retry_after_s),
+            _ => None,
+        };
+        let (status, slug, detail) = self.into_parts();
         let mut response = status.into_response();
         let headers = response.headers_mut();
-        match &self {
-            Self::Unavailable { retry_after_s, .. } | Self::TooMany { retry_after_s, .. } => {
-                headers.insert(header::RETRY_AFTER, HeaderValue::from(*retry_after_s));
-            }
-            Self::Unauthorized(_) => {
-                headers.insert(
-                    header::WWW_AUTHENTICATE,
-                    HeaderValue::from_static("Bearer realm=\"foreframe\""),
-                );
-            }
-            _ => {}
+        headers.extend(retry_after.map(|seconds| (header::RETRY_AFTER, seconds.into())));
+        if status == StatusCode::UNAUTHORIZED {
+            let scheme = HeaderValue::from_static("Bearer realm=\"foreframe\"");
+            headers.insert(header::WWW_AUTHENTICATE, scheme);
         }
-        response.extensions_mut().insert(Problem {
-            kind: format!("urn:foreframe:problem:{slug}"),
-            title: status.canonical_reason().unwrap_or(slug),
-            status: status.as_u16(),
-            detail: without_middle(&self.detail()),
-            instance: String::new(),
-        });
+        response.extensions_mut().insert(Problem::new(status, slug, &detail));
         response
     }
 }
 
 /// Writes the body of an error response.
 pub(in crate::server) fn finish(mut response: Response, request_id: &str) -> Response {
-    let Some(problem) = response.extensions_mut().remove::<Problem>() else {
+    let Some(mut problem) = response.extensions_mut().remove::<Problem>() else {
         return response;
     };
-    let problem = Problem {
-        instance: request_id.to_owned(),
-        ..problem
-    };
-    *response.body_mut() = Body::from(json(&problem));
+    request_id.clone_into(&mut problem.instance);
+    *response.body_mut() = Body::from(problem.json());
     let headers = response.headers_mut();
     headers.remove(header::CONTENT_LENGTH);
-    headers.insert(
-        header::CONTENT_TYPE,
-        HeaderValue::from_static("application/problem+json"),
-    );
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE));
     response
 }
 
-#[expect(clippy::expect_used, reason = "a struct of texts and a number is always valid JSON")]
-fn json(problem: &Problem) -> Vec<u8> {
-    serde_json::to_vec(problem).expect("a problem that is not JSON is a bug")
+/// The response to a connection from which no request was read, as bytes on the wire. The connection ends after it.
+pub(in crate::server) fn last_response(status: StatusCode, slug: &str, detail: &str) -> Vec<u8> {
+    let body = Problem::new(status, slug, detail).json();
+    let retry_after = match status {
+        StatusCode::SERVICE_UNAVAILABLE => format!("Retry-After: {RETRY_AFTER_S}\r\n"),
+        _ => String::new(),
+    };
+    let head = format!(
+        "HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: {MEDIA_TYPE}\r\nX-Content-Type-Options: nosniff\r\n\
+         {retry_after}Content-Length: {}\r\n\r\n",
+        body.len()
+    );
+    [head.as_bytes(), &body].concat()
 }
-
-/// The response to a connection over the limit, as bytes on the wire: no request is read from it.
-pub(in crate::server) const CONNECTIONS_FULL_RESPONSE: &str = "HTTP/1.1 503 Service Unavailable\r\n\
-    Retry-After: 1\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\
-    X-Content-Type-Options: nosniff\r\n\r\n\
-    {\"type\":\"urn:foreframe:problem:unavailable\",\"title\":\"Service Unavailable\",\"status\":503,\
-    \"detail\":\"too many connections; try again later\",\"instance\":\"\"}";
-
-/// The response to a request in plain HTTP where TLS is expected.
-#[cfg(feature = "tls")]
-pub(in crate::server) const PLAIN_HTTP_RESPONSE: &str = "HTTP/1.1 400 Bad Request\r\n\
-    Connection: close\r\nContent-Type: application/problem+json\r\nX-Content-Type-Options: nosniff\r\n\r\n\
-    {\"type\":\"urn:foreframe:problem:malformed\",\"title\":\"Bad Request\",\"status\":400,\
-    \"detail\":\"this address takes HTTPS only; use https:// or wss://\",\"instance\":\"\"}";
 
 /// The response to a request that is not HTTP, in place of the one without a body that hyper writes. `head`: what hyper would
 /// write. `None` if it is another response: all of ours have a request id.
 pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
-    let head = head.starts_with(b"HTTP/1.1 4").then_some(head)?;
-    let head = std::str::from_utf8(head).ok()?;
-    let (line, headers) = head.split_once("\r\n")?;
-    let is_alone = headers.ends_with("\r\n\r\n") && headers.matches("\r\n\r\n").count() == 1;
-    if !is_alone || headers.contains("x-request-id:") {
+    let head = str::from_utf8(head.starts_with(b"HTTP/1.1 4").then_some(head)?).ok()?;
+    if head.find("\r\n\r\n") != Some(head.len() - 4) || head.contains("x-request-id:") {
         return None;
     }
-    let (kind, title, status, detail) = match line.split(' ').nth(1)? {
-        "400" => ("malformed", "Bad Request", 400, "the request is not valid HTTP/1.1"),
-        "414" => ("too-large", "URI Too Long", 414, "the path of the request is too long"),
-        "431" => (
-            "too-large",
-            "Request Header Fields Too Large",
-            431,
-            "the head of the request is longer than this server takes",
-        ),
+    let status = StatusCode::from_bytes(head.as_bytes().get(9..12)?).ok()?;
+    let (slug, detail) = match status {
+        StatusCode::BAD_REQUEST => ("malformed", "the request is not valid HTTP/1.1"),
+        StatusCode::URI_TOO_LONG => ("too-large", "the path of the request is too long"),
+        StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE => {
+            ("too-large", "the head of the request is longer than this server takes")
+        }
         _ => return None,
     };
-    let body = json(&Problem {
-        kind: format!("urn:foreframe:problem:{kind}"),
-        title,
-        status,
-        detail: detail.to_owned(),
-        instance: String::new(),
-    });
-    let head = format!(
-        "HTTP/1.1 {status} {title}\r\nConnection: close\r\nContent-Type: application/problem+json\r\n\
-         X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\n\r\n",
-        body.len()
-    );
-    Some([head.as_bytes(), &body].concat())
+    Some(last_response(status, slug, detail))
 }
 
 #[cfg(test)]
@@ -256,7 +232,7 @@ mod tests {
 
     #[test]
     fn the_status_follows_from_the_kind() {
-        let status = |kind| ApiError::of(&ClassifiedError(kind)).status().0.as_u16();
+        let status = |kind| ApiError::of(&ClassifiedError(kind)).into_parts().0.as_u16();
         assert_eq!(status(ErrorKind::NotFound), 404);
         assert_eq!(status(ErrorKind::Conflict), 409);
         assert_eq!([ErrorKind::Usage, ErrorKind::Unusable].map(status), [422; 2]);

@@ -6,33 +6,24 @@ use tracing::warn;
 /// cannot listen for signals, it never completes. To be called within a tokio runtime.
 #[cfg(unix)]
 pub fn requested() -> impl Future<Output = ()> {
+    use futures_util::future::select_all;
     use tokio::signal::unix::{SignalKind, signal};
+    let kinds = [SignalKind::interrupt(), SignalKind::terminate()];
     // Signals are caught from here on, and not only when the future is first polled.
-    let listen = |kind: SignalKind, name: &'static str| match signal(kind) {
-        Ok(signal) => Some(signal),
-        Err(error) => {
-            warn!(%error, signal = name, "could not listen for a signal");
-            None
-        }
-    };
-    let (interrupt, terminate) = (
-        listen(SignalKind::interrupt(), "SIGINT"),
-        listen(SignalKind::terminate(), "SIGTERM"),
-    );
+    let listeners = kinds.map(|kind| {
+        let listener = signal(kind);
+        listener.inspect_err(|error| warn!(%error, signal = ?kind, "could not listen for a signal"))
+    });
     async move {
-        tokio::select! {
-            () = received(interrupt) => {}
-            () = received(terminate) => {}
-        }
-    }
-}
-
-/// Completes when the signal arrives; never without a listener.
-#[cfg(unix)]
-async fn received(signal: Option<tokio::signal::unix::Signal>) {
-    match signal {
-        Some(mut signal) => drop(signal.recv().await),
-        None => std::future::pending().await,
+        let received = listeners.map(|listener| {
+            Box::pin(async {
+                match listener {
+                    Ok(mut listener) => drop(listener.recv().await),
+                    Err(_) => std::future::pending().await,
+                }
+            })
+        });
+        select_all(received).await;
     }
 }
 

@@ -1,5 +1,5 @@
-//! The limit of tasks that outlive their HTTP connection (streams, and requests that change state), the signal that they shall
-//! stop, and a way to wait for their end. An HTTP server's own graceful shutdown does not wait for them.
+//! A limit of tasks (streams, requests), the signal that they shall stop, and a way to wait for their end. An HTTP server's own
+//! graceful shutdown does not wait for tasks that outlive their connection.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use super::problem::ApiError;
 #[derive(Clone)]
 pub(in crate::server) struct TaskLimit {
     places: Arc<Semaphore>,
-    /// What they are, for error messages.
+    /// What they are and do, for error messages.
     kind: &'static str,
     limit: u32,
     stop: watch::Sender<bool>,
@@ -33,7 +33,7 @@ impl TaskLimit {
         let (limit, kind) = (self.limit, self.kind);
         Arc::clone(&self.places)
             .try_acquire_owned()
-            .map_err(|_| ApiError::unavailable(format!("{limit} {kind} are open already; try again later")))
+            .map_err(|_| ApiError::unavailable(format!("{limit} {kind} already; try again later")))
     }
 
     /// How many are open.

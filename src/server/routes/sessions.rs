@@ -16,7 +16,7 @@ use utoipa_axum::routes;
 use self::bodies::{CreateSession, CreatedSession, ExportedState, SessionDescription, SessionList};
 use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::keys::Caller;
-use crate::server::http::page::Page;
+use crate::server::http::page::{Page, checked_limit};
 use crate::server::http::problem::{ApiError, Problem};
 use crate::server::state::App;
 use crate::server::stream::protocol::StreamLimits;
@@ -71,7 +71,9 @@ async fn list(
     Query(page): Query<Page>,
 ) -> Result<axum::Json<SessionList>, ApiError> {
     let now = Instant::now();
-    let found = app.sessions().page(&page.after, page.limit()? + 1, caller, now);
+    let found = app
+        .sessions()
+        .page(&page.after, checked_limit(page.limit)? + 1, caller, now);
     let (found, next) = page.of(found, |session| session.id())?;
     let grace = app.sessions().grace();
     let describe = |session: &Arc<Session>| SessionDescription::of(session, grace, now);

@@ -11,7 +11,7 @@ use super::step::{FrameStep, SessionCore, StepError};
 use crate::server::blocking::BlockingWork;
 use crate::server::http::keys::Caller;
 use crate::server::images::ImageFormat;
-use crate::server::token::{Token, TokenHash};
+use crate::server::token::{RandomError, Token, TokenHash};
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{Predictor, SessionState};
 
@@ -52,7 +52,7 @@ impl Session {
         settings: SessionSettings,
         maker: Caller,
         now: Instant,
-    ) -> Result<(Self, String), getrandom::Error> {
+    ) -> Result<(Self, String), RandomError> {
         let (id, token) = (Token::random()?, Token::random()?);
         let session = Self {
             key: id.key(),

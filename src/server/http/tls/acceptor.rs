@@ -2,36 +2,27 @@
 
 use std::convert::Infallible;
 use std::io;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::Arc;
 use std::time::Duration;
 
+use axum::http::StatusCode;
 use tokio::io::AsyncWriteExt as _;
+use tokio::sync::watch;
 use tokio_rustls::rustls::ServerConfig as RustlsConfig;
 use tokio_rustls::rustls::crypto::{CryptoProvider, ring};
-use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert};
-use tokio_rustls::rustls::sign::CertifiedKey;
+use tokio_rustls::rustls::sign::{CertifiedKey, SingleCertAndKey};
 use tokio_rustls::server::TlsStream;
 use tracing::{info, warn};
 
-use super::certificate::{CertificateText, out_of_date};
-use super::{CertificateFiles, TlsError};
+use super::TlsError;
+use super::certificate::{CertificateFiles, CertificateText, cannot_be_used, out_of_date};
 use crate::server::http::listener::BoundedConnection;
-use crate::server::http::problem::PLAIN_HTTP_RESPONSE;
+use crate::server::http::problem::last_response;
 
 /// How often the files are read.
 const READ_EVERY: Duration = Duration::from_secs(2);
 /// A certificate that expires within this time is warned of.
 const WARN_BEFORE: Duration = Duration::from_hours(7 * 24);
-
-/// The certificate in use.
-#[derive(Debug)]
-struct CurrentCertificate(RwLock<Arc<CertifiedKey>>);
-
-impl ResolvesServerCert for CurrentCertificate {
-    fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        Some(Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner)))
-    }
-}
 
 /// Does the handshakes; clones share the certificate.
 #[derive(Clone)]
@@ -39,34 +30,21 @@ pub(in crate::server::http) struct TlsAcceptor {
     files: CertificateFiles,
     text: CertificateText,
     provider: Arc<CryptoProvider>,
-    current: Arc<CurrentCertificate>,
-    config: Arc<RustlsConfig>,
+    /// With the certificate in use.
+    current: watch::Sender<Arc<RustlsConfig>>,
 }
 
 impl TlsAcceptor {
-    /// Errors: every [`TlsError`] but `Unsupported` and `Incomplete`.
+    /// Errors: a file cannot be read or used.
     pub(super) fn open(files: CertificateFiles) -> Result<Self, TlsError> {
         let provider = Arc::new(ring::default_provider());
         let text = CertificateText::read(&files)?;
-        let key = Arc::new(text.parse(&files, &provider)?);
-        warn_if_out_of_date(&key, &provider);
-        let current = Arc::new(CurrentCertificate(RwLock::new(key)));
-        let config = RustlsConfig::builder_with_provider(Arc::clone(&provider))
-            .with_safe_default_protocol_versions()
-            .map_err(|error| TlsError::Malformed {
-                setting: "tls_certificate",
-                path: files.certificate.clone(),
-                reason: error.to_string(),
-            })?;
-        let resolver = Arc::<CurrentCertificate>::clone(&current);
-        let mut config = config.with_no_client_auth().with_cert_resolver(resolver);
-        config.alpn_protocols = vec![b"http/1.1".to_vec()];
+        let config = config(&text, &files, &provider)?;
         Ok(Self {
             files,
             text,
             provider,
-            current,
-            config: Arc::new(config),
+            current: watch::Sender::new(config),
         })
     }
 
@@ -77,12 +55,13 @@ impl TlsAcceptor {
     ) -> io::Result<TlsStream<BoundedConnection>> {
         // The first byte of TLS is 22, and that of HTTP a letter.
         if connection.peek().await?.is_some_and(|byte| byte.is_ascii_alphabetic()) {
-            connection.write_all(PLAIN_HTTP_RESPONSE.as_bytes()).await?;
+            let detail = "this address takes HTTPS only; use https:// or wss://";
+            let refusal = last_response(StatusCode::BAD_REQUEST, "malformed", detail);
+            connection.write_all(&refusal).await?;
             return Err(io::Error::other("the client speaks plain HTTP"));
         }
-        tokio_rustls::TlsAcceptor::from(Arc::clone(&self.config))
-            .accept(connection)
-            .await
+        let config = Arc::clone(&self.current.borrow());
+        tokio_rustls::TlsAcceptor::from(config).accept(connection).await
     }
 
     /// Reads the files again and again. A changed certificate is used from the next handshake on; if it cannot be used, the one
@@ -98,10 +77,9 @@ impl TlsAcceptor {
                 // A file that is being replaced may be absent for a moment.
                 _ => continue,
             };
-            match text.parse(&self.files, &self.provider) {
-                Ok(key) => {
-                    warn_if_out_of_date(&key, &self.provider);
-                    *self.current.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(key);
+            match config(&text, &self.files, &self.provider) {
+                Ok(config) => {
+                    self.current.send_replace(config);
                     info!("the TLS certificate was renewed");
                 }
                 Err(error) => warn!(%error, "the TLS certificate on disk cannot be used; the one before stays"),
@@ -109,6 +87,23 @@ impl TlsAcceptor {
             seen = text;
         }
     }
+}
+
+/// What a handshake needs, with that certificate. Errors: it cannot be used.
+fn config(
+    text: &CertificateText,
+    files: &CertificateFiles,
+    provider: &Arc<CryptoProvider>,
+) -> Result<Arc<RustlsConfig>, TlsError> {
+    let key = text.parse(files, provider)?;
+    warn_if_out_of_date(&key, provider);
+    let config = RustlsConfig::builder_with_provider(Arc::clone(provider)).with_safe_default_protocol_versions();
+    let config = config.map_err(|error| files.unusable_certificate(cannot_be_used(error)))?;
+    let mut config = config
+        .with_no_client_auth()
+        .with_cert_resolver(Arc::new(SingleCertAndKey::from(key)));
+    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    Ok(Arc::new(config))
 }
 
 fn warn_if_out_of_date(key: &CertifiedKey, provider: &Arc<CryptoProvider>) {

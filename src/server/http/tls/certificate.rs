@@ -1,5 +1,7 @@
 //! A certificate with its key, from files.
 
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,9 +13,16 @@ use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName,
 use tokio_rustls::rustls::sign::CertifiedKey;
 use tokio_rustls::rustls::{CertificateError, Error, InconsistentKeys, RootCertStore};
 
-use super::{CertificateFiles, TlsError};
+use super::TlsError;
 
-/// The content of the two files.
+/// The two files.
+#[derive(Clone)]
+pub(super) struct CertificateFiles {
+    pub(super) certificate: PathBuf,
+    pub(super) key: PathBuf,
+}
+
+/// Their content.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) struct CertificateText {
     certificate: Vec<u8>,
@@ -21,14 +30,11 @@ pub(super) struct CertificateText {
 }
 
 impl CertificateText {
-    /// Errors: `Read`.
+    /// Errors: a file cannot be read.
     pub(super) fn read(files: &CertificateFiles) -> Result<Self, TlsError> {
-        let read = |setting, path: &std::path::PathBuf| {
-            std::fs::read(path).map_err(|source| TlsError::Read {
-                setting,
-                path: path.clone(),
-                source,
-            })
+        let read = |setting, path: &Path| {
+            let unreadable = |error| TlsError(format!("could not read {setting} {}: {error}", path.display()));
+            std::fs::read(path).map_err(unreadable)
         };
         Ok(Self {
             certificate: read("tls_certificate", &files.certificate)?,
@@ -36,44 +42,44 @@ impl CertificateText {
         })
     }
 
-    /// The certificate chain with its key. `files`: for the errors. Errors: `Empty`, `Malformed`, `KeyMismatch`.
+    /// The certificate chain with its key. `files`: for the errors. Errors: one of them cannot be used, or the key belongs to
+    /// another certificate.
     pub(super) fn parse(&self, files: &CertificateFiles, provider: &CryptoProvider) -> Result<CertifiedKey, TlsError> {
-        let of_certificate = |reason: String| TlsError::Malformed {
-            setting: "tls_certificate",
-            path: files.certificate.clone(),
-            reason,
-        };
-        let of_key = |reason: String| TlsError::Malformed {
-            setting: "tls_key",
-            path: files.key.clone(),
-            reason,
-        };
+        let holds_no = |wanted| format!("holds no {wanted}; name a PEM file with a {wanted}");
         let chain = CertificateDer::pem_slice_iter(&self.certificate).collect::<Result<Vec<_>, _>>();
-        let chain = chain.map_err(|error| of_certificate(error.to_string()))?;
+        let chain = chain.map_err(|error| files.unusable_certificate(cannot_be_used(error)))?;
         if chain.is_empty() {
-            return Err(TlsError::Empty {
-                setting: "tls_certificate",
-                path: files.certificate.clone(),
-                wanted: "certificate",
-            });
+            return Err(files.unusable_certificate(holds_no("certificate")));
         }
         let key = PrivateKeyDer::from_pem_slice(&self.key).map_err(|error| match error {
-            pem::Error::NoItemsFound => TlsError::Empty {
-                setting: "tls_key",
-                path: files.key.clone(),
-                wanted: "private key",
-            },
-            error => of_key(error.to_string()),
+            pem::Error::NoItemsFound => files.unusable_key(holds_no("private key")),
+            error => files.unusable_key(cannot_be_used(error)),
         })?;
         CertifiedKey::from_der(chain, key, provider).map_err(|error| match error {
-            Error::InconsistentKeys(InconsistentKeys::KeyMismatch) => TlsError::KeyMismatch {
-                certificate: files.certificate.clone(),
-                key: files.key.clone(),
-            },
-            error @ Error::InvalidCertificate(_) => of_certificate(error.to_string()),
-            error => of_key(error.to_string()),
+            Error::InconsistentKeys(InconsistentKeys::KeyMismatch) => TlsError(format!(
+                "the key in tls_key {} does not fit the certificate in tls_certificate {}; name the key that the certificate \
+                 was made for",
+                files.key.display(),
+                files.certificate.display()
+            )),
+            Error::InvalidCertificate(_) => files.unusable_certificate(cannot_be_used(error)),
+            _ => files.unusable_key(cannot_be_used(error)),
         })
     }
+}
+
+impl CertificateFiles {
+    pub(super) fn unusable_certificate(&self, reason: impl Display) -> TlsError {
+        TlsError(format!("tls_certificate {} {reason}", self.certificate.display()))
+    }
+
+    fn unusable_key(&self, reason: impl Display) -> TlsError {
+        TlsError(format!("tls_key {} {reason}", self.key.display()))
+    }
+}
+
+pub(super) fn cannot_be_used(error: impl Display) -> String {
+    format!("cannot be used: {error}")
 }
 
 /// Why clients will not accept the certificate in this time from now; `None` if it is valid then.
