@@ -8,9 +8,9 @@
 //! one LSTM decoder that predicts the next frames and one that reconstructs the context), and [`flow`], which moves the
 //! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
 //!
-//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `ops`
-//! (operations with their gradients) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and meaning of a model) → `tensor_source`,
-//! `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
+//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `fused`
+//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and
+//! meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
 mod conditioning;
@@ -18,19 +18,20 @@ pub mod costs;
 pub mod dense;
 pub mod error;
 pub mod flow;
+mod fused;
 mod geometry;
 #[cfg(test)]
 pub mod gradient_check;
 mod init;
 pub mod loss;
 mod model_size;
+mod model_tensors;
 pub mod network;
 mod ops;
 mod options;
 pub mod parameters;
 pub mod spec;
 pub mod ssim_loss;
-mod tensor_source;
 pub mod tensors;
 
 pub use conditioning::ConditioningTensors;

@@ -1,12 +1,6 @@
 //! Appearance of the robots: each consists of a few upright cylinders and boxes.
 
-use super::ray_cast::{Block, UprightCylinder};
-
-/// A solid shape.
-pub(super) enum Solid {
-    Cylinder(UprightCylinder),
-    Block(Block),
-}
+use super::ray_cast::{Solid, UprightCylinder};
 
 /// A solid with its gray value, 0…1.
 pub(super) struct ShadedSolid {
@@ -31,7 +25,7 @@ const fn cylinder(radius: f32, bottom: f32, top: f32, albedo: f32) -> ShadedSoli
 
 const fn block(center: [f32; 3], half: [f32; 3], albedo: f32) -> ShadedSolid {
     ShadedSolid {
-        solid: Solid::Block(Block { center, half }),
+        solid: Solid::Block { center, half },
         albedo,
     }
 }

@@ -38,27 +38,19 @@ pub struct Pillar {
 
 /// The pillars. None stands between two start or goal positions.
 pub const PILLARS: [Pillar; 4] = [
-    Pillar {
-        position_m: [4.45, 0.65],
-        radius_m: 0.13,
-        albedo: 0.78,
-    },
-    Pillar {
-        position_m: [4.3, -1.35],
-        radius_m: 0.16,
-        albedo: 0.3,
-    },
-    Pillar {
-        position_m: [0.95, 1.45],
-        radius_m: 0.13,
-        albedo: 0.35,
-    },
-    Pillar {
-        position_m: [1.1, -1.5],
-        radius_m: 0.15,
-        albedo: 0.75,
-    },
+    pillar([4.45, 0.65], 0.13, 0.78),
+    pillar([4.3, -1.35], 0.16, 0.3),
+    pillar([0.95, 1.45], 0.13, 0.35),
+    pillar([1.1, -1.5], 0.15, 0.75),
 ];
+
+const fn pillar(position_m: [f32; 2], radius_m: f32, albedo: f32) -> Pillar {
+    Pillar {
+        position_m,
+        radius_m,
+        albedo,
+    }
+}
 
 /// The position of the pose, without the heading.
 #[must_use]
@@ -84,16 +76,15 @@ pub fn bearing(pose: PlanarPose, to: [f32; 2]) -> f32 {
 pub fn clearance(pose: PlanarPose, radius_m: f32, others: &[[f32; 2]]) -> f32 {
     let (sin, cos) = pose.heading_rad.sin_cos();
     let wall = |at: f32, direction: f32, low: f32, high: f32| {
+        if direction.abs() < 1e-6 {
+            return f32::INFINITY;
+        }
         let edge = if direction > 0.0 {
             high - radius_m
         } else {
             low + radius_m
         };
-        if direction.abs() < 1e-6 {
-            f32::INFINITY
-        } else {
-            ((edge - at) / direction).max(0.0)
-        }
+        ((edge - at) / direction).max(0.0)
     };
     let walls = wall(pose.x_m, cos, 0.0, LENGTH_M).min(wall(pose.y_m, sin, -WIDTH_M / 2.0, WIDTH_M / 2.0));
     let pillars = PILLARS.iter().map(|pillar| (pillar.position_m, pillar.radius_m));

@@ -113,21 +113,15 @@ impl Camera {
             .iter()
             .map(|robot| RobotView::new(robot, self.position))
             .collect();
-        let mut centers = Vec::with_capacity(self.width * self.height);
-        for row in 0..self.height {
-            for column in 0..self.width {
-                centers.push(self.sample(&views, column as f32 + 0.5, row as f32 + 0.5));
-            }
-        }
-        (0..centers.len())
-            .map(|index| {
-                if self.is_edge(&centers, index) {
-                    self.average(&views, index)
-                } else {
-                    centers[index]
-                }
-            })
-            .collect()
+        let places = (0..self.height).flat_map(|row| (0..self.width).map(move |column| (column, row)));
+        let centers: Vec<RaySample> = places
+            .map(|(column, row)| self.sample(&views, column as f32 + 0.5, row as f32 + 0.5))
+            .collect();
+        let refined = centers.iter().enumerate().map(|(index, center)| {
+            let is_edge = self.is_edge(&centers, index);
+            if is_edge { self.average(&views, index) } else { *center }
+        });
+        refined.collect()
     }
 
     fn is_edge(&self, samples: &[RaySample], index: usize) -> bool {
@@ -149,13 +143,9 @@ impl Camera {
         let mut sum = 0.0;
         let mut ids = [0u8; EDGE_RAYS * EDGE_RAYS];
         for (ray, id) in ids.iter_mut().enumerate() {
-            let right = (ray % EDGE_RAYS) as f32 + 0.5;
-            let down = (ray / EDGE_RAYS) as f32 + 0.5;
-            let sample = self.sample(
-                views,
-                column as f32 + right / EDGE_RAYS as f32,
-                row as f32 + down / EDGE_RAYS as f32,
-            );
+            let part = |index: usize| (index as f32 + 0.5) / EDGE_RAYS as f32;
+            let (right, down) = (part(ray % EDGE_RAYS), part(ray / EDGE_RAYS));
+            let sample = self.sample(views, column as f32 + right, row as f32 + down);
             sum += sample.gray;
             *id = sample.robot_id;
         }
@@ -181,7 +171,7 @@ impl Camera {
                 top: arena::HEIGHT_M,
             };
             let ray = Ray::new(self.position - Vector::new(x, y, 0.0), direction);
-            if let Some(found) = shape.cast_local_ray_and_get_normal(&ray, hit.time, true) {
+            if let Some(found) = shape.cast(&ray, hit.time) {
                 hit = NearestHit {
                     time: found.time_of_impact,
                     normal: found.normal,
@@ -202,19 +192,16 @@ impl Camera {
                 .map(|view| view.robot.shade(point.x, point.y))
                 .product::<f32>();
         }
-        if self.look == Look::Bright && hit.robot_id == 0 {
-            return RaySample {
-                gray: WHITE * shade,
-                surface: hit.surface,
-                robot_id: 0,
-            };
-        }
-        hit.albedo *= shade;
-        let lambert = hit.normal.dot(*LIGHT).max(0.0);
-        let distance_squared = direction.length_squared() * hit.time * hit.time;
-        let falloff = 1.0 / (1.0 + 0.012 * distance_squared);
+        let gray = if self.look == Look::Bright && hit.robot_id == 0 {
+            WHITE * shade
+        } else {
+            let lambert = hit.normal.dot(*LIGHT).max(0.0);
+            let distance_squared = direction.length_squared() * hit.time * hit.time;
+            let falloff = 1.0 / (1.0 + 0.012 * distance_squared);
+            hit.albedo * shade * (AMBIENT + (1.0 - AMBIENT) * lambert) * falloff
+        };
         RaySample {
-            gray: hit.albedo * (AMBIENT + (1.0 - AMBIENT) * lambert) * falloff,
+            gray,
             surface: hit.surface,
             robot_id: hit.robot_id,
         }

@@ -63,14 +63,9 @@ pub enum SimError {
 impl HasErrorKind for SimError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::UnknownScenario { .. }
-            | Self::UnknownLook { .. }
-            | Self::FrameSize { .. }
-            | Self::Setting { .. }
-            | Self::ActionLength { .. }
-            | Self::Value(_) => ErrorKind::Usage,
             Self::Ended | Self::NotReset => ErrorKind::Conflict,
             Self::Frame(_) => ErrorKind::Internal,
+            _ => ErrorKind::Usage,
         }
     }
 }

@@ -7,7 +7,7 @@
 //! still turn, a pushed robot moves, and an undisturbed robot follows the exact arc.
 
 use rapier3d::prelude::{
-    ColliderBuilder, ColliderHandle, LockedAxes, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
+    ColliderBuilder, ColliderHandle, ContactPair, LockedAxes, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
 use super::arena;
@@ -78,11 +78,10 @@ impl PhysicsScene {
         });
     }
 
-    /// Sets the robot's velocity command, [m/s, rad/s], clamped to the limits of the base.
+    /// Sets the robot's velocity command, [m/s, rad/s], clamped to the limits of the base. A robot's number is its place in
+    /// the order in which the robots were added, here and below.
     pub(super) fn command(&mut self, robot: usize, [linear, angular]: [f32; 2]) {
-        if let Some(body) = self.robots.get_mut(robot) {
-            body.drive.command(linear, angular);
-        }
+        self.robots[robot].drive.command(linear, angular);
     }
 
     /// Simulates `dt` seconds.
@@ -106,14 +105,9 @@ impl PhysicsScene {
         self.physics.step();
     }
 
-    /// The robot's true pose. `robot` is the number of an added robot.
-    #[expect(clippy::expect_used, reason = "the caller numbers the robots as it added them")]
+    /// The robot's true pose.
     pub(super) fn pose(&self, robot: usize) -> PlanarPose {
-        let body = self
-            .robots
-            .get(robot)
-            .and_then(|robot| self.physics.bodies.get(robot.handle));
-        let body = body.expect("the pose of a robot that was not added is a bug");
+        let body = &self.physics.bodies[self.robots[robot].handle];
         PlanarPose {
             x_m: body.translation().x,
             y_m: body.translation().y,
@@ -123,22 +117,16 @@ impl PhysicsScene {
 
     /// The robot's wheel odometry, with the components of [`super::state_channels`].
     pub(super) fn odometry(&self, robot: usize) -> Vec<f32> {
-        let Some(body) = self.robots.get(robot) else {
-            return Vec::new();
-        };
-        let pose = body.drive.odometry();
-        let (linear, angular) = body.drive.velocity();
+        let drive = &self.robots[robot].drive;
+        let (pose, (linear, angular)) = (drive.odometry(), drive.velocity());
         let (sin, cos) = pose.heading_rad.sin_cos();
         vec![pose.x_m, pose.y_m, cos, sin, linear, angular]
     }
 
     /// Whether the robot touches a wall, a pillar or another robot.
     pub(super) fn is_touching(&self, robot: usize) -> bool {
-        self.robots.get(robot).is_some_and(|body| {
-            self.physics
-                .contact_pairs_with(body.collider)
-                .any(rapier3d::prelude::ContactPair::has_any_active_contact)
-        })
+        let mut contacts = self.physics.contact_pairs_with(self.robots[robot].collider);
+        contacts.any(ContactPair::has_any_active_contact)
     }
 }
 

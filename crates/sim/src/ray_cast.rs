@@ -1,5 +1,5 @@
-//! Solids for ray casting that parry does not have or computes more slowly: an upright cylinder in closed form, and a box at
-//! any position.
+//! Solids for ray casting: an upright cylinder in closed form, which parry does not have or computes more slowly, and a box
+//! at any position.
 
 use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
 use rapier3d::parry::shape::{Cuboid, FeatureId};
@@ -50,17 +50,12 @@ impl UprightCylinder {
         let last = if exit < slab[1].0 { (exit, 0) } else { slab[1] };
         (first.0 <= last.0 && last.0 >= 0.0).then_some([first, last])
     }
-}
 
-impl RayCast for UprightCylinder {
+    /// Where the ray enters the cylinder, until `max_time`; at its origin, without a normal, if that is inside.
     #[inline]
-    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
-        let [first, last] = self.span(ray)?;
-        let (time, face, outward) = match (first.0 >= 0.0, solid) {
-            (true, _) => (first.0, first.1, 1.0),
-            (false, true) => (0.0, first.1, 0.0),
-            (false, false) => (last.0, last.1, -1.0),
-        };
+    pub(super) fn cast(&self, ray: &Ray, max_time: f32) -> Option<RayIntersection> {
+        let [(enter, face), _] = self.span(ray)?;
+        let (time, outward) = if enter >= 0.0 { (enter, 1.0) } else { (0.0, 0.0) };
         if time > max_time {
             return None;
         }
@@ -76,18 +71,27 @@ impl RayCast for UprightCylinder {
     }
 }
 
-/// A box with its sides parallel to the axes.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Block {
-    pub(super) center: [f32; 3],
-    pub(super) half: [f32; 3],
+/// A solid shape.
+pub(super) enum Solid {
+    Cylinder(UprightCylinder),
+    /// A box with its sides parallel to the axes.
+    Block {
+        center: [f32; 3],
+        half: [f32; 3],
+    },
 }
 
-impl RayCast for Block {
+impl Solid {
+    /// Where the ray enters the solid, until `max_time`.
     #[inline]
-    fn cast_local_ray_and_get_normal(&self, ray: &Ray, max_time: f32, solid: bool) -> Option<RayIntersection> {
-        let moved = ray.translate_by(-Vector::from_array(self.center));
-        Cuboid::new(Vector::from_array(self.half)).cast_local_ray_and_get_normal(&moved, max_time, solid)
+    pub(super) fn cast(&self, ray: &Ray, max_time: f32) -> Option<RayIntersection> {
+        match self {
+            Self::Cylinder(cylinder) => cylinder.cast(ray, max_time),
+            Self::Block { center, half } => {
+                let moved = ray.translate_by(-Vector::from_array(*center));
+                Cuboid::new(Vector::from_array(*half)).cast_local_ray_and_get_normal(&moved, max_time, true)
+            }
+        }
     }
 }
 
@@ -112,7 +116,7 @@ mod tests {
             // parry's cylinder lies along y: swap y and z.
             let swap = |v: Vector| Vector::new(v.x, v.z, v.y);
             let lying = Ray::new(swap(ray.origin), swap(direction));
-            let ours = upright.cast_local_ray(&ray, 10.0, true);
+            let ours = upright.cast(&ray, 10.0).map(|hit| hit.time_of_impact);
             let theirs = Cylinder::new(half, radius).cast_local_ray(&lying, 10.0, true);
             match (ours, theirs) {
                 (Some(ours), Some(theirs)) => prop_assert!((ours - theirs).abs() < 2e-3, "{ours} {theirs}"),

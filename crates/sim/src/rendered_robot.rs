@@ -1,10 +1,10 @@
 //! A robot as the camera sees it, and ray casting against it.
 
-use rapier3d::parry::query::{Ray, RayCast, RayIntersection};
+use rapier3d::parry::query::{Ray, RayIntersection};
 use rapier3d::parry::shape::FeatureId;
 use rapier3d::prelude::Vector;
 
-use super::appearance::{RobotAppearance, Solid};
+use super::appearance::RobotAppearance;
 use super::robot::PlanarPose;
 
 /// The nearest point that a ray hits, of all solids tested so far.
@@ -40,12 +40,7 @@ impl RenderedRobot {
 
     /// Rotates a vector from the room's axes to the robot's axes.
     fn to_robot_axes(&self, v: Vector) -> Vector {
-        Vector::new(self.cos * v.x + self.sin * v.y, self.cos * v.y - self.sin * v.x, v.z)
-    }
-
-    /// Rotates a vector from the robot's axes to the room's axes.
-    fn to_room_axes(&self, v: Vector) -> Vector {
-        Vector::new(self.cos * v.x - self.sin * v.y, self.sin * v.x + self.cos * v.y, v.z)
+        rotated(v, -self.sin, self.cos)
     }
 
     /// Share of the light that reaches a point of the floor beside the robot, 0…1: the robot's soft shadow.
@@ -90,14 +85,10 @@ impl<'a> RobotView<'a> {
         }
         let ray = Ray::new(self.origin, self.robot.to_robot_axes(direction));
         for (part, index) in self.robot.appearance.parts.iter().zip(0u16..) {
-            let found = match &part.solid {
-                Solid::Cylinder(shape) => shape.cast_local_ray_and_get_normal(&ray, hit.time, true),
-                Solid::Block(shape) => shape.cast_local_ray_and_get_normal(&ray, hit.time, true),
-            };
-            if let Some(found) = found {
+            if let Some(found) = part.solid.cast(&ray, hit.time) {
                 *hit = NearestHit {
                     time: found.time_of_impact,
-                    normal: self.robot.to_room_axes(found.normal),
+                    normal: rotated(found.normal, self.robot.sin, self.robot.cos),
                     albedo: part.albedo,
                     surface: 256 * u16::from(self.robot.id) + 8 * index + face(&found) as u16,
                     robot_id: self.robot.id,
@@ -112,4 +103,9 @@ pub(super) fn face(found: &RayIntersection) -> usize {
         FeatureId::Face(index) => index as usize,
         _ => 0,
     }
+}
+
+/// A vector turned counter-clockwise about the vertical.
+fn rotated(v: Vector, sin: f32, cos: f32) -> Vector {
+    Vector::new(cos * v.x - sin * v.y, sin * v.x + cos * v.y, v.z)
 }

@@ -223,15 +223,10 @@ impl TrialParameters {
     }
 
     /// The route of Tb2, then those of the other robots. Call it only after [`Self::validate`] has passed.
-    #[expect(clippy::expect_used, reason = "validate() has checked both indexes")]
     pub(super) fn routes(&self) -> Vec<Route> {
-        let start_m = arena::STARTS_M.get(self.start).copied();
-        let start_m = start_m.expect("an unknown start after validate() is a bug");
-        let goal_m = arena::GOALS_M.get(self.goal).copied();
-        let goal_m = goal_m.expect("an unknown goal after validate() is a bug");
         let tb2 = Route {
-            pose: pose(start_m, self.start_heading_rad),
-            goal_m,
+            pose: pose(arena::STARTS_M[self.start], self.start_heading_rad),
+            goal_m: arena::GOALS_M[self.goal],
             gains: self.gains,
         };
         std::iter::once(tb2).chain(self.crowd.iter().copied()).collect()
@@ -257,14 +252,9 @@ fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32)
     loop {
         let x = random.random_range(0.4..arena::LENGTH_M - 0.4);
         let y = random.random_range(0.4 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.4);
-        let is_clear_of_pillars = arena::PILLARS
-            .iter()
-            .all(|pillar| arena::distance(pillar.position_m, [x, y]) > pillar.radius_m + 0.3);
-        if is_clear_of_pillars
-            && taken
-                .iter()
-                .all(|&other| arena::distance(other, [x, y]) >= min_distance)
-        {
+        let to = |other| arena::distance(other, [x, y]);
+        let clears = |pillar: &arena::Pillar| to(pillar.position_m) > pillar.radius_m + 0.3;
+        if arena::PILLARS.iter().all(clears) && taken.iter().all(|&other| to(other) >= min_distance) {
             return [x, y];
         }
     }

@@ -74,6 +74,20 @@ struct OtherRobot {
     blocked_s: f32,
 }
 
+impl OtherRobot {
+    /// Gives the robot its next command, and a new goal where the scenario continues after a goal.
+    fn control(&mut self, physics: &mut PhysicsScene, robot: usize, ends_at_goal: bool, dt: f32) {
+        let pose = physics.pose(robot);
+        let is_touching = physics.is_touching(robot);
+        self.blocked_s = if is_touching { self.blocked_s + dt } else { 0.0 };
+        if !ends_at_goal && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S) {
+            self.navigator.choose_goal(pose);
+            self.blocked_s = 0.0;
+        }
+        physics.command(robot, self.navigator.command(pose, dt));
+    }
+}
+
 /// One running trial.
 pub struct World {
     config: WorldConfig,
@@ -200,7 +214,8 @@ impl World {
         let touched = self.advance();
         self.frame_index += 1;
         self.update_observation()?;
-        let terminated = !self.parameters.scenario.observer_drives() && self.has_arrived(0);
+        let tb2_arrived = self.others[0].navigator.has_arrived(self.physics.pose(1));
+        let terminated = !self.parameters.scenario.observer_drives() && tb2_arrived;
         let truncated = self.frame_index + 1 >= self.config.frame_limit();
         self.ended = terminated || truncated;
         Ok(StepResult {
@@ -216,40 +231,16 @@ impl World {
         let period = self.config.frame_period_s as f32;
         let steps = (period / PHYSICS_STEP_S).ceil().max(1.0);
         let dt = period / steps;
+        let ends_at_goal = !self.parameters.scenario.observer_drives();
         let mut touched = false;
         for _ in 0..steps as usize {
-            for index in 0..self.others.len() {
-                self.control(index, dt);
+            for (other, robot) in self.others.iter_mut().zip(1..) {
+                other.control(&mut self.physics, robot, ends_at_goal, dt);
             }
             self.physics.advance(dt);
             touched |= self.physics.is_touching(0);
         }
         touched
-    }
-
-    /// Gives another robot its next command, and a new goal where the scenario continues after a goal.
-    fn control(&mut self, index: usize, dt: f32) {
-        let robot = index + 1;
-        let ends_at_goal = !self.parameters.scenario.observer_drives();
-        let arrived = self.has_arrived(index);
-        let touching = self.physics.is_touching(robot);
-        let Some(other) = self.others.get_mut(index) else {
-            return;
-        };
-        other.blocked_s = if touching { other.blocked_s + dt } else { 0.0 };
-        if !ends_at_goal && (arrived || other.blocked_s > BLOCKED_LIMIT_S) {
-            other.navigator.choose_goal(self.physics.pose(robot));
-            other.blocked_s = 0.0;
-        }
-        let command = other.navigator.command(self.physics.pose(robot), dt);
-        self.physics.command(robot, command);
-    }
-
-    fn has_arrived(&self, index: usize) -> bool {
-        let pose = self.physics.pose(index + 1);
-        self.others
-            .get(index)
-            .is_some_and(|other| other.navigator.has_arrived(pose))
     }
 
     /// How well Tb2 is in view, 0…1: from its bearing, and 0 if none of its pixels is visible.

@@ -34,51 +34,48 @@ impl ConditioningTensors {
     /// The scaled inputs that the predictor gets after the features in each step, `[B, horizon, A + S]`; `None` if the
     /// conditioning is none. Errors: `Missing`, `Shape`.
     pub(super) fn inputs(&self, spec: &ModelSpec, batch: usize) -> Result<Option<Tensor>, NnError> {
-        let horizon = spec.horizon;
+        let [actions, state] = self.used(spec, batch)?;
         let mut inputs = Vec::new();
-        if let Some(count) = spec.action_inputs() {
-            let actions = checked(spec, "actions", self.actions.as_ref(), &[batch, horizon, count])?;
+        if let Some(actions) = actions {
             inputs.push(scaled(actions, &spec.actions)?);
         }
-        if let Some(count) = spec.state_inputs() {
-            let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
+        if let Some(state) = state {
             let state = scaled(state, &spec.states)?.unsqueeze(1)?;
-            inputs.push(state.expand((batch, horizon, count))?.contiguous()?);
+            let shape = (batch, spec.horizon, spec.states.len());
+            inputs.push(state.expand(shape)?.contiguous()?);
         }
-        Ok(match inputs.as_slice() {
-            [] => None,
-            [only] => Some(only.clone()),
-            several => Some(Tensor::cat(several, 2)?),
-        })
+        Ok((!inputs.is_empty()).then(|| Tensor::cat(&inputs, 2)).transpose()?)
     }
 
     /// The inputs as plain values. Values far outside the training's are limited, so that no prediction is NaN. Errors:
     /// `Missing`, `Shape`.
     pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
-        let values = |tensor: &Tensor, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
-            let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+        let [actions, states] = self.used(spec, batch)?;
+        let limited = |tensor: Option<&Tensor>, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
+            let Some(tensor) = tensor else { return Ok(Vec::new()) };
+            let values = tensor.flatten_all()?.to_vec1::<f32>()?.into_iter();
             let channels = channels.iter().cycle();
             Ok(values
-                .iter()
                 .zip(channels)
-                .map(|(value, channel)| channel.limited(*value))
+                .map(|(value, channel)| channel.limited(value))
                 .collect())
         };
-        let actions = match spec.action_inputs() {
-            Some(count) => {
-                let shape = [batch, spec.horizon, count];
-                values(checked(spec, "actions", self.actions.as_ref(), &shape)?, &spec.actions)?
-            }
-            None => Vec::new(),
-        };
-        let states = match spec.state_inputs() {
-            Some(count) => {
-                let state = checked(spec, "state", self.state.as_ref(), &[batch, count])?;
-                values(state, &spec.states)?
-            }
-            None => Vec::new(),
-        };
-        Ok(ConditioningValues { actions, states })
+        Ok(ConditioningValues {
+            actions: limited(actions, &spec.actions)?,
+            states: limited(states, &spec.states)?,
+        })
+    }
+
+    /// The actions and the state, where the model takes them. Errors: `Missing`, `Shape`.
+    fn used(&self, spec: &ModelSpec, batch: usize) -> Result<[Option<&Tensor>; 2], NnError> {
+        let actions = spec.action_inputs().map(|count| {
+            let shape = [batch, spec.horizon, count];
+            checked(spec, "actions", self.actions.as_ref(), &shape)
+        });
+        let state = spec
+            .state_inputs()
+            .map(|count| checked(spec, "state", self.state.as_ref(), &[batch, count]));
+        Ok([actions.transpose()?, state.transpose()?])
     }
 }
 

@@ -154,18 +154,8 @@ impl HasErrorKind for NnError {
         match self {
             // A training takes these from its settings.
             Self::OutOfRange { .. } | Self::NoChannels { .. } => ErrorKind::Usage,
-            Self::ChannelScale { .. }
-            | Self::FrameSides { .. }
-            | Self::RecurrentActions { .. }
-            | Self::Camera(_)
-            | Self::Shape { .. }
-            | Self::Missing { .. }
-            | Self::OtherArchitecture { .. }
-            | Self::TensorMissing { .. }
-            | Self::TensorUnknown { .. }
-            | Self::TensorShape { .. }
-            | Self::TensorNotFinite { .. } => ErrorKind::Unusable,
             Self::Tensor(_) => ErrorKind::Internal,
+            _ => ErrorKind::Unusable,
         }
     }
 }

@@ -25,7 +25,6 @@ mod rollout_rows;
 mod room_geometry;
 mod scene;
 
-pub(super) use beyond_horizon::predict_beyond_horizon;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub(super) use network::FlowNetwork;
 pub use network::FlowPrediction;

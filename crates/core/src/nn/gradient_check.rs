@@ -12,6 +12,11 @@ pub fn noise(shape: &[usize], seed: u64) -> Tensor {
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
 }
 
+/// All values, row by row.
+pub(super) fn values(tensor: &Tensor) -> Vec<f32> {
+    tensor.flatten_all().unwrap().to_vec1().unwrap()
+}
+
 /// Compares the gradients of a weighted sum of the operation's outputs with central differences of step `step`.
 pub(super) fn assert_gradients(inputs: &[Tensor], step: f32, operation: impl Fn(&[Tensor]) -> Result<Tensor>) {
     let vars: Vec<Var> = inputs.iter().map(|input| Var::from_tensor(input).unwrap()).collect();
@@ -19,35 +24,21 @@ pub(super) fn assert_gradients(inputs: &[Tensor], step: f32, operation: impl Fn(
     let out = operation(&tensors).unwrap();
     let weights = noise(out.dims(), 99);
     let value = |inputs: &[Tensor]| -> f64 {
-        let out = operation(inputs)
-            .unwrap()
-            .flatten_all()
-            .unwrap()
-            .to_vec1::<f32>()
-            .unwrap();
-        let weights = weights.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        out.iter()
-            .zip(&weights)
-            .map(|(a, b)| f64::from(*a) * f64::from(*b))
-            .sum()
+        let (out, weights) = (values(&operation(inputs).unwrap()), values(&weights));
+        let products = out.iter().zip(&weights).map(|(a, b)| f64::from(*a) * f64::from(*b));
+        products.sum()
     };
     let gradients = (out * &weights).unwrap().sum_all().unwrap().backward().unwrap();
     for (index, var) in vars.iter().enumerate() {
-        let found = gradients
-            .get(var.as_tensor())
-            .unwrap()
-            .flatten_all()
-            .unwrap()
-            .to_vec1::<f32>()
-            .unwrap();
-        let base = inputs[index].flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let found = values(gradients.get(var.as_tensor()).unwrap());
+        let base = values(&inputs[index]);
         let largest = found.iter().fold(0.0f32, |most, value| most.max(value.abs()));
         for place in (0..base.len()).step_by(base.len().div_ceil(40)) {
             let shifted = |by: f32| {
-                let mut values = base.clone();
-                values[place] += by;
+                let mut shifted = base.clone();
+                shifted[place] += by;
                 let mut all: Vec<Tensor> = inputs.to_vec();
-                all[index] = Tensor::from_vec(values, inputs[index].dims(), &Device::Cpu).unwrap();
+                all[index] = Tensor::from_vec(shifted, inputs[index].dims(), &Device::Cpu).unwrap();
                 value(&all)
             };
             let expected = ((shifted(step) - shifted(-step)) / (2.0 * f64::from(step))) as f32;

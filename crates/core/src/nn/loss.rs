@@ -5,12 +5,12 @@
 use std::fmt;
 use std::str::FromStr;
 
-use candle_core::{CpuStorage, CustomOp2, Layout, Shape, Tensor};
+use candle_core::{Shape, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::error::NnError;
+use super::fused::{FusedOperation, Operand, apply};
 use super::options::named_enum;
-use super::tensors::{slice, with_values};
 use crate::vectorized::vectorized;
 
 named_enum!(
@@ -27,9 +27,7 @@ impl Loss {
     /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
     pub fn between(self, prediction: &Tensor, target: &Tensor) -> Result<Tensor, NnError> {
         check_same_shape(prediction, target)?;
-        Ok(prediction
-            .contiguous()?
-            .apply_op2(&target.detach().contiguous()?, self)?)
+        Ok(apply(self, [prediction, &target.detach()])?)
     }
 }
 
@@ -42,49 +40,34 @@ pub(super) fn check_same_shape(prediction: &Tensor, target: &Tensor) -> Result<(
     Err(NnError::shape("prediction", prediction, expected))
 }
 
-/// One pass over memory forward and one backward.
-impl CustomOp2 for Loss {
-    fn name(&self) -> &'static str {
-        "loss"
-    }
+impl FusedOperation<2> for Loss {
+    const NAME: &'static str = "loss";
 
-    fn cpu_fwd(
-        &self,
-        prediction: &CpuStorage,
-        prediction_layout: &Layout,
-        target: &CpuStorage,
-        target_layout: &Layout,
-    ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let (prediction, target) = (slice(prediction, prediction_layout)?, slice(target, target_layout)?);
-        let count = prediction.len() as f64;
+    fn forward(&self, [prediction, target]: [Operand; 2]) -> candle_core::Result<(Vec<f32>, Shape)> {
+        let (prediction, target) = (prediction.values, target.values);
         let sum = match self {
             Self::Mse => sum_of(prediction, target, |difference| difference * difference),
             Self::L1 => sum_of(prediction, target, f32::abs),
         };
-        Ok((CpuStorage::F32(vec![(sum / count) as f32]), Shape::from(())))
+        Ok((vec![(sum / prediction.len() as f64) as f32], Shape::from(())))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        prediction: &Tensor,
-        target: &Tensor,
-        _loss: &Tensor,
-        gradient: &Tensor,
-    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
-        let scale = gradient.to_scalar::<f32>()? / prediction.elem_count() as f32;
-        let values = with_values(prediction, |prediction| {
-            with_values(target, |target| match self {
-                Self::Mse => slopes(prediction, target, |difference| 2.0 * scale * difference),
-                Self::L1 => slopes(prediction, target, |difference| {
-                    let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
-                    scale * sign
-                }),
-            })
-        })??;
-        Ok((
-            Some(Tensor::from_vec(values, prediction.dims(), prediction.device())?),
-            None,
-        ))
+        [prediction, target]: [Operand; 2],
+        _loss: Operand,
+        gradient: Operand,
+    ) -> candle_core::Result<[Option<Vec<f32>>; 2]> {
+        let (prediction, target) = (prediction.values, target.values);
+        let scale = gradient.values[0] / prediction.len() as f32;
+        let values = match self {
+            Self::Mse => slopes(prediction, target, |difference| 2.0 * scale * difference),
+            Self::L1 => slopes(prediction, target, |difference| {
+                let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
+                scale * sign
+            }),
+        };
+        Ok([Some(values), None])
     }
 }
 

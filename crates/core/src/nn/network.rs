@@ -2,15 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::Tensor;
+use candle_core::{Tensor, Var};
 
 use super::conditioning::ConditioningTensors;
 use super::dense::{DenseNetwork, Feedback};
 use super::error::NnError;
-use super::flow::{FlowNetwork, FlowPrediction, predict_beyond_horizon};
-use super::parameters::Parameters;
+use super::flow::{FlowNetwork, FlowPrediction};
+use super::model_tensors::ModelTensors;
+use super::parameters::{Parameters, of_shape};
 use super::spec::{Architecture, ModelSpec, in_range};
-use super::tensor_source::TensorSource;
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
 /// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
@@ -24,33 +24,6 @@ pub struct Network {
 enum Variant {
     Dense(Box<DenseNetwork>),
     Flow(Box<FlowNetwork>),
-}
-
-/// A model's tensors by name, some of them without gradients.
-struct NamedTensors<'a> {
-    shapes: BTreeMap<String, Vec<usize>>,
-    parameters: &'a Parameters,
-    frozen: &'a [&'a str],
-}
-
-impl TensorSource for NamedTensors<'_> {
-    fn tensor(&self, name: &str) -> Result<Tensor, NnError> {
-        #[expect(clippy::expect_used, reason = "the specification names every tensor of the model")]
-        let expected = (self.shapes.get(name).cloned()).expect("a tensor that tensor_shapes() does not list is a bug");
-        match self.parameters.get(name) {
-            None => Err(NnError::TensorMissing {
-                name: name.to_owned(),
-                expected,
-            }),
-            Some(var) if var.dims() != expected => Err(NnError::TensorShape {
-                name: name.to_owned(),
-                found: var.dims().to_vec(),
-                expected,
-            }),
-            Some(var) if self.frozen.iter().any(|prefix| name.starts_with(prefix)) => Ok(var.as_detached_tensor()),
-            Some(var) => Ok(var.as_tensor().clone()),
-        }
-    }
 }
 
 impl Network {
@@ -68,14 +41,17 @@ impl Network {
     /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
     pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
         spec.validate()?;
-        let tensors = NamedTensors {
-            shapes: spec.tensor_shapes(),
-            parameters,
-            frozen,
-        };
+        let mut tensors = BTreeMap::new();
+        for (name, shape) in spec.tensor_shapes() {
+            let tensor = of_shape(&name, &shape, parameters.get(&name).map(Var::as_tensor))?;
+            let is_frozen = frozen.iter().any(|prefix| name.starts_with(prefix));
+            let tensor = if is_frozen { tensor.detach() } else { tensor.clone() };
+            tensors.insert(name, tensor);
+        }
+        let tensors = ModelTensors(tensors);
         let variant = match spec.architecture {
-            Architecture::Dense(sizes) => Variant::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors)?)),
-            Architecture::Flow(sizes) => Variant::Flow(Box::new(FlowNetwork::new(&spec, sizes, &tensors)?)),
+            Architecture::Dense(sizes) => Variant::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors))),
+            Architecture::Flow(sizes) => Variant::Flow(Box::new(FlowNetwork::new(spec.clone(), sizes, &tensors))),
         };
         Ok(Self { spec, variant })
     }
@@ -122,11 +98,11 @@ impl Network {
         if let Feedback::TeacherForcing(truth) = feedback {
             let shape = [Some(batch), Some(self.spec.horizon), Some(self.spec.code_len())];
             self.check("true features", truth, &shape)?;
+            if let Variant::Dense(dense) = &self.variant {
+                return dense.predict_from_truth(codes, conditioning, truth);
+            }
         }
-        match &self.variant {
-            Variant::Dense(dense) => dense.predict(codes, conditioning, feedback),
-            Variant::Flow(flow) => Ok(flow.predict(&self.spec, codes, &each_once(batch), conditioning)?.frames),
-        }
+        self.predict_rollouts(codes, &each_once(batch), conditioning)
     }
 
     /// Codes `[N, horizon, code_len]` of N rollouts of B windows with `codes` [B, context, `code_len`]: rollout n follows the
@@ -140,7 +116,7 @@ impl Network {
         self.check_windows(codes)?;
         match &self.variant {
             Variant::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
-            Variant::Flow(flow) => Ok(flow.predict(&self.spec, codes, windows, conditioning)?.frames),
+            Variant::Flow(flow) => Ok(flow.predict(codes, windows, conditioning, self.spec.horizon)?.frames),
         }
     }
 
@@ -161,7 +137,7 @@ impl Network {
         self.check_windows(codes)?;
         match &self.variant {
             Variant::Dense(dense) => dense.with_horizon(steps).predict_rollouts(codes, windows, conditioning),
-            Variant::Flow(flow) => predict_beyond_horizon(flow, &self.spec, (codes, windows, conditioning), steps),
+            Variant::Flow(flow) => flow.predict_beyond_horizon(codes, windows, conditioning, steps),
         }
     }
 
@@ -177,9 +153,7 @@ impl Network {
         in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
         match &self.variant {
             Variant::Dense(_) => Ok(None),
-            Variant::Flow(flow) => flow
-                .predict_first(&self.spec, (frames, &each_once(batch)), conditioning, steps)
-                .map(Some),
+            Variant::Flow(flow) => flow.predict(frames, &each_once(batch), conditioning, steps).map(Some),
         }
     }
 

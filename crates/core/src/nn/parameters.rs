@@ -8,6 +8,7 @@ use super::error::NnError;
 use super::init;
 use super::options::ArchitectureKind;
 use super::spec::ModelSpec;
+use super::tensors::with_values;
 use crate::types::Seed;
 
 /// The trained tensors of a model. Names are sorted, so every pass over them has one order.
@@ -36,15 +37,10 @@ impl Parameters {
         }
         let mut vars = BTreeMap::new();
         for (name, expected) in spec.tensor_shapes() {
-            let Some(tensor) = tensors.remove(&name) else {
-                return Err(NnError::TensorMissing { name, expected });
-            };
-            if tensor.dims() != expected {
-                let found = tensor.dims().to_vec();
-                return Err(NnError::TensorShape { name, found, expected });
-            }
+            let found = tensors.remove(&name);
+            let tensor = of_shape(&name, &expected, found.as_ref())?;
             let tensor = tensor.to_dtype(DType::F32)?.force_contiguous()?;
-            if !is_finite(&tensor)? {
+            if !with_values(&tensor, |values| values.iter().all(|value| value.is_finite()))? {
                 return Err(NnError::TensorNotFinite { name });
             }
             vars.insert(name, Var::from_tensor(&tensor)?);
@@ -85,24 +81,12 @@ impl Parameters {
     /// Sets every tensor to its value in `snapshot`, in place: models that share the storage see the change.
     /// Errors: `TensorMissing`, `TensorShape`.
     pub fn restore(&self, snapshot: &BTreeMap<String, Tensor>) -> Result<(), NnError> {
+        let mut changes = Vec::new();
         for (name, var) in &self.0 {
-            let expected = var.dims().to_vec();
-            match snapshot.get(name) {
-                None => {
-                    let name = name.clone();
-                    return Err(NnError::TensorMissing { name, expected });
-                }
-                Some(tensor) if tensor.dims() != expected => {
-                    let (name, found) = (name.clone(), tensor.dims().to_vec());
-                    return Err(NnError::TensorShape { name, found, expected });
-                }
-                Some(_) => {}
-            }
+            changes.push((var, of_shape(name, var.dims(), snapshot.get(name))?));
         }
-        for (name, var) in &self.0 {
-            if let Some(tensor) = snapshot.get(name) {
-                var.set(&tensor.to_dtype(var.dtype())?)?;
-            }
+        for (var, tensor) in changes {
+            var.set(&tensor.to_dtype(var.dtype())?)?;
         }
         Ok(())
     }
@@ -124,8 +108,16 @@ fn architecture_of(tensors: &BTreeMap<String, Tensor>) -> Option<ArchitectureKin
     }
 }
 
-/// Whether every value is a finite number.
-fn is_finite(tensor: &Tensor) -> Result<bool, NnError> {
-    let values = tensor.flatten_all()?.to_vec1::<f32>()?;
-    Ok(values.iter().all(|value| value.is_finite()))
+/// The tensor that was found under a name, if it has the expected shape. Errors: `TensorMissing`, `TensorShape`.
+pub(super) fn of_shape<'a>(name: &str, expected: &[usize], found: Option<&'a Tensor>) -> Result<&'a Tensor, NnError> {
+    let (name, expected) = (name.to_owned(), expected.to_vec());
+    match found {
+        None => Err(NnError::TensorMissing { name, expected }),
+        Some(tensor) if tensor.dims() != expected => Err(NnError::TensorShape {
+            name,
+            found: tensor.dims().to_vec(),
+            expected,
+        }),
+        Some(tensor) => Ok(tensor),
+    }
 }

@@ -3,12 +3,12 @@
 //! The same measure as [`crate::frame::quality::ssim`]. Its gradient is written by hand, since it is then one pass of blurs
 //! back as it is one forward.
 
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
+use candle_core::{Result, Shape, Tensor};
 use rayon::prelude::*;
 
 use super::error::NnError;
+use super::fused::{FusedOperation, Operand, apply};
 use super::loss::check_same_shape;
-use super::tensors::{slice, with_values};
 use crate::frame::quality::SsimTerms;
 
 /// 1 minus the mean structural similarity of the frames `[…, P]`, as a scalar; `width` is a row's length in pixels.
@@ -16,10 +16,7 @@ use crate::frame::quality::SsimTerms;
 pub fn ssim_loss(prediction: &Tensor, target: &Tensor, width: usize) -> std::result::Result<Tensor, NnError> {
     check_same_shape(prediction, target)?;
     let frame = prediction.dims().last().copied().unwrap_or(0);
-    let operation = SsimLoss { frame, width };
-    Ok(prediction
-        .contiguous()?
-        .apply_op2(&target.detach().contiguous()?, operation)?)
+    Ok(apply(SsimLoss { frame, width }, [prediction, &target.detach()])?)
 }
 
 struct SsimLoss {
@@ -28,53 +25,28 @@ struct SsimLoss {
     width: usize,
 }
 
-impl CustomOp2 for SsimLoss {
-    fn name(&self) -> &'static str {
-        "ssim-loss"
+impl SsimLoss {
+    /// The similarity of each frame of the prediction and of the target.
+    fn terms<'a>(&self, [prediction, target]: [Operand<'a>; 2]) -> impl IndexedParallelIterator<Item = SsimTerms<'a>> {
+        let frames = prediction.values.par_chunks_exact(self.frame);
+        let pairs = frames.zip(target.values.par_chunks_exact(self.frame));
+        pairs.map(|(prediction, target)| SsimTerms::new(prediction, target, self.width))
+    }
+}
+
+impl FusedOperation<2> for SsimLoss {
+    const NAME: &'static str = "ssim-loss";
+
+    fn forward(&self, inputs: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
+        let sums: Vec<f64> = self.terms(inputs).map(|terms| terms.sum()).collect();
+        let loss = 1.0 - sums.iter().sum::<f64>() / inputs[0].values.len() as f64;
+        Ok((vec![loss as f32], Shape::from(())))
     }
 
-    fn cpu_fwd(
-        &self,
-        prediction: &CpuStorage,
-        prediction_layout: &Layout,
-        target: &CpuStorage,
-        target_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (prediction, target) = (slice(prediction, prediction_layout)?, slice(target, target_layout)?);
-        let sum: f64 = prediction
-            .par_chunks_exact(self.frame)
-            .zip(target.par_chunks_exact(self.frame))
-            .map(|(prediction, target)| SsimTerms::new(prediction, target, self.width).sum())
-            .collect::<Vec<_>>()
-            .iter()
-            .sum();
-        let loss = 1.0 - sum / prediction.len() as f64;
-        Ok((CpuStorage::F32(vec![loss as f32]), Shape::from(())))
-    }
-
-    fn bwd(
-        &self,
-        prediction: &Tensor,
-        target: &Tensor,
-        _loss: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let scale = -gradient.to_scalar::<f32>()? / prediction.elem_count() as f32;
-        let values: Vec<f32> = with_values(prediction, |prediction| {
-            with_values(target, |target| {
-                let frames = prediction
-                    .par_chunks_exact(self.frame)
-                    .zip(target.par_chunks_exact(self.frame));
-                frames
-                    .flat_map_iter(|(prediction, target)| {
-                        let slopes = SsimTerms::new(prediction, target, self.width).gradient();
-                        slopes.into_iter().map(|slope| slope * scale)
-                    })
-                    .collect()
-            })
-        })??;
-        let gradient = Tensor::from_vec(values, prediction.dims(), prediction.device())?;
-        Ok((Some(gradient), None))
+    fn backward(&self, inputs: [Operand; 2], _loss: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 2]> {
+        let scale = -gradient.values[0] / inputs[0].values.len() as f32;
+        let slopes = self.terms(inputs).flat_map_iter(|terms| terms.gradient());
+        Ok([Some(slopes.map(|slope| slope * scale).collect()), None])
     }
 }
 

@@ -7,10 +7,10 @@ use super::lstm::unroll;
 use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
-use crate::nn::ops::linear::{Activation, Linear};
+use crate::nn::model_tensors::ModelTensors;
+use crate::nn::ops::linear::Linear;
 use crate::nn::options::{PredictorOutput, Reconstruction};
 use crate::nn::spec::{DenseSpec, ModelSpec};
-use crate::nn::tensor_source::TensorSource;
 
 /// What the predictor gets as the previous frame in each step.
 #[derive(Clone, Copy, Debug)]
@@ -37,25 +37,27 @@ pub(in crate::nn) struct DenseNetwork {
 }
 
 impl DenseNetwork {
-    /// The network of these tensors. Errors: `TensorMissing`, `TensorShape`.
-    pub(in crate::nn) fn new(spec: ModelSpec, sizes: DenseSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
+    /// The network of these tensors.
+    pub(in crate::nn) fn new(spec: ModelSpec, sizes: DenseSpec, tensors: &ModelTensors) -> Self {
         let cell = |name: &str| {
             let tensor = |part: &str| tensors.tensor(&format!("{name}.{part}"));
-            let (w_x, w_h, bias) = (tensor("w_x")?, tensor("w_h")?, tensor("bias")?);
-            let peepholes = [tensor("peephole_i")?, tensor("peephole_f")?, tensor("peephole_o")?];
-            Ok::<_, NnError>(PeepholeCell::new(w_x, w_h, bias, peepholes))
+            let peepholes = ["peephole_i", "peephole_f", "peephole_o"].map(tensor);
+            PeepholeCell::new(tensor("w_x"), tensor("w_h"), tensor("bias"), peepholes)
         };
-        Ok(Self {
-            frame_encoder: tensors.linear("frame_encoder", Activation::Tanh)?,
-            frame_decoder: tensors.linear("frame_decoder", Activation::None)?,
-            encoder: cell("encoder")?,
-            predictor: cell("predictor")?,
-            predictor_output: tensors.linear("predictor.output", Activation::None)?,
-            reconstructor: cell("reconstructor")?,
-            reconstructor_output: tensors.linear("reconstructor.output", Activation::None)?,
+        Self {
+            frame_encoder: Linear {
+                has_tanh: true,
+                ..tensors.linear("frame_encoder")
+            },
+            frame_decoder: tensors.linear("frame_decoder"),
+            encoder: cell("encoder"),
+            predictor: cell("predictor"),
+            predictor_output: tensors.linear("predictor.output"),
+            reconstructor: cell("reconstructor"),
+            reconstructor_output: tensors.linear("reconstructor.output"),
             spec,
             sizes,
-        })
+        }
     }
 
     /// The same network for another number of steps.
@@ -77,20 +79,16 @@ impl DenseNetwork {
         Ok(self.frame_decoder.forward(features)?)
     }
 
-    /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`. The
-    /// predictor starts from the encoder's last state. Step k gets the features of frame k, the action that leads to frame
-    /// k + 1, and the state; its output is added to the features unless the specification says `absolute`. Errors:
-    /// `Shape`, `Missing`.
-    pub(in crate::nn) fn predict(
+    /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`, from the
+    /// true ones, `target` ("teacher forcing"). The predictor starts from the encoder's last state. Step k gets the features
+    /// of frame k, the action that leads to frame k + 1, and the state; its output is added to the features unless the
+    /// specification says `absolute`. Errors: `Shape`, `Missing`.
+    pub(in crate::nn) fn predict_from_truth(
         &self,
         features: &Tensor,
         condition: &ConditioningTensors,
-        feedback: Feedback,
+        target: &Tensor,
     ) -> Result<Tensor, NnError> {
-        let target = match feedback {
-            Feedback::TeacherForcing(target) => target,
-            Feedback::Prediction => return self.run_predictor(features, None, condition),
-        };
         let conditions = condition.inputs(&self.spec, features.dim(0)?)?;
         let (_, state) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
@@ -100,8 +98,7 @@ impl DenseNetwork {
             None => previous.clone(),
         };
         let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
-        let changes = self.predictor_output.forward(&outputs.flatten(0, 1)?)?;
-        let outputs = changes.reshape(target.dims())?;
+        let outputs = Self::each_step(&self.predictor_output, &outputs)?;
         Ok(match self.sizes.predictor_output {
             PredictorOutput::Residual => (previous + outputs)?,
             PredictorOutput::Absolute => outputs,
@@ -117,32 +114,21 @@ impl DenseNetwork {
         windows: &[u32],
         condition: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
-        self.run_predictor(features, Some(windows), condition)
-    }
-
-    fn run_predictor(
-        &self,
-        features: &Tensor,
-        windows: Option<&[u32]>,
-        condition: &ConditioningTensors,
-    ) -> Result<Tensor, NnError> {
-        let (_, mut state) = self.encode(features)?;
-        let mut last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
-        if let Some(windows) = windows {
-            let rows = Tensor::new(windows, features.device())?;
-            last = last.index_select(&rows, 0)?;
-            state = LstmState {
-                h: state.h.contiguous()?.index_select(&rows, 0)?,
-                c: state.c.contiguous()?.index_select(&rows, 0)?,
-            };
-        }
-        let conditions = condition.inputs(&self.spec, last.dim(0)?)?;
+        let (_, LstmState { h, c }) = self.encode(features)?;
+        let last = features.get_on_dim(1, self.spec.context - 1)?;
+        let rows = Tensor::new(windows, features.device())?;
+        let of_rollouts = |values: &Tensor| values.contiguous()?.index_select(&rows, 0);
+        let conditions = condition.inputs(&self.spec, windows.len())?;
         let decoder = Decoder {
             cell: &self.predictor,
             output: &self.predictor_output,
             residual: self.sizes.predictor_output == PredictorOutput::Residual,
         };
-        decoder.run(self.spec.horizon, &last, conditions.as_ref(), &state)
+        let state = LstmState {
+            h: of_rollouts(&h)?,
+            c: of_rollouts(&c)?,
+        };
+        decoder.run(self.spec.horizon, &of_rollouts(&last)?, conditions.as_ref(), &state)
     }
 
     /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
@@ -161,15 +147,17 @@ impl DenseNetwork {
                 decoder.run(self.spec.context, &first, None, &state)
             }
             Reconstruction::Stepwise => {
-                let (outputs, _) = unroll(
-                    &self.reconstructor,
-                    &outputs,
-                    &self.reconstructor.zero_state(features.dim(0)?)?,
-                )?;
-                let flat = self.reconstructor_output.forward(&outputs.flatten(0, 1)?)?;
-                Ok(flat.reshape(features.dims())?)
+                let start = self.reconstructor.zero_state(features.dim(0)?)?;
+                let (outputs, _) = unroll(&self.reconstructor, &outputs, &start)?;
+                Self::each_step(&self.reconstructor_output, &outputs)
             }
         }
+    }
+
+    /// A layer at each step of `[B, T, …]`.
+    fn each_step(layer: &Linear, x: &Tensor) -> Result<Tensor, NnError> {
+        let (batch, steps, _) = x.dims3()?;
+        Ok(layer.forward(&x.flatten(0, 1)?)?.reshape((batch, steps, ()))?)
     }
 
     /// The encoder's outputs `[B, context, H]` and its last state.

@@ -5,31 +5,24 @@
 
 use crate::nn::ops::activation::{sigmoid, tanh};
 
-/// Diagonals of `W_ci`, `W_cf`, `W_co`, `[H]` each.
-#[derive(Clone, Copy)]
-pub(super) struct Peepholes<'a> {
-    pub(super) i: &'a [f32],
-    pub(super) f: &'a [f32],
-    pub(super) o: &'a [f32],
-}
-
 /// One step of one row. `sums` `[4H]` contains `W_x x + W_h h + b` and is overwritten with the activations i, f, tanh(·),
-/// o. `c_before` is the cell state before the step; `c` and `h` `[H]` receive the new state.
+/// o. `c_before` is the cell state before the step; `c` and `h` `[H]` receive the new state. The peepholes' weights are the
+/// diagonals of `W_ci`, `W_cf` and `W_co`, `[H]` each.
 #[inline(always)]
-pub(super) fn forward(sums: &mut [f32], c_before: &[f32], peepholes: Peepholes, c: &mut [f32], h: &mut [f32]) {
+pub(super) fn forward(sums: &mut [f32], c_before: &[f32], [w_i, w_f, w_o]: [&[f32]; 3], c: &mut [f32], h: &mut [f32]) {
     let hidden = c.len();
     let (i, rest) = sums.split_at_mut(hidden);
     let (f, rest) = rest.split_at_mut(hidden);
     let (g, o) = rest.split_at_mut(hidden);
-    gate(i, peepholes.i, c_before);
-    gate(f, peepholes.f, c_before);
+    gate(i, w_i, c_before);
+    gate(f, w_f, c_before);
     for g in &mut *g {
         *g = tanh(*g);
     }
     for ((((c, c_before), i), f), g) in c.iter_mut().zip(c_before).zip(&*i).zip(&*f).zip(&*g) {
         *c = f * c_before + i * g;
     }
-    gate(o, peepholes.o, c);
+    gate(o, w_o, c);
     for ((h, o), c) in h.iter_mut().zip(&*o).zip(&*c) {
         *h = o * tanh(*c);
     }
@@ -57,7 +50,13 @@ pub(super) struct StepActivations<'a> {
 /// The backward pass of one row's step. `d_h` `[H]` is the gradient of h. `d_c` `[H]` is the gradient of c from later
 /// steps and is overwritten with the gradient of `c_before`. `d_sums` `[4H]` receives the gradient of the sums.
 #[inline(always)]
-pub(super) fn backward(step: StepActivations, peepholes: Peepholes, d_h: &[f32], d_c: &mut [f32], d_sums: &mut [f32]) {
+pub(super) fn backward(
+    step: StepActivations,
+    [w_i, w_f, w_o]: [&[f32]; 3],
+    d_h: &[f32],
+    d_c: &mut [f32],
+    d_sums: &mut [f32],
+) {
     let StepActivations {
         activations,
         c_before,
@@ -80,7 +79,7 @@ pub(super) fn backward(step: StepActivations, peepholes: Peepholes, d_h: &[f32],
     for (((d_c, d_h), o), tanh_c) in d_c.iter_mut().zip(d_h).zip(o).zip(&*d_g) {
         *d_c += d_h * o * (1.0 - tanh_c * tanh_c);
     }
-    add_product(d_c, d_o, peepholes.o);
+    add_product(d_c, d_o, w_o);
     for (((d_i, d_c), i), g) in d_i.iter_mut().zip(&*d_c).zip(i).zip(g) {
         *d_i = d_c * g * i * (1.0 - i);
     }
@@ -93,8 +92,8 @@ pub(super) fn backward(step: StepActivations, peepholes: Peepholes, d_h: &[f32],
     for (d_c, f) in d_c.iter_mut().zip(f) {
         *d_c *= f;
     }
-    add_product(d_c, d_i, peepholes.i);
-    add_product(d_c, d_f, peepholes.f);
+    add_product(d_c, d_i, w_i);
+    add_product(d_c, d_f, w_f);
 }
 
 /// sums += a · b, element by element.

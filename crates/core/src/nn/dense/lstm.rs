@@ -4,25 +4,31 @@ use candle_core::Tensor;
 use candle_nn::Module as _;
 
 use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
-use super::recurrence::{decode_autoregressive, forward_sequence};
+use super::recurrence::{FeedbackLoop, Recurrence};
 use crate::nn::error::NnError;
-use crate::nn::ops::linear::{Activation, Linear};
+use crate::nn::ops::linear::Linear;
 
 /// Runs the cell over a sequence x `[B, T, D]` from `state`. Returns the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
-    let (outputs, c) = forward_sequence(cell, &input_projection(cell, x, 0)?, state)?;
-    let h = outputs.get(outputs.dim(0)? - 1)?;
+    let steps = x.dim(1)?;
+    let start = Tensor::cat(&[&state.h, &state.c], 1)?;
+    let recurrence = Recurrence::new(cell, None, steps)?;
+    let all = recurrence.apply(&input_projection(cell, x, 0)?, &start, &cell.recurrent_weights())?;
+    let outputs = all.narrow(0, 0, steps)?;
+    let (h, c) = (outputs.get(steps - 1)?, all.get(steps)?);
     Ok((outputs.transpose(0, 1)?.contiguous()?, LstmState { h, c }))
 }
 
 /// The input projection `w_x x + b` of x `[B, T, D]`, with the rows of `w_x` from `first_row`: one matrix product for all
-/// steps, `[T, B, 4H]`.
+/// steps, `[T · B, 4H]`.
 fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
-    let (batch, steps, inputs) = x.dims3()?;
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
-    let w_x = cell.w_x.narrow(0, first_row, inputs)?;
-    let sums = Linear::new(w_x, cell.bias.clone(), Activation::None).forward(&rows)?;
-    Ok(sums.reshape((steps, batch, 4 * cell.hidden()))?)
+    let layer = Linear {
+        weight: cell.w_x.narrow(0, first_row, x.dim(2)?)?,
+        bias: cell.bias.clone(),
+        has_tanh: false,
+    };
+    Ok(layer.forward(&rows)?)
 }
 
 impl Decoder<'_> {
@@ -34,11 +40,23 @@ impl Decoder<'_> {
         conditions: Option<&Tensor>,
         state: &LstmState,
     ) -> Result<Tensor, NnError> {
+        let Self { cell, output, residual } = *self;
         let projection = match conditions {
-            Some(conditions) => input_projection(self.cell, conditions, first.dim(1)?)?,
-            None => self.cell.bias.clone(),
+            Some(conditions) => input_projection(cell, conditions, first.dim(1)?)?,
+            None => cell.bias.clone(),
         };
-        let features = decode_autoregressive(self, steps, &projection, first, state)?;
+        let start = Tensor::cat(&[&state.h, &state.c, first], 1)?;
+        // The first rows belong to the features.
+        let w_x = cell.w_x.narrow(0, 0, first.dim(1)?)?;
+        let feedback = FeedbackLoop {
+            w_x: w_x.detach(),
+            weight: output.weight.detach(),
+            bias: output.bias.to_vec1()?,
+            residual,
+        };
+        let mut weights = cell.recurrent_weights();
+        weights.extend([w_x, output.weight.clone(), output.bias.clone()]);
+        let features = Recurrence::new(cell, Some(feedback), steps)?.apply(&projection, &start, &weights)?;
         Ok(features.transpose(0, 1)?.contiguous()?)
     }
 }

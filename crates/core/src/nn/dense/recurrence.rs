@@ -4,151 +4,97 @@
 mod backward;
 mod steps;
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 
-use self::steps::{FeedbackLoop, Recurrence};
-use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
-use crate::nn::tensors::{add_columns, matrix, slice, with_values};
-
-/// Runs the cell over a sequence whose input `projection` `W_x x + b` `[T, B, 4H]` is already computed. Returns every h
-/// `[T, B, H]` and the last c `[B, H]`.
-pub(super) fn forward_sequence(
-    cell: &PeepholeCell,
-    projection: &Tensor,
-    state: &LstmState,
-) -> Result<(Tensor, Tensor)> {
-    let steps = projection.dim(0)?;
-    let start = Tensor::cat(&[&state.h, &state.c], 1)?;
-    let all =
-        Recurrence::new(cell, None, steps)?.apply(&projection.flatten(0, 1)?, &start, &cell.recurrent_weights())?;
-    Ok((all.narrow(0, 0, steps)?, all.get(steps)?))
-}
-
-/// Runs a decoder on its own output. Returns features `[T, B, F]`. The first F rows of the cell's `w_x` belong to the
-/// features; `projection` is the contribution of all other inputs and the bias, `[T, B, 4H]`, or `[4H]` if it is the same in
-/// every step.
-pub(super) fn decode_autoregressive(
-    decoder: &Decoder,
-    steps: usize,
-    projection: &Tensor,
-    first: &Tensor,
-    state: &LstmState,
-) -> Result<Tensor> {
-    let Decoder { cell, output, residual } = *decoder;
-    let w_x = cell.w_x.narrow(0, 0, first.dim(1)?)?;
-    let feedback = FeedbackLoop {
-        w_x: w_x.detach(),
-        weight: output.weight.detach(),
-        bias: output.bias.to_vec1()?,
-        residual,
-    };
-    let start = Tensor::cat(&[&state.h, &state.c, first], 1)?;
-    let projection = if projection.rank() == 1 {
-        projection.clone()
-    } else {
-        projection.flatten(0, 1)?
-    };
-    let mut weights = cell.recurrent_weights();
-    weights.extend([w_x, output.weight.clone(), output.bias.clone()]);
-    Recurrence::new(cell, Some(feedback), steps)?.apply(&projection, &start, &weights)
-}
+pub(super) use self::steps::{FeedbackLoop, Recurrence};
+use super::lstm_cell::PeepholeCell;
+use crate::nn::fused::{self, FusedOperation, Operand};
+use crate::nn::tensors::add_columns;
 
 impl PeepholeCell {
     /// The weights whose gradients the operation computes, in its order.
-    fn recurrent_weights(&self) -> Vec<Tensor> {
-        let mut weights = vec![self.w_h.clone()];
-        weights.extend(self.peepholes.iter().cloned());
-        weights
+    pub(super) fn recurrent_weights(&self) -> Vec<Tensor> {
+        let peepholes = self.peepholes.iter();
+        std::iter::once(&self.w_h).chain(peepholes).cloned().collect()
     }
 }
 
 impl Recurrence {
-    fn new(cell: &PeepholeCell, feedback: Option<FeedbackLoop>, steps: usize) -> Result<Self> {
+    pub(super) fn new(cell: &PeepholeCell, feedback: Option<FeedbackLoop>, steps: usize) -> Result<Self> {
         let [i, f, o] = &cell.peepholes;
-        let values = |tensor: &Tensor| tensor.to_vec1::<f32>();
         Ok(Self {
             steps,
             hidden: cell.hidden(),
             w_h: cell.w_h.detach(),
-            peepholes: [values(i)?, values(f)?, values(o)?],
+            peepholes: [i.to_vec1()?, f.to_vec1()?, o.to_vec1()?],
             feedback,
-            trace: Mutex::new(None),
+            trace: OnceLock::new(),
         })
     }
 
-    /// Applies the operation. `weights` are an argument only to receive their gradients. They are joined in one vector,
-    /// because an operation takes three arguments, and left out if no gradients are needed.
-    fn apply(self, projection: &Tensor, start: &Tensor, weights: &[Tensor]) -> Result<Tensor> {
-        let (projection, start) = (projection.contiguous()?, start.contiguous()?);
-        if !weights.iter().chain([&projection, &start]).any(Tensor::track_op) {
-            return projection.apply_op3_no_bwd(&start, &start, &self);
+    /// Applies the operation to the contribution of the inputs and the bias, `projection` `[T · B, 4H]`, or `[4H]` if it is
+    /// the same in every step, and to `start` `[B, H + H + F]`. Gives the features `[T, B, F]` with feedback, else every h
+    /// and the last c `[T + 1, B, H]`.
+    ///
+    /// `weights` are an argument only to receive their gradients. They are joined in one vector, because an operation takes
+    /// three arguments, and left out if no gradients are needed.
+    pub(super) fn apply(self, projection: &Tensor, start: &Tensor, weights: &[Tensor]) -> Result<Tensor> {
+        if !weights.iter().chain([projection, start]).any(Tensor::track_op) {
+            return fused::apply(self, [projection, start, start]);
         }
         let flat = weights.iter().map(Tensor::flatten_all).collect::<Result<Vec<_>>>()?;
-        projection.apply_op3(&start, &Tensor::cat(&flat, 0)?, self)
+        fused::apply(self, [projection, start, &Tensor::cat(&flat, 0)?])
     }
 }
 
-impl CustomOp3 for Recurrence {
-    fn name(&self) -> &'static str {
-        "recurrence"
-    }
+impl FusedOperation<3> for Recurrence {
+    const NAME: &'static str = "recurrence";
 
-    fn cpu_fwd(
-        &self,
-        projection: &CpuStorage,
-        projection_layout: &Layout,
-        start: &CpuStorage,
-        start_layout: &Layout,
-        _weights: &CpuStorage,
-        _weights_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (projection, start) = (slice(projection, projection_layout)?, slice(start, start_layout)?);
-        let trace = self.run(projection, start)?;
-        let batch = start_layout.dims()[0];
-        let result = if self.feedback.is_some() {
-            let features = self.features();
-            (
-                trace.features[batch * features..].to_vec(),
-                (self.steps, batch, features),
-            )
+    fn forward(&self, [projection, start, _weights]: [Operand; 3]) -> Result<(Vec<f32>, Shape)> {
+        let trace = self.run(projection.values, start.values)?;
+        let (steps, hidden, features) = (self.steps, self.hidden, self.features());
+        let batch = start.dims()[0];
+        let (values, shape) = if self.feedback.is_some() {
+            let features_after = trace.features[batch * features..].to_vec();
+            (features_after, (steps, batch, features))
         } else {
-            let mut values = trace.h[batch * self.hidden..].to_vec();
-            values.extend_from_slice(&trace.c[self.steps * batch * self.hidden..]);
-            (values, (self.steps + 1, batch, self.hidden))
+            let mut values = trace.h[batch * hidden..].to_vec();
+            values.extend_from_slice(&trace.c[steps * batch * hidden..]);
+            (values, (steps + 1, batch, hidden))
         };
-        *self.trace.lock().unwrap_or_else(PoisonError::into_inner) = Some(trace);
-        Ok((CpuStorage::F32(result.0), Shape::from(result.1)))
+        if self.trace.set(trace).is_err() {
+            bail!("a recurrence that runs twice is a bug");
+        }
+        Ok((values, Shape::from(shape)))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        projection: &Tensor,
-        start: &Tensor,
-        _weights: &Tensor,
-        _result: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let trace = self.trace.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(trace) = trace.as_ref() else {
+        [projection, ..]: [Operand; 3],
+        _output: Operand,
+        gradient: Operand,
+    ) -> Result<[Option<Vec<f32>>; 3]> {
+        let Some(trace) = self.trace.get() else {
             bail!("the recurrence has no forward pass to differentiate; this is a bug");
         };
-        let gradients = with_values(gradient, |gradient| self.backward(trace, gradient))??;
-        let hidden = self.hidden;
-        let sums = matrix(gradients.sums.clone(), 4 * hidden)?;
-        let weights = self.weight_gradients(trace, &gradients, &sums)?;
-        let projection = if projection.rank() == 1 {
+        let gradients = self.propagate(trace, gradient.values)?;
+        let weights = self.weight_gradients(trace, &gradients)?;
+        let (hidden, features) = (self.hidden, self.features());
+        let mut start = Vec::new();
+        for row in 0..gradients.h.len() / hidden {
+            start.extend_from_slice(&gradients.h[row * hidden..(row + 1) * hidden]);
+            start.extend_from_slice(&gradients.c[row * hidden..(row + 1) * hidden]);
+            start.extend_from_slice(&gradients.first[row * features..(row + 1) * features]);
+        }
+        let sums = if projection.dims().len() == 1 {
             let mut columns = vec![0.0; 4 * hidden];
             add_columns(&mut columns, &gradients.sums);
-            Tensor::from_vec(columns, 4 * hidden, projection.device())?
+            columns
         } else {
-            sums
+            gradients.sums
         };
-        let mut parts = vec![matrix(gradients.h, hidden)?, matrix(gradients.c, hidden)?];
-        if self.feedback.is_some() {
-            parts.push(matrix(gradients.first, start.dim(1)? - 2 * hidden)?);
-        }
-        Ok((Some(projection), Some(Tensor::cat(&parts, 1)?), Some(weights)))
+        Ok([sums, start, weights].map(Some))
     }
 }

@@ -9,40 +9,43 @@ use crate::nn::error::NnError;
 use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::spec::ModelSpec;
 
-/// Frames `[N, steps, P]` of N rollouts: the windows' frames, the window of each rollout, and its conditioning with `steps`
-/// actions. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
-pub(in crate::nn) fn predict_beyond_horizon(
-    flow: &FlowNetwork,
-    spec: &ModelSpec,
-    (frames, windows, conditioning): (&Tensor, &[u32], &ConditioningTensors),
-    steps: usize,
-) -> Result<Tensor, NnError> {
-    let count = windows.len();
-    let asked = ModelSpec {
-        horizon: steps,
-        ..spec.clone()
-    };
-    let ConditioningValues { actions, mut states } = conditioning.values(&asked, count)?;
-    let mut context = frames.index_select(&Tensor::new(windows, frames.device())?, 0)?;
-    let each: Vec<u32> = (0..count as u32).collect();
-    let (mut parts, mut done) = (Vec::new(), 0);
-    while done < steps {
-        let taken = spec.horizon.min(steps - done);
-        let part = actions_from(&actions, count, steps, done, spec);
-        let conditioning = ConditioningTensors {
-            actions: given(&part, &[count, spec.horizon, spec.actions.len()])?,
-            state: given(&states, &[count, spec.states.len()])?,
+impl FlowNetwork {
+    /// As [`FlowNetwork::predict`], but any number of frames; the conditioning has as many actions. Gives the frames
+    /// `[N, steps, P]`. Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
+    pub(in crate::nn) fn predict_beyond_horizon(
+        &self,
+        frames: &Tensor,
+        windows: &[u32],
+        conditioning: &ConditioningTensors,
+        steps: usize,
+    ) -> Result<Tensor, NnError> {
+        let (spec, count) = (&self.spec, windows.len());
+        let asked = ModelSpec {
+            horizon: steps,
+            ..spec.clone()
         };
-        let predicted = flow.predict(spec, &context, &each, &conditioning)?;
-        parts.push(predicted.frames.narrow(1, 0, taken)?);
-        done += taken;
-        if done < steps {
-            let seen = Tensor::cat(&[&context, &predicted.frames.clamp(0f32, 1f32)?], 1)?;
-            context = seen.narrow(1, spec.horizon, spec.context)?.contiguous()?;
-            advance(spec, &mut states, &part, &predicted.motion)?;
+        let ConditioningValues { actions, mut states } = conditioning.values(&asked, count)?;
+        let mut context = frames.index_select(&Tensor::new(windows, frames.device())?, 0)?;
+        let each: Vec<u32> = (0..count as u32).collect();
+        let (mut parts, mut done) = (Vec::new(), 0);
+        while done < steps {
+            let taken = spec.horizon.min(steps - done);
+            let part = actions_from(&actions, count, steps, done, spec);
+            let conditioning = ConditioningTensors {
+                actions: given(&part, &[count, spec.horizon, spec.actions.len()])?,
+                state: given(&states, &[count, spec.states.len()])?,
+            };
+            let predicted = self.predict(&context, &each, &conditioning, spec.horizon)?;
+            parts.push(predicted.frames.narrow(1, 0, taken)?);
+            done += taken;
+            if done < steps {
+                let seen = Tensor::cat(&[&context, &predicted.frames.clamp(0f32, 1f32)?], 1)?;
+                context = seen.narrow(1, spec.horizon, spec.context)?.contiguous()?;
+                advance(spec, &mut states, &part, &predicted.motion)?;
+            }
         }
+        Ok(Tensor::cat(&parts, 1)?)
     }
-    Ok(Tensor::cat(&parts, 1)?)
 }
 
 /// The values as a tensor, if there are any.

@@ -1,8 +1,8 @@
 //! Frames cut into blocks of 2×2 pixels, and back.
 
-use candle_core::Tensor;
+use candle_core::{Device, Result, Tensor};
 
-use crate::nn::error::NnError;
+use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::ops::sampling::ImageSize;
 
@@ -30,7 +30,7 @@ pub(super) fn write_blocks(frame: &[f32], size: ImageSize, places: &[f32], out: 
 
 /// The last frames `[contexts, P]` sampled at the items' places `[M, P, 2]`: per 2×2 block its four pixels and the share
 /// that lies inside the frame, `[M, H/2, W/2, 5]`.
-pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], size: ImageSize) -> Vec<f32> {
+pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], size: ImageSize) -> Result<Tensor> {
     let (half, pixels) = (size.shrunk(2), size.pixels());
     let mut out = vec![0.0; frame_of.len() * half.pixels() * MOVED_CHANNELS];
     let items = out
@@ -49,11 +49,19 @@ pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], s
             }
         }
     }
-    out
+    Tensor::from_vec(
+        out,
+        (frame_of.len(), half.height, half.width, MOVED_CHANNELS),
+        &Device::Cpu,
+    )
 }
 
-/// 2×2 blocks of pixels `[M, H/2, W/2, 4]` as frames `[M, P]`.
-pub(super) fn fold_pixels(blocks: &Tensor) -> Result<Tensor, NnError> {
-    let frames = pixel_shuffle(blocks)?;
-    Ok(frames.flatten_from(1)?)
+/// Of a scene `[M, H/2, W/2, SCENE_CHANNELS]` the content: 2×2 blocks of pixels `[M, H/2, W/2, 4]`.
+pub(super) fn content_blocks(scene: &Tensor) -> Result<Tensor> {
+    scene.narrow(3, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)
+}
+
+/// Of a scene the content as frames `[M, P]`.
+pub(super) fn content_frames(scene: &Tensor) -> Result<Tensor> {
+    pixel_shuffle(&content_blocks(scene)?)?.flatten_from(1)
 }

@@ -8,7 +8,8 @@ use crate::nn::ops::sampling::own_places;
 use crate::nn::spec::ModelSpec;
 
 /// The contexts that are encoded, each once.
-pub(super) struct EncoderViews {
+pub(super) struct EncoderViews<'a> {
+    pub(super) spec: &'a ModelSpec,
     /// The context of each rollout.
     pub(super) row_of: Vec<u32>,
     /// How many frames are read of each.
@@ -23,7 +24,7 @@ pub(super) struct EncoderViews {
     pub(super) poses: Vec<CameraPose>,
 }
 
-impl EncoderViews {
+impl EncoderViews<'_> {
     /// Number of contexts.
     pub(super) fn count(&self) -> usize {
         self.poses.len()
@@ -37,22 +38,22 @@ impl EncoderViews {
     /// The encoder's inputs `[contexts, H/2, W/2, channels]`: blocks of the last frames, the earlier ones turned into the
     /// last one's view by the measured yaw rate, and of what the scene looks like without what moves (`seen`,
     /// `[contexts, H/2, W/2, 4]`).
-    pub(super) fn inputs(&self, spec: &ModelSpec, camera: Option<CameraModel>, seen: &[f32]) -> Vec<f32> {
-        let size = spec.image_size();
+    pub(super) fn inputs(&self, camera: Option<CameraModel>, seen: &[f32]) -> Vec<f32> {
+        let size = self.spec.image_size();
         let (half, pixels) = (size.shrunk(2), size.pixels());
         let own = own_places(size);
         let (frames_read, channels) = (self.frames_read, Self::channels(self.frames_read));
         let mut inputs = vec![0.0; self.count() * half.pixels() * channels];
         for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * channels).enumerate() {
-            let turns = StateChannels::of(spec).yaw_rate_in(&self.states[index]).zip(camera);
+            let yaw_rate = StateChannels::of(self.spec).yaw_rate_in(&self.states[index]);
             write_blocks(&self.last_frames[index * pixels..], size, &own, inputs, 0);
             for back in 1..frames_read {
                 let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..];
-                let places = turns.map(|(rate, camera)| {
-                    let viewer = Viewer::new(camera, size);
-                    viewer.turned(&viewer.rays(), rate * spec.frame_period_s as f32 * back as f32)
+                let turned = yaw_rate.zip(camera).map(|(rate, camera)| {
+                    let yaw = rate * self.spec.frame_period_s as f32 * back as f32;
+                    Viewer::new(camera, size).turned(&[yaw])
                 });
-                write_blocks(frame, size, places.as_ref().unwrap_or(&own), inputs, 4 * back);
+                write_blocks(frame, size, turned.as_ref().unwrap_or(&own), inputs, 4 * back);
             }
             let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];
             for (place, (out, seen)) in inputs.chunks_exact_mut(channels).zip(seen.chunks_exact(4)).enumerate() {

@@ -9,7 +9,6 @@ use super::scene::SceneKind;
 use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::convolution::TAPS;
-use crate::nn::ops::sampling::ImageSize;
 use crate::nn::spec::{FlowLayers, FlowSpec, ModelSpec};
 
 /// Channels of a frame on the grid of a quarter of the sides: a 4×4 block.
@@ -35,11 +34,12 @@ pub(in crate::nn) fn tensor_shapes(spec: &ModelSpec, flow: &FlowSpec) -> BTreeMa
     if StateChannels::of(spec).commands_speeds() {
         shapes.insert(WHEELS.to_owned(), vec![2]);
     }
-    let ImageSize { height, width } = spec.image_size().shrunk(2);
-    match SceneKind::of(spec, flow.camera) {
-        SceneKind::Room(..) => shapes.insert("flow.scene.room".to_owned(), vec![6]),
-        _ => shapes.insert("flow.scene.image".to_owned(), vec![height * width, SCENE_CHANNELS]),
+    let scene = SceneKind::of(spec, flow.camera);
+    let shape = match scene {
+        SceneKind::Room(..) => vec![6],
+        _ => vec![spec.image_size().shrunk(2).pixels(), SCENE_CHANNELS],
     };
+    shapes.insert(scene.tensor_name().to_owned(), shape);
     shapes
 }
 

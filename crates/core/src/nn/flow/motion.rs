@@ -8,10 +8,11 @@ use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
 use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::geometry::wheel_dynamics;
-use crate::nn::ops::linear::{Activation, Linear};
-use crate::nn::ops::modulation::silu;
+use crate::nn::model_tensors::ModelTensors;
+use crate::nn::ops::linear::Linear;
+use crate::nn::ops::modulation::perceptron;
+use crate::nn::ops::sampling::ImageSize;
 use crate::nn::spec::{FlowSpec, ModelSpec};
-use crate::nn::tensor_source::TensorSource;
 
 /// Hidden units of the correction.
 pub(super) const MOTION_HIDDEN: usize = 64;
@@ -32,19 +33,14 @@ pub(super) struct MotionHead {
 }
 
 impl MotionHead {
-    pub(super) fn new(spec: &ModelSpec, sizes: &FlowSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
-        let linear = |name: &str| tensors.linear(name, Activation::None);
+    pub(super) fn new(spec: &ModelSpec, sizes: &FlowSpec, tensors: &ModelTensors) -> Self {
         let is_moving = spec.action_inputs().is_some();
-        let layers = || Ok::<_, NnError>([linear("flow.motion.inputs")?, linear("flow.motion.output")?]);
-        Ok(Self {
-            layers: is_moving.then(layers).transpose()?,
-            wheels: (StateChannels::of(spec).commands_speeds())
-                .then(|| tensors.tensor(WHEELS))
-                .transpose()?,
-            affine: (is_moving && sizes.camera.is_none())
-                .then(|| linear("flow.affine"))
-                .transpose()?,
-        })
+        let layers = || ["flow.motion.inputs", "flow.motion.output"].map(|name| tensors.linear(name));
+        Self {
+            layers: is_moving.then(layers),
+            wheels: (StateChannels::of(spec).commands_speeds()).then(|| tensors.tensor(WHEELS)),
+            affine: (is_moving && sizes.camera.is_none()).then(|| tensors.linear("flow.affine")),
+        }
     }
 
     /// Whether anything says how the camera moves.
@@ -53,21 +49,22 @@ impl MotionHead {
     }
 
     /// Yaw, ahead and left since the last frame `[N, horizon, 3]`; zero for a standing camera.
-    pub(super) fn forward(&self, spec: &ModelSpec, rows: &RolloutRows) -> Result<Tensor, NnError> {
+    pub(super) fn forward(&self, rows: &RolloutRows) -> Result<Tensor, NnError> {
+        let spec = rows.spec;
         let shape = (rows.count(), spec.horizon, 3);
-        let Some([inputs, output]) = &self.layers else {
+        let Some(layers) = &self.layers else {
             return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
         let channels = StateChannels::of(spec);
         let speeds = (0..rows.count())
-            .map(|row| channels.speeds(rows.state(row), rows.actions(row), rows.action_count()))
+            .map(|row| channels.speeds(rows.state(row), rows.actions(row), spec.actions.len()))
             .collect();
         let wheels = match &self.wheels {
             Some(wheels) => wheels.clone(),
             None => Tensor::zeros(2, DType::F32, &Device::Cpu)?,
         };
         let plain = wheel_dynamics::integral(&wheels, speeds, spec.frame_period_s)?;
-        let correction = output.forward(&silu(&inputs.forward(&rows.scaled(spec)?)?)?)?;
+        let correction = perceptron(layers, &rows.scaled()?)?;
         Ok((plain + (correction.reshape(shape)? * CORRECTION)?)?)
     }
 
@@ -75,21 +72,18 @@ impl MotionHead {
     /// pixel's place `[1, P, 2]`.
     pub(super) fn affine_places(
         &self,
-        spec: &ModelSpec,
+        size: ImageSize,
         motion: &Tensor,
         own: &Tensor,
     ) -> Result<Option<Tensor>, NnError> {
         let Some(affine) = &self.affine else {
             return Ok(None);
         };
-        let size = spec.image_size();
         let (items, pixels) = (motion.dim(0)?, size.pixels());
         let sides = Tensor::new(&[size.width as f32, size.height as f32], &Device::Cpu)?;
         let from_middle = (own.broadcast_div(&sides)? * 2.0)?.affine(1.0, -1.0)?;
-        let basis = Tensor::cat(
-            &[&from_middle, &Tensor::ones((1, pixels, 1), DType::F32, &Device::Cpu)?],
-            2,
-        )?;
+        let ones = Tensor::ones((1, pixels, 1), DType::F32, &Device::Cpu)?;
+        let basis = Tensor::cat(&[&from_middle, &ones], 2)?;
         let map = (affine.forward(motion)? * AFFINE)?.reshape((items, 3, 2))?;
         let basis = basis.broadcast_as((items, pixels, 3))?.contiguous()?;
         let moved = basis.matmul(&map)?.broadcast_mul(&sides)?;

@@ -9,13 +9,12 @@ use super::motion::MotionHead;
 use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use crate::nn::error::NnError;
+use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::convolution::{ConvShape, Convolution3};
-use crate::nn::ops::linear::{Activation, Linear};
-use crate::nn::ops::modulation::{modulated_silu, silu};
+use crate::nn::ops::linear::Linear;
+use crate::nn::ops::modulation::{modulated_silu, perceptron, silu};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
-use crate::nn::ops::sampling::ImageSize;
 use crate::nn::spec::{FlowSpec, ModelSpec};
-use crate::nn::tensor_source::TensorSource;
 
 /// What the network gives for a batch.
 #[derive(Clone, Debug)]
@@ -31,6 +30,7 @@ pub struct FlowPrediction {
 /// The network. Holds weights only.
 #[derive(Clone, Debug)]
 pub(in crate::nn) struct FlowNetwork {
+    pub(super) spec: ModelSpec,
     pub(super) sizes: FlowSpec,
     stem: Convolution3,
     halving: Convolution3,
@@ -46,43 +46,40 @@ pub(in crate::nn) struct FlowNetwork {
 }
 
 impl FlowNetwork {
-    /// The network of these tensors. Errors: `TensorMissing`, `TensorShape`.
-    pub(in crate::nn) fn new(spec: &ModelSpec, sizes: FlowSpec, tensors: &dyn TensorSource) -> Result<Self, NnError> {
+    /// The network of these tensors.
+    pub(in crate::nn) fn new(spec: ModelSpec, sizes: FlowSpec, tensors: &ModelTensors) -> Self {
         let layers = &sizes.layers;
-        let linear = |name: &str| tensors.linear(name, Activation::None);
-        let blocks = (0..layers.encoder_blocks).map(|index| {
-            let convolution = |part, shape| tensors.convolution(&format!("flow.encoder.{index}.{part}"), shape);
-            Ok([
-                convolution("first", ConvShape::dilated(1 << (index % 3)))?,
-                convolution("second", ConvShape::PLAIN)?,
-            ])
-        });
-        let refine = (0..layers.decoder_blocks).map(|index| {
-            let convolution = |part, shape| tensors.convolution(&format!("flow.decoder.{index}.{part}"), shape);
-            Ok([
-                convolution("first", ConvShape::PLAIN)?,
-                convolution("second", ConvShape::PLAIN)?,
-            ])
-        });
-        Ok(Self {
+        let convolution = |name: &str, shape| tensors.convolution(&format!("flow.{name}"), shape);
+        let block = |name: String, first| {
+            [
+                convolution(&format!("{name}.first"), first),
+                convolution(&format!("{name}.second"), ConvShape::PLAIN),
+            ]
+        };
+        Self {
             sizes,
-            stem: tensors.convolution("flow.stem", ConvShape::PLAIN)?,
-            halving: tensors.convolution("flow.halving", ConvShape::HALVING)?,
-            blocks: blocks.collect::<Result<_, NnError>>()?,
-            scene: Scene::new(spec, sizes.camera, tensors)?,
-            motion: MotionHead::new(spec, &sizes, tensors)?,
-            modulation: [linear("flow.modulation.inputs")?, linear("flow.modulation.output")?],
-            mix: linear(&format!("flow.{}", mix_name(layers)))?,
-            refine: refine.collect::<Result<_, NnError>>()?,
-            enlarge: linear("flow.enlarge")?,
-            fine: tensors.convolution("flow.fine", ConvShape::PLAIN)?,
-            head: tensors.convolution("flow.head", ConvShape::PLAIN)?,
-        })
+            stem: convolution("stem", ConvShape::PLAIN),
+            halving: convolution("halving", ConvShape::HALVING),
+            blocks: (0..layers.encoder_blocks)
+                .map(|index| block(format!("encoder.{index}"), ConvShape::dilated(1 << (index % 3))))
+                .collect(),
+            scene: Scene::new(&spec, sizes.camera, tensors),
+            motion: MotionHead::new(&spec, &sizes, tensors),
+            modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),
+            mix: tensors.linear(&format!("flow.{}", mix_name(layers))),
+            refine: (0..layers.decoder_blocks)
+                .map(|index| block(format!("decoder.{index}"), ConvShape::PLAIN))
+                .collect(),
+            enlarge: tensors.linear("flow.enlarge"),
+            fine: convolution("fine", ConvShape::PLAIN),
+            head: convolution("head", ConvShape::PLAIN),
+            spec,
+        }
     }
 
     /// Whether gradients go to the weights.
     pub(super) fn is_trained(&self) -> bool {
-        self.stem.is_trained()
+        self.stem.weight.track_op()
     }
 
     /// The states `[M, H/4, W/4, C]` after the decoder's modulated blocks.
@@ -98,23 +95,17 @@ impl FlowNetwork {
     }
 
     /// The head's values of each item `[M, H/2, W/2, 4 · HEAD_VALUES]` from its state, the pixels to move and the scene.
-    pub(super) fn head(
-        &self,
-        state: &Tensor,
-        moved: &Tensor,
-        scene: &Tensor,
-        quarter: ImageSize,
-    ) -> Result<Tensor, NnError> {
-        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(state)?, quarter)?)?;
+    pub(super) fn head(&self, state: &Tensor, moved: &Tensor, scene: &Tensor) -> Result<Tensor, NnError> {
+        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(state)?)?)?;
         let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
         Ok(self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?)
     }
 
     /// Features of each context `[contexts, H/4, W/4, C]`.
-    pub(super) fn encode(&self, spec: &ModelSpec, contexts: &EncoderViews) -> Result<Tensor, NnError> {
-        let half = spec.image_size().shrunk(2);
-        let seen = self.scene.content_now(spec, contexts)?;
-        let inputs = contexts.inputs(spec, self.sizes.camera, &seen);
+    pub(super) fn encode(&self, contexts: &EncoderViews) -> Result<Tensor, NnError> {
+        let half = self.spec.image_size().shrunk(2);
+        let seen = self.scene.content_now(contexts)?;
+        let inputs = contexts.inputs(self.sizes.camera, &seen);
         let inputs = Tensor::from_vec(inputs, (contexts.count(), half.height, half.width, ()), &Device::Cpu)?;
         let mut coarse = self.halving.forward(&silu(&self.stem.forward(&inputs)?)?)?;
         for [first, second] in &self.blocks {
@@ -125,23 +116,17 @@ impl FlowNetwork {
     }
 
     /// Scales and shifts of each item's modulated layers `[M, …]`.
-    pub(super) fn modulate(&self, spec: &ModelSpec, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
-        let known = rows.step_inputs(spec)?;
-        let motion = motion.flatten(0, 1)?;
-        let inputs = if self.motion.is_moving() {
-            Tensor::cat(&[&known, &motion], 1)?
-        } else {
-            known
-        };
-        let [inputs_layer, output_layer] = &self.modulation;
-        Ok(output_layer.forward(&silu(&inputs_layer.forward(&inputs)?)?)?)
+    pub(super) fn modulate(&self, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
+        let mut inputs = rows.step_inputs()?;
+        if self.motion.is_moving() {
+            inputs = Tensor::cat(&[&inputs, &motion.flatten(0, 1)?], 1)?;
+        }
+        Ok(perceptron(&self.modulation, &inputs)?)
     }
 
     /// A linear layer at each place of `[M, h, w, …]`.
-    pub(super) fn per_place(layer: &Linear, x: &Tensor, size: ImageSize) -> Result<Tensor, NnError> {
-        let (items, _, _, channels) = x.dims4()?;
-        let flat = layer.forward(&x.reshape((items * size.pixels(), channels))?)?;
-        let outputs = flat.dim(1)?;
-        Ok(flat.reshape((items, size.height, size.width, outputs))?)
+    pub(super) fn per_place(layer: &Linear, x: &Tensor) -> Result<Tensor, NnError> {
+        let (items, height, width, _) = x.dims4()?;
+        Ok(layer.forward(&x.flatten(0, 2)?)?.reshape((items, height, width, ()))?)
     }
 }

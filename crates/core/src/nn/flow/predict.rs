@@ -6,40 +6,28 @@ use super::network::{FlowNetwork, FlowPrediction};
 use super::rollout_rows::RolloutRows;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
-use crate::nn::spec::ModelSpec;
 
 /// Rollouts that are computed together without gradients, so that many take no more memory than few.
 const ROLLOUTS_AT_ONCE: usize = 16;
 
 impl FlowNetwork {
-    /// N rollouts of B windows of frames `[B, context, P]`: rollout n follows window `windows[n]` under row n of the
-    /// conditioning. Errors: `Shape`, `Missing`.
+    /// N rollouts of B windows of frames `[B, context, P]`, with the frames of the first `steps` only: rollout n follows
+    /// window `windows[n]` under row n of the conditioning. Errors: `Shape`, `Missing`.
     pub(in crate::nn) fn predict(
         &self,
-        spec: &ModelSpec,
         frames: &Tensor,
         windows: &[u32],
         conditioning: &ConditioningTensors,
-    ) -> Result<FlowPrediction, NnError> {
-        self.predict_first(spec, (frames, windows), conditioning, spec.horizon)
-    }
-
-    /// As [`FlowNetwork::predict`], with the frames of the first `steps` only.
-    pub(in crate::nn) fn predict_first(
-        &self,
-        spec: &ModelSpec,
-        (frames, windows): (&Tensor, &[u32]),
-        conditioning: &ConditioningTensors,
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {
-        let rows = RolloutRows::new(spec, frames, windows, conditioning)?;
+        let rows = RolloutRows::new(&self.spec, frames, windows, conditioning)?;
         if rows.count() <= ROLLOUTS_AT_ONCE || self.is_trained() {
-            return self.predict_rows(spec, &rows, steps);
+            return self.predict_rows(&rows, steps);
         }
         let (mut frames, mut scene, mut motion) = (Vec::new(), Vec::new(), Vec::new());
         for first in (0..rows.count()).step_by(ROLLOUTS_AT_ONCE) {
             let part = rows.part(first..rows.count().min(first + ROLLOUTS_AT_ONCE));
-            let part = self.predict_rows(spec, &part, steps)?;
+            let part = self.predict_rows(&part, steps)?;
             frames.push(part.frames);
             scene.push(part.scene);
             motion.push(part.motion);
@@ -51,11 +39,11 @@ impl FlowNetwork {
         })
     }
 
-    fn predict_rows(&self, spec: &ModelSpec, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    fn predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         if self.sizes.layers.recurrent {
-            self.predict_recurrently(spec, rows, steps)
+            self.predict_recurrently(rows, steps)
         } else {
-            self.predict_directly(spec, rows, steps)
+            self.predict_directly(rows, steps)
         }
     }
 }

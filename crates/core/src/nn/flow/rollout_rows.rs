@@ -14,7 +14,8 @@ use crate::nn::spec::ModelSpec;
 use crate::nn::tensors::with_values;
 
 /// The rollouts to predict: windows, actions and states in their own units.
-pub(super) struct RolloutRows {
+pub(super) struct RolloutRows<'a> {
+    pub(super) spec: &'a ModelSpec,
     /// Frames of all windows `[B, context, P]`.
     frames: Arc<Vec<f32>>,
     /// The window of each rollout.
@@ -23,14 +24,12 @@ pub(super) struct RolloutRows {
     actions: Vec<f32>,
     /// `[N, S]`; empty without state.
     states: Vec<f32>,
-    action_count: usize,
-    state_count: usize,
 }
 
-impl RolloutRows {
+impl<'a> RolloutRows<'a> {
     /// Errors: `Shape`, `Missing` where the conditioning does not fit; `Tensor` if a window does not exist.
     pub(super) fn new(
-        spec: &ModelSpec,
+        spec: &'a ModelSpec,
         frames: &Tensor,
         windows: &[u32],
         conditioning: &ConditioningTensors,
@@ -41,12 +40,11 @@ impl RolloutRows {
         }
         let ConditioningValues { actions, states } = conditioning.values(spec, windows.len())?;
         Ok(Self {
+            spec,
             frames: Arc::new(with_values(frames, <[f32]>::to_vec)?),
             windows: windows.to_vec(),
             actions,
             states,
-            action_count: spec.action_inputs().unwrap_or(0),
-            state_count: spec.state_inputs().unwrap_or(0),
         })
     }
 
@@ -57,125 +55,99 @@ impl RolloutRows {
 
     /// Some of the rollouts.
     pub(super) fn part(&self, range: Range<usize>) -> Self {
-        let all = self.count();
-        let cut = |values: &[f32]| {
-            let each = values.len() / all;
-            values[range.start * each..range.end * each].to_vec()
-        };
         Self {
+            spec: self.spec,
             frames: Arc::clone(&self.frames),
             windows: self.windows[range.clone()].to_vec(),
-            actions: cut(&self.actions),
-            states: cut(&self.states),
-            ..*self
+            actions: self.of_rows(&self.actions, range.clone()).to_vec(),
+            states: self.of_rows(&self.states, range).to_vec(),
         }
+    }
+
+    fn of_rows<'v>(&self, values: &'v [f32], range: Range<usize>) -> &'v [f32] {
+        let each = values.len() / self.count();
+        &values[range.start * each..range.end * each]
     }
 
     /// The state of a rollout, empty where the model takes none.
     pub(super) fn state(&self, row: usize) -> &[f32] {
-        &self.states[row * self.state_count..(row + 1) * self.state_count]
+        self.of_rows(&self.states, row..row + 1)
     }
 
     /// The actions of a rollout, step after step; empty where the model takes none.
     pub(super) fn actions(&self, row: usize) -> &[f32] {
-        let each = self.actions.len() / self.count();
-        &self.actions[row * each..(row + 1) * each]
-    }
-
-    /// Components of an action that the model takes.
-    pub(super) fn action_count(&self) -> usize {
-        self.action_count
+        self.of_rows(&self.actions, row..row + 1)
     }
 
     /// Where the state says that the camera stands at the last frame of a rollout's context.
-    pub(super) fn pose(&self, spec: &ModelSpec, row: usize) -> CameraPose {
-        StateChannels::of(spec).pose_in(self.state(row))
+    fn pose(&self, row: usize) -> CameraPose {
+        StateChannels::of(self.spec).pose_in(self.state(row))
     }
 
-    /// Where the camera will stand at each step of each rollout.
-    pub(super) fn rollout_poses(&self, spec: &ModelSpec, motions: &[[f32; 3]]) -> Vec<CameraPose> {
-        let pose = |(item, &motion): (usize, &[f32; 3])| self.pose(spec, item / spec.horizon).moved(motion);
-        motions.iter().enumerate().map(pose).collect()
+    /// Where the camera stands at the last frame of the context of each step's rollout.
+    pub(super) fn poses_before(&self) -> Vec<CameraPose> {
+        let of_steps = |row| std::iter::repeat_n(self.pose(row), self.spec.horizon);
+        (0..self.count()).flat_map(of_steps).collect()
     }
 
     /// State and all actions of each rollout, scaled, `[N, S + horizon · A]`.
-    pub(super) fn scaled(&self, spec: &ModelSpec) -> Result<Tensor, NnError> {
-        let rows: Vec<f32> = (0..self.count()).flat_map(|row| self.scaled_row(spec, row)).collect();
-        let width = self.state_count + spec.horizon * self.action_count;
-        Ok(Tensor::from_vec(rows, (self.count(), width), &Device::Cpu)?)
+    pub(super) fn scaled(&self) -> Result<Tensor, NnError> {
+        let rows: Vec<f32> = (0..self.count()).flat_map(|row| self.scaled_row(row)).collect();
+        Ok(Tensor::from_vec(rows, (self.count(), ()), &Device::Cpu)?)
     }
 
-    /// The scaled state of each rollout.
-    pub(super) fn scaled_states(&self, spec: &ModelSpec) -> Vec<Vec<f32>> {
-        (0..self.count())
-            .map(|row| spec.scaled_state(self.state(row)))
-            .collect()
-    }
-
-    fn scaled_row(&self, spec: &ModelSpec, row: usize) -> Vec<f32> {
-        let state = self.state(row).iter().zip(&spec.states);
-        let actions = self.actions(row).iter().zip(spec.actions.iter().cycle());
-        state
-            .chain(actions)
-            .map(|(value, channel)| channel.scaled(*value))
-            .collect()
+    fn scaled_row(&self, row: usize) -> Vec<f32> {
+        let mut scaled = self.spec.scaled_state(self.state(row));
+        let actions = self.actions(row).iter().zip(self.spec.actions.iter().cycle());
+        scaled.extend(actions.map(|(value, channel)| channel.scaled(*value)));
+        scaled
     }
 
     /// Per item: the scaled state, the scaled actions up to the step (zero after it) and which step it is, `[M, …]`.
-    pub(super) fn step_inputs(&self, spec: &ModelSpec) -> Result<Tensor, NnError> {
-        let horizon = spec.horizon;
-        let width = self.state_count + horizon * self.action_count + horizon;
-        let mut values = Vec::with_capacity(self.count() * horizon * width);
+    pub(super) fn step_inputs(&self) -> Result<Tensor, NnError> {
+        let horizon = self.spec.horizon;
+        let mut values = Vec::new();
         for row in 0..self.count() {
-            let scaled = self.scaled_row(spec, row);
+            let (scaled, actions) = (self.scaled_row(row), self.actions(row).len());
             for step in 0..horizon {
-                let taken = self.state_count + (step + 1) * self.action_count;
-                values.extend(
-                    scaled
-                        .iter()
-                        .enumerate()
-                        .map(|(at, value)| if at < taken { *value } else { 0.0 }),
-                );
+                let untaken = actions - (step + 1) * (actions / horizon);
+                values.extend_from_slice(&scaled[..scaled.len() - untaken]);
+                values.extend(std::iter::repeat_n(0.0, untaken));
                 values.extend((0..horizon).map(|other| f32::from(u8::from(other == step))));
             }
         }
-        Ok(Tensor::from_vec(values, (self.count() * horizon, width), &Device::Cpu)?)
+        Ok(Tensor::from_vec(values, (self.count() * horizon, ()), &Device::Cpu)?)
     }
 
     /// The contexts that the rollouts follow, with the last `frames_read` frames of each. Rollouts of one window and state
     /// share one.
-    pub(super) fn contexts(&self, spec: &ModelSpec, frames_read: usize) -> EncoderViews {
-        let size = spec.image_size();
-        let (pixels, context) = (size.pixels(), spec.context);
-        let (mut row_of, mut firsts) = (Vec::with_capacity(self.count()), Vec::<usize>::new());
-        for row in 0..self.count() {
-            let same =
-                |&first: &usize| self.windows[first] == self.windows[row] && self.state(first) == self.state(row);
-            let known = firsts.last().as_ref().is_some_and(|first| same(first));
-            if !known {
-                firsts.push(row);
-            }
-            row_of.push((firsts.len() - 1) as u32);
-        }
+    pub(super) fn contexts(&self, frames_read: usize) -> EncoderViews<'a> {
+        let (pixels, context) = (self.spec.pixels(), self.spec.context);
         let mut views = EncoderViews {
-            row_of,
+            spec: self.spec,
+            row_of: Vec::new(),
             frames_read,
-            last_frames: Vec::with_capacity(firsts.len() * pixels),
+            last_frames: Vec::new(),
             earlier: Vec::new(),
             states: Vec::new(),
             poses: Vec::new(),
         };
-        for &row in &firsts {
-            let frame = |back: usize| {
-                let place = self.windows[row] as usize * context + (context - 1).saturating_sub(back);
-                &self.frames[place * pixels..(place + 1) * pixels]
-            };
-            views.last_frames.extend_from_slice(frame(0));
-            for back in 1..frames_read {
-                views.earlier.extend_from_slice(frame(back));
+        for row in 0..self.count() {
+            let is_known =
+                row > 0 && self.windows[row] == self.windows[row - 1] && self.state(row) == self.state(row - 1);
+            if !is_known {
+                let frame = |back: usize| {
+                    let place = self.windows[row] as usize * context + (context - 1).saturating_sub(back);
+                    &self.frames[place * pixels..(place + 1) * pixels]
+                };
+                views.last_frames.extend_from_slice(frame(0));
+                for back in 1..frames_read {
+                    views.earlier.extend_from_slice(frame(back));
+                }
+                views.states.push(self.state(row).to_vec());
+                views.poses.push(self.pose(row));
             }
-            views.states.push(self.state(row).to_vec());
-            views.poses.push(self.pose(spec, row));
+            views.row_of.push(views.poses.len() as u32 - 1);
         }
         views
     }

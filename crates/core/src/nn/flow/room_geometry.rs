@@ -4,10 +4,13 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
+use std::ops::Range;
 
+use candle_core::{Result, Shape, Tensor};
+
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{CameraPose, Viewer, rotated};
-use crate::nn::tensors::{slice, with_values};
+use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
 /// Octaves of sines and cosines of each coordinate of the point met.
@@ -18,10 +21,8 @@ const WAVES: usize = 3 * 2 * OCTAVES;
 const SIDES: usize = 6;
 /// Numbers that describe one ray: waves, side met, point met, the ray itself and the distance.
 pub(super) const RAY_VALUES: usize = WAVES + SIDES + 12;
-/// How far the sides lie from the middle of the places seen in training, in units of the room, before they are learned.
-const FIRST_SIDE: f32 = 2.6;
-const FIRST_FLOOR: f32 = 0.8;
-const FIRST_CEILING: f32 = 2.0;
+/// Where the sides lie before they are learned, from the middle of the places seen in training, in units of the room.
+const FIRST_SIDES: [f32; SIDES] = [-2.6, 2.6, -2.6, 2.6, -0.8, 2.0];
 /// Units of the room that one unit of the learned parameter moves a side.
 const SIDE_GAIN: f32 = 2.0;
 /// Nearest that a side counts.
@@ -60,16 +61,8 @@ pub(super) struct RoomSides([f32; SIDES]);
 impl RoomSides {
     /// From the learned parameter's values.
     fn learned(parameter: &[f32]) -> Self {
-        let first = [
-            -FIRST_SIDE,
-            FIRST_SIDE,
-            -FIRST_SIDE,
-            FIRST_SIDE,
-            -FIRST_FLOOR,
-            FIRST_CEILING,
-        ];
         Self(std::array::from_fn(|side| {
-            first[side] + SIDE_GAIN * parameter.get(side).copied().unwrap_or(0.0)
+            FIRST_SIDES[side] + SIDE_GAIN * parameter.get(side).copied().unwrap_or(0.0)
         }))
     }
 
@@ -116,17 +109,17 @@ impl RoomViews {
         [(pose.x - x) / unit, (pose.y - y) / unit, 0.0]
     }
 
-    /// Calls `visit` with each ray in the room, views one after another.
+    /// Calls `visit` with each ray in the room, views one after another, and the range of its description.
     #[inline(always)]
-    fn visit(&self, mut visit: impl FnMut(usize, RoomRay)) {
-        let mut index = 0;
+    fn visit(&self, mut visit: impl FnMut(Range<usize>, RoomRay)) {
+        let mut from = 0;
         for &pose in &self.poses {
             let origin = self.origin(pose);
             let (sin, cos) = pose.heading.sin_cos();
             for &ray in &self.rays {
                 let direction = rotated(ray, sin, cos);
-                visit(index, RoomRay { origin, direction });
-                index += 1;
+                visit(from..from + RAY_VALUES, RoomRay { origin, direction });
+                from += RAY_VALUES;
             }
         }
     }
@@ -134,11 +127,7 @@ impl RoomViews {
     /// What each ray meets, described by [`RAY_VALUES`] numbers: `[views · rays, RAY_VALUES]`. `parameter` `[6]` moves the
     /// sides, and gradients go to it.
     pub(super) fn describe(self, parameter: &Tensor) -> Result<Tensor> {
-        if parameter.track_op() {
-            parameter.apply_op1(self)
-        } else {
-            parameter.apply_op1_no_bwd(&self)
-        }
+        apply(self, [parameter])
     }
 
     /// Where each view's pixels were seen from the pose of the same index in `before`: `[views, rays, 2]`.
@@ -195,42 +184,26 @@ fn describe(ray: RoomRay, hit: RoomHit, out: &mut [f32]) {
     rest[11] = 1.0 / (distance + 0.3);
 }
 
-impl CustomOp1 for RoomViews {
-    fn name(&self) -> &'static str {
-        "describe-rays"
-    }
+impl FusedOperation<1> for RoomViews {
+    const NAME: &'static str = "describe-rays";
 
-    fn cpu_fwd(&self, parameter: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let sides = RoomSides::learned(slice(parameter, layout)?);
+    fn forward(&self, [parameter]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let sides = RoomSides::learned(parameter.values);
         let rows = self.poses.len() * self.rays.len();
         let mut out = vec![0.0; rows * RAY_VALUES];
-        self.visit(|index, ray| {
-            describe(
-                ray,
-                sides.hit(ray),
-                &mut out[index * RAY_VALUES..(index + 1) * RAY_VALUES],
-            );
-        });
-        Ok((CpuStorage::F32(out), Shape::from((rows, RAY_VALUES))))
+        self.visit(|range, ray| describe(ray, sides.hit(ray), &mut out[range]));
+        Ok((out, Shape::from((rows, RAY_VALUES))))
     }
 
-    fn bwd(&self, parameter: &Tensor, y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let sides = RoomSides::of(parameter)?;
-        let mut sums = [0.0; SIDES];
-        with_values(y, |y| {
-            with_values(gradient, |gradient| {
-                self.visit(|index, ray| {
-                    let range = index * RAY_VALUES..(index + 1) * RAY_VALUES;
-                    let hit = sides.hit(ray);
-                    sums[hit.side] += SIDE_GAIN * side_gradient(ray, hit, &y[range.clone()], &gradient[range]);
-                });
-            })
-        })??;
-        Ok(Some(Tensor::from_vec(
-            sums.to_vec(),
-            parameter.dims(),
-            parameter.device(),
-        )?))
+    fn backward(&self, [parameter]: [Operand; 1], y: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let sides = RoomSides::learned(parameter.values);
+        let mut sums = vec![0.0; SIDES];
+        self.visit(|range, ray| {
+            let hit = sides.hit(ray);
+            let slope = side_gradient(ray, hit, &y.values[range.clone()], &gradient.values[range]);
+            sums[hit.side] += SIDE_GAIN * slope;
+        });
+        Ok([Some(sums)])
     }
 }
 

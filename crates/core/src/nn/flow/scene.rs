@@ -4,10 +4,9 @@
 //! room ([`super::room_geometry`]). Otherwise by its place in the frame, the state and the motion. For a camera that stands it is one
 //! learned image.
 
-use candle_core::{Device, Tensor};
-use candle_nn::Module as _;
+use candle_core::{DType, Device, Tensor};
 
-use super::blocks::centred;
+use super::blocks::{centred, content_blocks};
 use super::encoder_views::EncoderViews;
 use super::rollout_rows::RolloutRows;
 use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews};
@@ -15,12 +14,12 @@ use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
 use crate::nn::geometry::state_channels::StateChannels;
-use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
-use crate::nn::ops::linear::{Activation, Linear};
-use crate::nn::ops::modulation::silu;
+use crate::nn::model_tensors::ModelTensors;
+use crate::nn::ops::compose::SCENE_CHANNELS;
+use crate::nn::ops::linear::Linear;
+use crate::nn::ops::modulation::perceptron;
 use crate::nn::ops::sampling::ImageSize;
 use crate::nn::spec::{MIN_CHANNEL_STD, ModelSpec};
-use crate::nn::tensor_source::TensorSource;
 use crate::nn::tensors::with_values;
 
 /// Octaves of sines and cosines of a block's column and row.
@@ -58,6 +57,14 @@ impl SceneKind {
         }
     }
 
+    /// The name of the tensor that says what is seen, or where the room's sides are.
+    pub(super) fn tensor_name(self) -> &'static str {
+        match self {
+            Self::Room(..) => "flow.scene.room",
+            Self::Places | Self::Image => "flow.scene.image",
+        }
+    }
+
     /// Inputs of the learned function; none for an image.
     pub(super) fn inputs(self, spec: &ModelSpec) -> Option<usize> {
         match self {
@@ -72,72 +79,58 @@ impl SceneKind {
 #[derive(Clone, Debug)]
 pub(super) struct Scene {
     kind: SceneKind,
-    /// Three linear layers with `SiLU` between them.
+    /// Three linear layers with `SiLU` between them; none for an image.
     layers: Vec<Linear>,
-    /// The room's sides `[6]`.
-    room: Option<Tensor>,
-    /// One value per block and channel `[H/2 · W/2, SCENE_CHANNELS]`.
-    image: Option<Tensor>,
+    /// The room's sides `[6]`; else one value per block and channel `[H/2 · W/2, SCENE_CHANNELS]`.
+    learned: Tensor,
+}
+
+/// From where a scene is seen.
+struct SceneViews<'a> {
+    /// The scaled state of each view.
+    states: Vec<&'a [f32]>,
+    /// Yaw, ahead and left of each since the last frame `[M, 3]`.
+    motion: Tensor,
+    poses: &'a [CameraPose],
 }
 
 impl Scene {
-    pub(super) fn new(
-        spec: &ModelSpec,
-        camera: Option<CameraModel>,
-        tensors: &dyn TensorSource,
-    ) -> Result<Self, NnError> {
+    pub(super) fn new(spec: &ModelSpec, camera: Option<CameraModel>, tensors: &ModelTensors) -> Self {
         let kind = SceneKind::of(spec, camera);
-        let layers = match kind {
-            SceneKind::Image => Vec::new(),
-            _ => ["inputs", "hidden", "output"]
-                .iter()
-                .map(|name| tensors.linear(&format!("flow.scene.{name}"), Activation::None))
-                .collect::<Result<_, NnError>>()?,
-        };
-        let is_room = matches!(kind, SceneKind::Room(..));
-        Ok(Self {
+        let names = ["flow.scene.inputs", "flow.scene.hidden", "flow.scene.output"];
+        let names = names.iter().filter(|_| kind != SceneKind::Image);
+        Self {
             kind,
-            layers,
-            room: is_room.then(|| tensors.tensor("flow.scene.room")).transpose()?,
-            image: (!is_room).then(|| tensors.tensor("flow.scene.image")).transpose()?,
-        })
-    }
-
-    /// The scene at each item, `[M, H/2, W/2, SCENE_CHANNELS]`.
-    pub(super) fn forward(
-        &self,
-        spec: &ModelSpec,
-        rows: &RolloutRows,
-        motion: &Tensor,
-        poses: &[CameraPose],
-    ) -> Result<Tensor, NnError> {
-        match self.kind {
-            SceneKind::Room(scale, camera) => self.room_seen(spec, scale, camera, poses),
-            SceneKind::Places => {
-                let scaled = rows.scaled_states(spec);
-                let items: Vec<&[f32]> = (0..poses.len())
-                    .map(|item| scaled[item / spec.horizon].as_slice())
-                    .collect();
-                self.places_seen(spec, &items, &motion.flatten(0, 1)?)
-            }
-            SceneKind::Image => self.image_seen(spec, poses.len()),
+            layers: names.map(|name| tensors.linear(name)).collect(),
+            learned: tensors.tensor(kind.tensor_name()),
         }
     }
 
-    /// The content at each context's last frame, `[contexts, H/2, W/2, 4]`, without gradients.
-    pub(super) fn content_now(&self, spec: &ModelSpec, contexts: &EncoderViews) -> Result<Vec<f32>, NnError> {
-        let count = contexts.count();
-        let scene = match self.kind {
-            SceneKind::Room(scale, camera) => self.room_seen(spec, scale, camera, &contexts.poses)?,
-            SceneKind::Places => {
-                let states: Vec<Vec<f32>> = contexts.states.iter().map(|state| spec.scaled_state(state)).collect();
-                let states: Vec<&[f32]> = states.iter().map(Vec::as_slice).collect();
-                let motion = Tensor::zeros((count, 3), candle_core::DType::F32, &Device::Cpu)?;
-                self.places_seen(spec, &states, &motion)?
-            }
-            SceneKind::Image => self.image_seen(spec, count)?,
+    /// The scene at each item, `[M, H/2, W/2, SCENE_CHANNELS]`.
+    pub(super) fn forward(&self, rows: &RolloutRows, motion: &Tensor, poses: &[CameraPose]) -> Result<Tensor, NnError> {
+        let scaled: Vec<Vec<f32>> = (0..rows.count())
+            .map(|row| rows.spec.scaled_state(rows.state(row)))
+            .collect();
+        let views = SceneViews {
+            states: (0..poses.len())
+                .map(|item| scaled[item / rows.spec.horizon].as_slice())
+                .collect(),
+            motion: motion.flatten(0, 1)?,
+            poses,
         };
-        let content = scene.narrow(3, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)?;
+        self.seen(rows.spec, &views)
+    }
+
+    /// The content at each context's last frame, `[contexts, H/2, W/2, 4]`, without gradients.
+    pub(super) fn content_now(&self, contexts: &EncoderViews) -> Result<Vec<f32>, NnError> {
+        let spec = contexts.spec;
+        let scaled: Vec<Vec<f32>> = contexts.states.iter().map(|state| spec.scaled_state(state)).collect();
+        let views = SceneViews {
+            states: scaled.iter().map(Vec::as_slice).collect(),
+            motion: Tensor::zeros((contexts.count(), 3), DType::F32, &Device::Cpu)?,
+            poses: &contexts.poses,
+        };
+        let content = content_blocks(&self.seen(spec, &views)?)?;
         Ok(with_values(&content.detach(), <[f32]>::to_vec)?)
     }
 
@@ -148,7 +141,7 @@ impl Scene {
         poses: &[CameraPose],
         before: &[CameraPose],
     ) -> Result<Option<Vec<f32>>, NnError> {
-        let (SceneKind::Room(scale, _), Some(room)) = (self.kind, &self.room) else {
+        let SceneKind::Room(scale, _) = self.kind else {
             return Ok(None);
         };
         let views = RoomViews {
@@ -156,75 +149,45 @@ impl Scene {
             rays: viewer.rays(),
             poses: poses.to_vec(),
         };
-        Ok(Some(views.places_before(RoomSides::of(room)?, viewer, before)))
+        Ok(Some(views.places_before(RoomSides::of(&self.learned)?, viewer, before)))
     }
 
-    fn room_seen(
-        &self,
-        spec: &ModelSpec,
-        scale: RoomScale,
-        camera: CameraModel,
-        poses: &[CameraPose],
-    ) -> Result<Tensor, NnError> {
+    fn seen(&self, spec: &ModelSpec, views: &SceneViews) -> Result<Tensor, NnError> {
         let half = spec.image_size().shrunk(2);
-        let room = self
-            .room
-            .as_ref()
-            .ok_or_else(|| candle_core::Error::Msg("a room has six learned sides".to_owned()))?;
-        let views = RoomViews {
-            scale,
-            rays: Viewer::new(camera, half).rays(),
-            poses: poses.to_vec(),
-        };
-        Self::shaped(&self.run(&views.describe(room)?)?, half)
+        let shape = (views.poses.len(), half.height, half.width, SCENE_CHANNELS);
+        let image = || self.learned.reshape((1, half.height, half.width, SCENE_CHANNELS));
+        Ok(match self.kind {
+            SceneKind::Room(scale, camera) => {
+                let views = RoomViews {
+                    scale,
+                    rays: Viewer::new(camera, half).rays(),
+                    poses: views.poses.to_vec(),
+                };
+                let seen = perceptron(&self.layers, &views.describe(&self.learned)?)?;
+                (seen + MIDDLE_GRAY)?.reshape(shape)?
+            }
+            SceneKind::Places => {
+                let seen = perceptron(&self.layers, &Self::known_of_places(half, views)?)?;
+                (seen + MIDDLE_GRAY)?.reshape(shape)?.broadcast_add(&image()?)?
+            }
+            SceneKind::Image => (image()?.broadcast_as(shape)?.contiguous()? + MIDDLE_GRAY)?,
+        })
     }
 
-    fn places_seen(&self, spec: &ModelSpec, states: &[&[f32]], motion: &Tensor) -> Result<Tensor, NnError> {
-        let half = spec.image_size().shrunk(2);
-        let items = states.len();
+    /// Place, state and motion of each block of each view.
+    fn known_of_places(half: ImageSize, views: &SceneViews) -> Result<Tensor, NnError> {
+        let (items, blocks) = (views.states.len(), half.pixels());
         let places = place_values(half);
         let mut known = Vec::new();
-        for state in states {
+        for state in &views.states {
             for place in places.chunks_exact(PLACE_VALUES) {
                 known.extend_from_slice(place);
                 known.extend_from_slice(state);
             }
         }
-        let width = known.len() / (items * half.pixels());
-        let known = Tensor::from_vec(known, (items * half.pixels(), width), &Device::Cpu)?;
-        let motion = motion
-            .unsqueeze(1)?
-            .expand((items, half.pixels(), 3))?
-            .reshape((items * half.pixels(), 3))?;
-        let seen = Self::shaped(&self.run(&Tensor::cat(&[&known, &motion], 1)?)?, half)?;
-        let Some(image) = &self.image else { return Ok(seen) };
-        Ok(seen.broadcast_add(&image.reshape((1, half.height, half.width, SCENE_CHANNELS))?)?)
-    }
-
-    fn image_seen(&self, spec: &ModelSpec, items: usize) -> Result<Tensor, NnError> {
-        let half = spec.image_size().shrunk(2);
-        let image = self
-            .image
-            .as_ref()
-            .ok_or_else(|| candle_core::Error::Msg("a standing camera's scene is an image".to_owned()))?;
-        let image = image.reshape((1, half.height, half.width, SCENE_CHANNELS))?;
-        let shape = (items, half.height, half.width, SCENE_CHANNELS);
-        Ok((image.broadcast_as(shape)?.contiguous()? + MIDDLE_GRAY)?)
-    }
-
-    fn run(&self, described: &Tensor) -> Result<Tensor, NnError> {
-        let mut values = described.clone();
-        for (index, layer) in self.layers.iter().enumerate() {
-            if index > 0 {
-                values = silu(&values)?;
-            }
-            values = layer.forward(&values)?;
-        }
-        Ok((values + MIDDLE_GRAY)?)
-    }
-
-    fn shaped(values: &Tensor, half: ImageSize) -> Result<Tensor, NnError> {
-        Ok(values.reshape(((), half.height, half.width, SCENE_CHANNELS))?)
+        let known = Tensor::from_vec(known, (items * blocks, ()), &Device::Cpu)?;
+        let motion = views.motion.unsqueeze(1)?.expand((items, blocks, 3))?;
+        Ok(Tensor::cat(&[&known, &motion.reshape((items * blocks, 3))?], 1)?)
     }
 }
 

@@ -5,11 +5,11 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor};
 
 use crate::frame::warp::CameraModel;
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::ops::sampling::ImageSize;
-use crate::nn::tensors::{slice, with_values};
 use crate::vectorized::vectorized;
 
 /// Depths below this count as this deep, so that what is behind the camera lands far outside the frame.
@@ -105,24 +105,39 @@ impl Viewer {
         ]
     }
 
-    /// Where each pixel was before the camera turned by `yaw`, `[P, 2]`.
-    pub(in crate::nn) fn turned(self, rays: &[[f32; 3]], yaw: f32) -> Vec<f32> {
-        let mut places = vec![0.0; 2 * rays.len()];
-        self.write_turned(rays, yaw, &mut places);
+    /// Where each pixel was before the camera turned by each of the angles, in radians: `[M, P, 2]`.
+    pub(in crate::nn) fn turned(self, yaws: &[f32]) -> Vec<f32> {
+        let rays = self.rays();
+        let mut places = vec![0.0; yaws.len() * 2 * rays.len()];
+        for (places, yaw) in places.chunks_exact_mut(2 * rays.len()).zip(yaws) {
+            let (sin, cos) = yaw.sin_cos();
+            vectorized(
+                #[inline(always)]
+                || {
+                    for (place, &ray) in places.chunks_exact_mut(2).zip(&rays) {
+                        place.copy_from_slice(&self.project(rotated(ray, sin, cos)));
+                    }
+                },
+            );
+        }
         places
     }
 
-    /// As [`Viewer::turned`], into `places`.
-    fn write_turned(self, rays: &[[f32; 3]], yaw: f32, places: &mut [f32]) {
-        let (sin, cos) = yaw.sin_cos();
-        vectorized(
-            #[inline(always)]
-            || {
-                for (place, &ray) in places.chunks_exact_mut(2).zip(rays) {
-                    place.copy_from_slice(&self.project(rotated(ray, sin, cos)));
-                }
-            },
-        );
+    /// How the place of a ray changes with the yaw.
+    fn slope(self, ray: [f32; 3], sin: f32, cos: f32) -> [f32; 2] {
+        let point = rotated(ray, sin, cos);
+        let [depth, down] = self.depth_and_down(point);
+        if depth <= MIN_DEPTH {
+            return [0.0; 2];
+        }
+        let [ahead, left, _] = point;
+        // Of ahead, left, depth and down with the yaw: −left, ahead, and so on.
+        let (depth_slope, down_slope) = (-self.tilt_cos * left, self.tilt_sin * left);
+        let scale = 1.0 / (depth * depth * self.pixel);
+        [
+            -(ahead * depth - left * depth_slope) * scale,
+            (down_slope * depth - down * depth_slope) * scale,
+        ]
     }
 }
 
@@ -133,81 +148,31 @@ pub(in crate::nn) fn rotated([ahead, left, up]: [f32; 3], sin: f32, cos: f32) ->
 }
 
 /// Where each pixel was before the camera turned by `yaw` `[M]`, in radians: `[M, P, 2]`. Gradients go to the yaw.
-pub(in crate::nn) fn turning_places(viewer: Viewer, rays: &[[f32; 3]], yaw: &Tensor) -> Result<Tensor> {
-    let yaw = yaw.contiguous()?;
-    let operation = Turning {
-        viewer,
-        rays: rays.to_vec(),
-    };
-    if yaw.track_op() {
-        yaw.apply_op1(operation)
-    } else {
-        yaw.apply_op1_no_bwd(&operation)
-    }
+pub(in crate::nn) fn turning_places(viewer: Viewer, yaw: &Tensor) -> Result<Tensor> {
+    apply(viewer, [yaw])
 }
 
-struct Turning {
-    viewer: Viewer,
-    rays: Vec<[f32; 3]>,
-}
+impl FusedOperation<1> for Viewer {
+    const NAME: &'static str = "turning-places";
 
-impl CustomOp1 for Turning {
-    fn name(&self) -> &'static str {
-        "turning-places"
+    fn forward(&self, [yaw]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let shape = (yaw.layout.shape().dims1()?, self.size.pixels(), 2);
+        Ok((self.turned(yaw.values), Shape::from(shape)))
     }
 
-    fn cpu_fwd(&self, yaw: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let yaw = slice(yaw, layout)?;
-        if layout.dims().len() != 1 {
-            bail!("yaw has shape {:?}; it must be [M]", layout.dims());
-        }
-        let of_item = 2 * self.rays.len();
-        let mut places = vec![0.0; yaw.len() * of_item];
-        for (places, &yaw) in places.chunks_exact_mut(of_item).zip(yaw) {
-            self.viewer.write_turned(&self.rays, yaw, places);
-        }
-        Ok((CpuStorage::F32(places), Shape::from((yaw.len(), self.rays.len(), 2))))
-    }
-
-    fn bwd(&self, yaw: &Tensor, _places: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let Viewer {
-            tilt_sin,
-            tilt_cos,
-            pixel,
-            ..
-        } = self.viewer;
-        let slope = |ray: [f32; 3], sin: f32, cos: f32| {
-            let point = rotated(ray, sin, cos);
-            let [depth, down] = self.viewer.depth_and_down(point);
-            if depth <= MIN_DEPTH {
-                return [0.0; 2];
-            }
-            let [ahead, left, _] = point;
-            // Of ahead, left, depth and down with the yaw: −left, ahead, and so on.
-            let (depth_slope, down_slope) = (-tilt_cos * left, tilt_sin * left);
-            let scale = 1.0 / (depth * depth * pixel);
-            [
-                -(ahead * depth - left * depth_slope) * scale,
-                (down_slope * depth - down * depth_slope) * scale,
-            ]
-        };
-        let sums: Vec<f32> = with_values(yaw, |yaw| {
-            with_values(gradient, |gradient| {
-                yaw.iter()
-                    .zip(gradient.chunks_exact(2 * self.rays.len()))
-                    .map(|(yaw, gradient)| {
-                        let (sin, cos) = yaw.sin_cos();
-                        let rays = self.rays.iter().zip(gradient.chunks_exact(2));
-                        rays.map(|(&ray, gradient)| {
-                            let [column, row] = slope(ray, sin, cos);
-                            column * gradient[0] + row * gradient[1]
-                        })
-                        .sum()
-                    })
-                    .collect()
+    fn backward(&self, [yaw]: [Operand; 1], _places: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let rays = self.rays();
+        let items = yaw.values.iter().zip(gradient.values.chunks_exact(2 * rays.len()));
+        let sums = items.map(|(yaw, gradient)| {
+            let (sin, cos) = yaw.sin_cos();
+            let rays = rays.iter().zip(gradient.chunks_exact(2));
+            rays.map(|(&ray, gradient)| {
+                let [column, row] = self.slope(ray, sin, cos);
+                column * gradient[0] + row * gradient[1]
             })
-        })??;
-        Ok(Some(Tensor::from_vec(sums, yaw.dims(), yaw.device())?))
+            .sum::<f32>()
+        });
+        Ok([Some(sums.collect())])
     }
 }
 
@@ -227,7 +192,7 @@ mod tests {
     #[test]
     fn turning_agrees_with_the_warp_of_frames() {
         let viewer = Viewer::new(CAMERA, SIZE);
-        let places = viewer.turned(&viewer.rays(), 0.3);
+        let places = viewer.turned(&[0.3]);
         let expected = rotation_grid(CAMERA, SIZE.width, SIZE.height, 0.3);
         for (place, expected) in places.chunks_exact(2).zip(expected) {
             assert!((place[0] + 0.5 - expected[0]).abs() < 1e-4 && (place[1] + 0.5 - expected[1]).abs() < 1e-4);
@@ -238,9 +203,7 @@ mod tests {
     fn gradients_of_the_yaw_agree_with_differences() {
         let viewer = Viewer::new(CAMERA, SIZE);
         let yaw = Tensor::new(&[0.1f32, -0.4, 0.0], &candle_core::Device::Cpu).unwrap();
-        assert_gradients(&[yaw], 1e-3, |inputs| {
-            turning_places(viewer, &viewer.rays(), &inputs[0])
-        });
+        assert_gradients(&[yaw], 1e-3, |inputs| turning_places(viewer, &inputs[0]));
     }
 
     #[test]

@@ -1,10 +1,10 @@
 //! How a base with two driven wheels follows commanded speeds: each wheel changes its speed at a limited acceleration. The
 //! wheels' distance and the acceleration are learned; then the motion is the integral of the speeds.
 
-use candle_core::{CpuStorage, CustomOp1, Device, Layout, Result, Shape, Tensor};
+use candle_core::{Result, Shape, Tensor};
 
 use super::camera::CameraPose;
-use crate::nn::tensors::{slice, with_values};
+use crate::nn::fused::{FusedOperation, Operand, apply};
 
 /// Half the distance between the wheels before anything is learned, in metres.
 const HALF_TRACK_M: f64 = 0.15;
@@ -30,7 +30,7 @@ pub(in crate::nn) struct CommandedSpeeds {
 /// Yaw, ahead and left since the last frame `[N, horizon, 3]`, in radians and metres, for N rollouts of `horizon` steps of
 /// `period_s`. `wheels` `[2]` holds the logarithms of both learned values, relative to their first ones.
 pub(in crate::nn) fn integral(wheels: &Tensor, rollouts: Vec<CommandedSpeeds>, period_s: f64) -> Result<Tensor> {
-    wheels.contiguous()?.apply_op1(WheelIntegral { rollouts, period_s })
+    apply(WheelIntegral { rollouts, period_s }, [wheels])
 }
 
 struct WheelIntegral {
@@ -77,44 +77,41 @@ fn mean_speed(speed: &mut f64, target: f64, acceleration: f64, period_s: f64) ->
     target - lost * difference.signum()
 }
 
-fn parameters(wheels: &[f32]) -> [f64; 2] {
-    std::array::from_fn(|index| f64::from(wheels.get(index).copied().unwrap_or(0.0)))
+fn parameters(wheels: Operand) -> [f64; 2] {
+    std::array::from_fn(|index| f64::from(wheels.values[index]))
 }
 
-impl CustomOp1 for WheelIntegral {
-    fn name(&self) -> &'static str {
-        "wheel-integral"
-    }
+impl FusedOperation<1> for WheelIntegral {
+    const NAME: &'static str = "wheel-integral";
 
-    fn cpu_fwd(&self, wheels: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let motions = self.motions(parameters(slice(wheels, layout)?));
+    fn forward(&self, [wheels]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let motions = self.motions(parameters(wheels));
         let count = self.rollouts.len();
         let steps = motions.len() / 3 / count.max(1);
-        Ok((CpuStorage::F32(motions), Shape::from((count, steps, 3))))
+        Ok((motions, Shape::from((count, steps, 3))))
     }
 
-    fn bwd(&self, wheels: &Tensor, _motion: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let learned = with_values(wheels, parameters)?;
-        let slopes = with_values(gradient, |gradient| {
-            [0, 1].map(|index| {
-                let shifted = |by: f64| {
-                    let mut learned = learned;
-                    learned[index] += by;
-                    self.motions(learned)
-                };
-                let pairs = shifted(DIFFERENCE).into_iter().zip(shifted(-DIFFERENCE));
-                let slope = pairs
-                    .zip(gradient)
-                    .map(|((more, less), gradient)| f64::from(more - less) / (2.0 * DIFFERENCE) * f64::from(*gradient));
-                slope.sum::<f64>() as f32
-            })
-        })?;
-        Ok(Some(Tensor::new(&slopes, &Device::Cpu)?))
+    fn backward(&self, [wheels]: [Operand; 1], _motion: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let slopes = [0, 1].map(|index| {
+            let shifted = |by: f64| {
+                let mut learned = parameters(wheels);
+                learned[index] += by;
+                self.motions(learned)
+            };
+            let pairs = shifted(DIFFERENCE).into_iter().zip(shifted(-DIFFERENCE));
+            let slope = pairs
+                .zip(gradient.values)
+                .map(|((more, less), gradient)| f64::from(more - less) / (2.0 * DIFFERENCE) * f64::from(*gradient));
+            slope.sum::<f64>() as f32
+        });
+        Ok([Some(slopes.to_vec())])
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use candle_core::Device;
+
     use super::*;
     use crate::nn::gradient_check::assert_gradients;
 

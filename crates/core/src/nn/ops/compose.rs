@@ -3,11 +3,11 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 
 use super::activation::exp;
 use super::sampling::{ImageSize, Neighbourhood};
-use crate::nn::tensors::{slice, with_values};
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::vectorized;
 
 /// Numbers that the head gives for each pixel: two flows (column, row), three mask logits, one change of the content.
@@ -50,17 +50,13 @@ impl Composition {
     /// The frames `[M, P]`. `head` is `[M, H/2, W/2, 4 · HEAD_VALUES]`, `scene` `[M, H/2, W/2, SCENE_CHANNELS]`, `places`
     /// `[M, P, 2]` where each pixel was before the camera turned. Gradients go to all three.
     pub(in crate::nn) fn compose(self, head: &Tensor, scene: &Tensor, places: &Tensor) -> Result<Tensor> {
-        let (head, scene, places) = (head.contiguous()?, scene.contiguous()?, places.contiguous()?);
-        if head.track_op() || scene.track_op() || places.track_op() {
-            head.apply_op3(&scene, &places, self)
-        } else {
-            head.apply_op3_no_bwd(&scene, &places, &self)
-        }
+        apply(self, [head, scene, places])
     }
 
-    /// Calls `visit` with the index of each pixel among all, of its head values, of its content, and its frame's.
+    /// Calls `visit` with the index of each pixel among all, of its head values and of its content, with its parts and its
+    /// frame.
     #[inline(always)]
-    fn visit(&self, mut visit: impl FnMut([usize; 3], &[f32])) {
+    fn visit(&self, [heads, scene, places]: [Operand; 3], mut visit: impl FnMut([usize; 3], PixelParts, &[f32])) {
         let ImageSize { height, width } = self.size;
         let pixels = self.size.pixels();
         for (item, &frame) in self.frame_of.iter().enumerate() {
@@ -73,7 +69,10 @@ impl Composition {
                     let pixel = item * pixels + row * width + column;
                     let head = (block * 4 + part) * HEAD_VALUES;
                     let content = block * SCENE_CHANNELS + SCENE_FEATURES + part;
-                    visit([pixel, head, content], frame);
+                    let place = [places.values[2 * pixel], places.values[2 * pixel + 1]];
+                    let head_values = &heads.values[head..head + HEAD_VALUES];
+                    let parts = self.parts(pixel, head_values, scene.values[content], place, frame);
+                    visit([pixel, head, content], parts, frame);
                 }
             }
         }
@@ -85,8 +84,7 @@ impl Composition {
         clippy::too_many_arguments,
         reason = "the values of one pixel, in the innermost loop"
     )]
-    fn parts(&self, pixel: usize, head: &[f32], content: f32, places: &[f32], frame: &[f32]) -> PixelParts {
-        let turned = [places[2 * pixel], places[2 * pixel + 1]];
+    fn parts(&self, pixel: usize, head: &[f32], content: f32, turned: [f32; 2], frame: &[f32]) -> PixelParts {
         let room = match &self.room_places {
             Some(places) => [places[2 * pixel], places[2 * pixel + 1]],
             None => turned,
@@ -120,8 +118,9 @@ impl Composition {
         (OUTSIDE_LOGIT * distance).min(MAX_OUTSIDE_LOGIT)
     }
 
-    fn check(&self, head: &[usize], scene: &[usize], places: &[usize]) -> Result<()> {
+    fn check(&self, inputs: [Operand; 3]) -> Result<()> {
         let (items, ImageSize { height, width }) = (self.frame_of.len(), self.size);
+        let [head, scene, places] = inputs.map(|input| input.dims());
         let fits = head == [items, height / 2, width / 2, 4 * HEAD_VALUES]
             && scene == [items, height / 2, width / 2, SCENE_CHANNELS]
             && places == [items, height * width, 2];
@@ -132,92 +131,60 @@ impl Composition {
     }
 }
 
-impl CustomOp3 for Composition {
-    fn name(&self) -> &'static str {
-        "compose"
-    }
+impl FusedOperation<3> for Composition {
+    const NAME: &'static str = "compose";
 
-    fn cpu_fwd(
-        &self,
-        head: &CpuStorage,
-        head_layout: &Layout,
-        scene: &CpuStorage,
-        scene_layout: &Layout,
-        places: &CpuStorage,
-        places_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        self.check(head_layout.dims(), scene_layout.dims(), places_layout.dims())?;
-        let head = slice(head, head_layout)?;
-        let scene = slice(scene, scene_layout)?;
-        let places = slice(places, places_layout)?;
-        let mut out = vec![0.0; self.frame_of.len() * self.size.pixels()];
+    fn forward(&self, inputs: [Operand; 3]) -> Result<(Vec<f32>, Shape)> {
+        self.check(inputs)?;
+        let (items, pixels) = (self.frame_of.len(), self.size.pixels());
+        let mut out = vec![0.0; items * pixels];
         vectorized(
             #[inline(always)]
             || {
                 self.visit(
+                    inputs,
                     #[inline(always)]
-                    |[pixel, at, content], frame| {
-                        let parts = self.parts(pixel, &head[at..at + HEAD_VALUES], scene[content], places, frame);
-                        let weighted = parts.values.iter().zip(parts.mask);
-                        out[pixel] = weighted.map(|(value, share)| value * share).sum();
+                    |[pixel, ..], parts, _| out[pixel] = parts.mixed(),
+                );
+            },
+        );
+        Ok((out, Shape::from((items, pixels))))
+    }
+
+    fn backward(&self, inputs: [Operand; 3], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 3]> {
+        let [mut for_head, mut for_scene, mut for_places] = inputs.map(|input| vec![0.0; input.values.len()]);
+        // With a room, the first flow starts from a place that gets no gradient.
+        let first = usize::from(self.room_places.is_some());
+        vectorized(
+            #[inline(always)]
+            || {
+                self.visit(
+                    inputs,
+                    #[inline(always)]
+                    |[pixel, head, content], parts, frame| {
+                        let gradient = gradient.values[pixel];
+                        let moved = parts.gradient(gradient, frame, &mut for_head[head..head + HEAD_VALUES]);
+                        for place in &moved[first..] {
+                            for_places[2 * pixel] += place[0];
+                            for_places[2 * pixel + 1] += place[1];
+                        }
+                        for_scene[content] = gradient * parts.mask[2];
                     },
                 );
             },
         );
-        Ok((
-            CpuStorage::F32(out),
-            Shape::from((self.frame_of.len(), self.size.pixels())),
-        ))
-    }
-
-    fn bwd(
-        &self,
-        head: &Tensor,
-        scene: &Tensor,
-        places: &Tensor,
-        _y: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let mut for_head = vec![0.0; head.elem_count()];
-        let mut for_scene = vec![0.0; scene.elem_count()];
-        let mut for_places = vec![0.0; places.elem_count()];
-        with_values(head, |head| {
-            with_values(scene, |scene| {
-                with_values(places, |places| {
-                    with_values(gradient, |gradient| {
-                        vectorized(
-                            #[inline(always)]
-                            || {
-                                self.visit(
-                                    #[inline(always)]
-                                    |[pixel, at, content], frame| {
-                                        let head = &head[at..at + HEAD_VALUES];
-                                        let for_head = &mut for_head[at..at + HEAD_VALUES];
-                                        let parts = self.parts(pixel, head, scene[content], places, frame);
-                                        let moved = parts.gradient(gradient[pixel], frame, for_head);
-                                        let turned = usize::from(self.room_places.is_some());
-                                        for place in &moved[turned..] {
-                                            for_places[2 * pixel] += place[0];
-                                            for_places[2 * pixel + 1] += place[1];
-                                        }
-                                        for_scene[content] = gradient[pixel] * parts.mask[2];
-                                    },
-                                );
-                            },
-                        );
-                    })
-                })
-            })
-        })????;
-        Ok((
-            Some(Tensor::from_vec(for_head, head.dims(), head.device())?),
-            Some(Tensor::from_vec(for_scene, scene.dims(), scene.device())?),
-            Some(Tensor::from_vec(for_places, places.dims(), places.device())?),
-        ))
+        Ok([for_head, for_scene, for_places].map(Some))
     }
 }
 
 impl PixelParts {
+    /// The pixel's value.
+    #[inline(always)]
+    fn mixed(&self) -> f32 {
+        let weighted = self.values.iter().zip(self.mask);
+        weighted.map(|(value, share)| value * share).sum()
+    }
+
     /// Writes the gradient of the pixel's head values; gives that of the two places.
     #[inline(always)]
     fn gradient(&self, gradient: f32, frame: &[f32], for_head: &mut [f32]) -> [[f32; 2]; 2] {
@@ -225,12 +192,7 @@ impl PixelParts {
             let slopes = self.around[flow].slopes(frame);
             slopes.map(|slope| gradient * self.mask[flow] * slope)
         });
-        let mixed: f32 = self
-            .values
-            .iter()
-            .zip(self.mask)
-            .map(|(value, share)| value * share)
-            .sum();
+        let mixed = self.mixed();
         for_head[0] = FLOW_PX * first[0];
         for_head[1] = FLOW_PX * first[1];
         for_head[2] = FLOW_PX * second[0];

@@ -2,15 +2,12 @@
 //! the neighbours of all places in one row of the kernel are a matrix whose rows overlap in memory, so one matrix product a
 //! kernel row gives all output channels, and nothing is copied. candle's own CPU convolution is several times slower forth
 //! and back.
-// A closure's vector instructions reach what is inlined into it, and only that.
-#![allow(clippy::inline_always)]
 
-use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 use candle_nn::Module;
 
-use crate::nn::tensors::{add_columns, slice, with_values};
-use crate::vectorized::vectorized;
+use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::tensors::{product, sum_columns};
 
 /// Side of the kernel.
 const SIDE: usize = 3;
@@ -39,52 +36,20 @@ impl ConvShape {
     }
 }
 
-/// The convolution `[N, H, W, C]` → `[N, ⌈H / stride⌉, ⌈W / stride⌉, O]`. Weight `[9 · C, O]`, taps row by row; bias `[O]`.
-/// Places outside the image count as zero. Errors: shapes that do not fit.
-fn convolve(x: &Tensor, weight: &Tensor, bias: &Tensor, shape: ConvShape) -> Result<Tensor> {
-    let wants_input_gradient = x.track_op();
-    let operation = Convolution {
-        shape,
-        wants_input_gradient,
-    };
-    let x = x.contiguous()?;
-    if wants_input_gradient || weight.track_op() || bias.track_op() {
-        x.apply_op3(weight, bias, operation)
-    } else {
-        x.apply_op3_no_bwd(weight, bias, &operation)
-    }
-}
-
-/// A layer that is a 3×3 convolution.
+/// A layer that is a 3×3 convolution of weight `[9 · C, O]`, taps row by row, and bias `[O]`.
 #[derive(Clone, Debug)]
 pub(in crate::nn) struct Convolution3 {
-    weight: Tensor,
-    bias: Tensor,
-    shape: ConvShape,
-}
-
-impl Convolution3 {
-    /// A layer of weight `[9 · C, O]` and bias `[O]`.
-    pub(in crate::nn) fn new(weight: Tensor, bias: Tensor, shape: ConvShape) -> Self {
-        Self { weight, bias, shape }
-    }
-
-    /// Whether gradients go to the weight.
-    pub(in crate::nn) fn is_trained(&self) -> bool {
-        self.weight.track_op()
-    }
+    pub(in crate::nn) weight: Tensor,
+    pub(in crate::nn) bias: Tensor,
+    pub(in crate::nn) shape: ConvShape,
 }
 
 impl Module for Convolution3 {
-    /// The convolution of x, see [`convolve`].
+    /// The convolution `[N, H, W, C]` → `[N, ⌈H / stride⌉, ⌈W / stride⌉, O]`. Places outside the image count as zero.
+    /// Errors: shapes that do not fit.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        convolve(x, &self.weight, &self.bias, self.shape)
+        apply(self.shape, [x, &self.weight, &self.bias])
     }
-}
-
-struct Convolution {
-    shape: ConvShape,
-    wants_input_gradient: bool,
 }
 
 /// Sizes of one image of a convolution.
@@ -116,8 +81,7 @@ struct TapRun {
 }
 
 impl ImageGeometry {
-    fn of(dims: (usize, usize, usize, usize), shape: ConvShape) -> Self {
-        let (_, height, width, channels) = dims;
+    fn of((_, height, width, channels): (usize, usize, usize, usize), shape: ConvShape) -> Self {
         Self {
             height,
             width,
@@ -147,32 +111,9 @@ impl ImageGeometry {
         self.width + 2 * self.shape.dilation
     }
 
-    /// The image of zeros with its border.
-    fn bordered(self) -> CpuStorage {
-        let height = self.height + 2 * self.shape.dilation;
-        CpuStorage::F32(vec![0.0; height * self.pitch() * self.channels])
-    }
-
     /// Where the first place inside the border begins.
     fn inside(self) -> usize {
         self.shape.dilation * (self.pitch() + 1) * self.channels
-    }
-
-    /// Writes an image into a bordered one. An image of `spread` times smaller sides is spread over every `spread`th place.
-    fn write(self, image: &[f32], spread: usize, bordered: &mut CpuStorage) {
-        let CpuStorage::F32(bordered) = bordered else { return };
-        let length = self.width.div_ceil(spread) * self.channels;
-        for (row, values) in image.chunks_exact(length).enumerate() {
-            let from = self.inside() + row * spread * self.pitch() * self.channels;
-            if spread == 1 {
-                bordered[from..from + length].copy_from_slice(values);
-                continue;
-            }
-            for (column, value) in values.chunks_exact(self.channels).enumerate() {
-                let from = from + column * spread * self.channels;
-                bordered[from..from + self.channels].copy_from_slice(value);
-            }
-        }
     }
 
     /// All output places. Without a stride they are one block, in which the borders between rows count as places.
@@ -207,174 +148,138 @@ impl ImageGeometry {
         let steps = vec![self.shape.stride * self.channels, 1];
         Layout::new(Shape::from((block.places, run.length)), steps, block.from + run.offset)
     }
+}
 
-    /// Adds the convolution of a bordered image to `sums` `[places, outputs]`. The weight begins at `from` in its storage.
-    fn add_to(self, sums: &mut [f32], bordered: &CpuStorage, weight: &CpuStorage, from: usize) -> Result<()> {
-        let outputs = sums.len() / self.places();
-        let used = self.out_width() * outputs;
-        for block in self.blocks() {
-            let pitch = if self.shape.stride == 1 {
-                self.pitch() * outputs
-            } else {
-                used
-            };
-            for run in self.runs() {
+/// An image with a border of zeros around it.
+struct BorderedImage {
+    geometry: ImageGeometry,
+    values: CpuStorage,
+}
+
+impl BorderedImage {
+    /// An image of zeros.
+    fn new(geometry: ImageGeometry) -> Self {
+        let height = geometry.height + 2 * geometry.shape.dilation;
+        let values = CpuStorage::F32(vec![0.0; height * geometry.pitch() * geometry.channels]);
+        Self { geometry, values }
+    }
+
+    /// Writes an image inside the border. An image of `spread` times smaller sides is spread over every `spread`th place.
+    fn write(&mut self, image: &[f32], spread: usize) {
+        let (geometry, channels) = (self.geometry, self.geometry.channels);
+        let CpuStorage::F32(bordered) = &mut self.values else {
+            return;
+        };
+        let length = geometry.width.div_ceil(spread) * channels;
+        for (row, values) in image.chunks_exact(length).enumerate() {
+            let from = geometry.inside() + row * spread * geometry.pitch() * channels;
+            if spread == 1 {
+                bordered[from..from + length].copy_from_slice(values);
+                continue;
+            }
+            for (column, value) in values.chunks_exact(channels).enumerate() {
+                let from = from + column * spread * channels;
+                bordered[from..from + channels].copy_from_slice(value);
+            }
+        }
+    }
+
+    /// Adds the image's convolution to `sums` `[places, outputs]`. The weight begins at `from` in its storage.
+    fn add_convolution(&self, sums: &mut [f32], weight: &CpuStorage, from: usize) -> Result<()> {
+        let geometry = self.geometry;
+        let outputs = sums.len() / geometry.places();
+        let used = geometry.out_width() * outputs;
+        let pitch = match geometry.shape.stride {
+            1 => geometry.pitch() * outputs,
+            _ => used,
+        };
+        for block in geometry.blocks() {
+            for run in geometry.runs() {
                 let weights = Layout::contiguous_with_offset((run.length, outputs), from + run.first * outputs);
-                let sizes = (1, block.places, outputs, run.length);
-                let product = bordered.matmul(weight, sizes, &self.neighbours(&block, &run), &weights)?;
-                let CpuStorage::F32(product) = product else {
-                    bail!("a convolution takes f32 tensors");
-                };
+                let neighbours = geometry.neighbours(&block, &run);
+                let product = product((&self.values, &neighbours), (weight, &weights))?;
                 let rows = sums[block.row * used..].chunks_exact_mut(used);
                 for (sums, product) in rows.zip(product.chunks(pitch)) {
-                    add(sums, &product[..used]);
+                    sum_columns(sums, &product[..used]);
                 }
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds the gradient of the weight `[9 · C, O]` to `sums`, from that of the image's convolution, which is spread over an
+    /// image as large as this one. What is no output place has a gradient of zero.
+    fn add_weight_gradient(&self, sums: &mut [f32], gradient: &Self) -> Result<()> {
+        let (geometry, spread) = (self.geometry, gradient.geometry);
+        let (stride, outputs) = (geometry.shape.stride, spread.channels);
+        for block in geometry.blocks() {
+            let from = spread.inside() + block.row * stride * spread.pitch() * outputs;
+            let gradients = Layout::new(Shape::from((block.places, outputs)), vec![stride * outputs, 1], from);
+            for run in geometry.runs() {
+                let neighbours = geometry.neighbours(&block, &run).transpose(0, 1)?;
+                let product = product((&self.values, &neighbours), (&gradient.values, &gradients))?;
+                sum_columns(&mut sums[run.first * outputs..][..product.len()], &product);
             }
         }
         Ok(())
     }
 }
 
-/// Adds values to sums.
-fn add(sums: &mut [f32], values: &[f32]) {
-    vectorized(
-        #[inline(always)]
-        || {
-            for (sum, value) in sums.iter_mut().zip(values) {
-                *sum += value;
-            }
-        },
-    );
-}
+impl FusedOperation<3> for ConvShape {
+    const NAME: &'static str = "convolution";
 
-impl CustomOp3 for Convolution {
-    fn name(&self) -> &'static str {
-        "convolution"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        weight: &CpuStorage,
-        weight_layout: &Layout,
-        bias: &CpuStorage,
-        bias_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let dims = x_layout.shape().dims4()?;
-        let image = ImageGeometry::of(dims, self.shape);
-        let (rows, outputs) = weight_layout.shape().dims2()?;
-        let taps = TAPS * image.channels;
-        if !weight_layout.is_contiguous() {
-            bail!("a convolution takes contiguous weights");
-        }
+    fn forward(&self, [x, weight, bias]: [Operand; 3]) -> Result<(Vec<f32>, Shape)> {
+        let dims = x.layout.shape().dims4()?;
+        let image = ImageGeometry::of(dims, *self);
+        let (rows, outputs) = weight.layout.shape().dims2()?;
+        let (channels, taps) = (image.channels, TAPS * image.channels);
         if rows != taps {
-            bail!(
-                "a convolution of {} channels takes {taps} rows of weights, got {rows}",
-                image.channels
-            );
+            bail!("a convolution of {channels} channels takes {taps} rows of weights, got {rows}");
         }
-        let (values, bias) = (slice(x, x_layout)?, slice(bias, bias_layout)?);
-        let mut sums = bias.repeat(dims.0 * image.places());
-        let mut bordered = image.bordered();
-        let images = values.chunks_exact(image.inputs());
+        let mut sums = bias.values.repeat(dims.0 * image.places());
+        let mut bordered = BorderedImage::new(image);
+        let images = x.values.chunks_exact(image.inputs());
         for (values, sums) in images.zip(sums.chunks_exact_mut(image.places() * outputs)) {
-            image.write(values, 1, &mut bordered);
-            image.add_to(sums, &bordered, weight, weight_layout.start_offset())?;
+            bordered.write(values, 1);
+            bordered.add_convolution(sums, weight.storage, weight.layout.start_offset())?;
         }
-        let shape = (dims.0, image.out_height(), image.out_width(), outputs);
-        Ok((CpuStorage::F32(sums), Shape::from(shape)))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        weight: &Tensor,
-        bias: &Tensor,
-        _y: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let image = ImageGeometry::of(x.dims4()?, self.shape);
-        let (rows, outputs) = weight.dims2()?;
-        let device = x.device();
-        let mut for_bias = vec![0.0; outputs];
-        let mut for_weight = vec![0.0; rows * outputs];
-        let mut for_x = self.wants_input_gradient.then(|| vec![0.0; x.elem_count()]);
-        let turned = CpuStorage::F32(with_values(weight, |weight| turned_kernel(weight, image.channels))?);
-        with_values(x, |values| {
-            with_values(gradient, |gradient| -> Result<()> {
-                add_all_columns(&mut for_bias, gradient);
-                let mut backward = Backward::new(image, outputs);
-                let gradients = gradient.chunks_exact(image.places() * outputs);
-                for (index, (values, gradient)) in values.chunks_exact(image.inputs()).zip(gradients).enumerate() {
-                    backward.read(values, gradient);
-                    backward.add_weight_gradient(&mut for_weight)?;
-                    if let Some(for_x) = &mut for_x {
-                        let for_x = &mut for_x[index * image.inputs()..(index + 1) * image.inputs()];
-                        backward.spread.add_to(for_x, &backward.gradient, &turned, 0)?;
-                    }
-                }
-                Ok(())
-            })
-        })???;
-        let for_x = for_x
-            .map(|for_x| Tensor::from_vec(for_x, x.dims(), device))
-            .transpose()?;
         Ok((
-            for_x,
-            Some(Tensor::from_vec(for_weight, (rows, outputs), device)?),
-            Some(Tensor::from_vec(for_bias, bias.dims(), device)?),
+            sums,
+            Shape::from((dims.0, image.out_height(), image.out_width(), outputs)),
         ))
     }
-}
 
-/// An image and the gradient of its convolution, both with borders.
-struct Backward {
-    image: ImageGeometry,
-    bordered: CpuStorage,
-    /// The gradient's image: as large as the input, so that a convolution of it gives the input's gradient.
-    spread: ImageGeometry,
-    gradient: CpuStorage,
-}
-
-impl Backward {
-    fn new(image: ImageGeometry, outputs: usize) -> Self {
+    fn backward(
+        &self,
+        [x, weight, bias]: [Operand; 3],
+        _output: Operand,
+        gradient: Operand,
+    ) -> Result<[Option<Vec<f32>>; 3]> {
+        let image = ImageGeometry::of(x.layout.shape().dims4()?, *self);
+        let outputs = bias.values.len();
+        // As large as the input, so that a convolution of it gives the input's gradient.
         let spread = ImageGeometry {
             channels: outputs,
-            shape: ConvShape::dilated(image.shape.dilation),
+            shape: Self::dilated(self.dilation),
             ..image
         };
-        Self {
-            image,
-            bordered: image.bordered(),
-            spread,
-            gradient: spread.bordered(),
-        }
-    }
-
-    fn read(&mut self, values: &[f32], gradient: &[f32]) {
-        self.image.write(values, 1, &mut self.bordered);
-        self.spread.write(gradient, self.image.shape.stride, &mut self.gradient);
-    }
-
-    /// Adds the gradient of the weight `[9 · C, O]`. What is no output place has a gradient of zero.
-    fn add_weight_gradient(&self, sums: &mut [f32]) -> Result<()> {
-        let (image, outputs) = (self.image, self.spread.channels);
-        let stride = image.shape.stride;
-        for block in image.blocks() {
-            let from = self.spread.inside() + block.row * stride * self.spread.pitch() * outputs;
-            let steps = vec![stride * outputs, 1];
-            let gradients = Layout::new(Shape::from((block.places, outputs)), steps, from);
-            for run in image.runs() {
-                let neighbours = image.neighbours(&block, &run).transpose(0, 1)?;
-                let sizes = (1, run.length, outputs, block.places);
-                let product = self.bordered.matmul(&self.gradient, sizes, &neighbours, &gradients)?;
-                if let CpuStorage::F32(product) = product {
-                    add(&mut sums[run.first * outputs..], &product);
-                }
+        let (mut bordered, mut bordered_gradient) = (BorderedImage::new(image), BorderedImage::new(spread));
+        let turned = CpuStorage::F32(turned_kernel(weight.values, image.channels));
+        let mut for_bias = vec![0.0; outputs];
+        let mut for_weight = vec![0.0; weight.values.len()];
+        let mut for_x = x.is_tracked.then(|| vec![0.0; x.values.len()]);
+        sum_columns(&mut for_bias, gradient.values);
+        let gradients = gradient.values.chunks_exact(image.places() * outputs);
+        for (index, (values, gradient)) in x.values.chunks_exact(image.inputs()).zip(gradients).enumerate() {
+            bordered.write(values, 1);
+            bordered_gradient.write(gradient, self.stride);
+            bordered.add_weight_gradient(&mut for_weight, &bordered_gradient)?;
+            if let Some(for_x) = &mut for_x {
+                let for_x = &mut for_x[index * image.inputs()..(index + 1) * image.inputs()];
+                bordered_gradient.add_convolution(for_x, &turned, 0)?;
             }
         }
-        Ok(())
+        Ok([for_x, Some(for_weight), Some(for_bias)])
     }
 }
 
@@ -391,13 +296,6 @@ fn turned_kernel(weight: &[f32], channels: usize) -> Vec<f32> {
     turned
 }
 
-fn add_all_columns(sums: &mut [f32], values: &[f32]) {
-    vectorized(
-        #[inline(always)]
-        || add_columns(sums, values),
-    );
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -409,7 +307,7 @@ mod tests {
     fn convolution_agrees_with_candle() {
         for shape in SHAPES {
             let (x, weight, bias) = (noise(&[2, 6, 5, 3], 1), noise(&[27, 4], 2), noise(&[4], 3));
-            let ours = convolve(&x, &weight, &bias, shape).unwrap();
+            let ours = apply(shape, [&x, &weight, &bias]).unwrap();
             // candle: channels first, weights [O, C, 3, 3].
             let kernel = weight.reshape((3, 3, 3, 4)).unwrap().permute((3, 2, 0, 1)).unwrap();
             let image = x.permute((0, 3, 1, 2)).unwrap().contiguous().unwrap();
@@ -434,7 +332,7 @@ mod tests {
         for shape in SHAPES {
             let inputs = [noise(&[2, 5, 6, 3], 1), noise(&[27, 4], 2), noise(&[4], 3)];
             assert_gradients(&inputs, 1e-2, |inputs| {
-                convolve(&inputs[0], &inputs[1], &inputs[2], shape)
+                apply(shape, [&inputs[0], &inputs[1], &inputs[2]])
             });
         }
     }

@@ -3,144 +3,91 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor};
 use candle_nn::Module;
 
 use super::activation::tanh;
-use crate::nn::tensors::{add_columns, matrix, slice, with_values};
+use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::tensors::{add_columns, product, slice, sum_columns};
 use crate::vectorized::vectorized;
 
-/// The activation function of a linear layer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::nn) enum Activation {
-    /// No activation function.
-    None,
-    /// tanh.
-    Tanh,
-}
-
-/// y = activation(x · weight + bias); weight `[D, O]`, bias `[O]`.
+/// y = x · weight + bias, or its tanh; weight `[D, O]`, bias `[O]`.
 #[derive(Clone, Debug)]
 pub(in crate::nn) struct Linear {
     pub(in crate::nn) weight: Tensor,
     pub(in crate::nn) bias: Tensor,
-    activation: Activation,
-}
-
-impl Linear {
-    /// A layer of weight `[D, O]` and bias `[O]`.
-    pub(in crate::nn) fn new(weight: Tensor, bias: Tensor, activation: Activation) -> Self {
-        Self {
-            weight,
-            bias,
-            activation,
-        }
-    }
+    pub(in crate::nn) has_tanh: bool,
 }
 
 impl Module for Linear {
     /// The layer's output `[N, O]` for x `[N, D]`, all f32.
-    fn forward(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let fused = FusedLinear {
-            activation: self.activation,
-            wants_input_gradient: x.track_op(),
-        };
-        let x = x.contiguous()?;
-        if x.track_op() || self.weight.track_op() || self.bias.track_op() {
-            x.apply_op3(&self.weight, &self.bias, fused)
-        } else {
-            x.apply_op3_no_bwd(&self.weight, &self.bias, &fused)
-        }
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let has_tanh = self.has_tanh;
+        apply(FusedLinear { has_tanh }, [x, &self.weight, &self.bias])
     }
 }
 
 /// Sum, bias and activation in one pass. It computes the input's gradient only if it is needed.
 struct FusedLinear {
-    activation: Activation,
-    wants_input_gradient: bool,
+    has_tanh: bool,
 }
 
-impl CustomOp3 for FusedLinear {
-    fn name(&self) -> &'static str {
-        "linear"
-    }
+impl FusedOperation<3> for FusedLinear {
+    const NAME: &'static str = "linear";
 
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        weight: &CpuStorage,
-        weight_layout: &Layout,
-        bias: &CpuStorage,
-        bias_layout: &Layout,
-    ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let ((rows, inputs), (_, outputs)) = (x_layout.shape().dims2()?, weight_layout.shape().dims2()?);
-        let mut sums = x.matmul(weight, (1, rows, outputs, inputs), x_layout, weight_layout)?;
-        let bias = slice(bias, bias_layout)?;
-        if let CpuStorage::F32(sums) = &mut sums {
-            vectorized(
-                #[inline(always)]
-                || {
-                    for row in sums.chunks_exact_mut(outputs) {
-                        add_columns(row, bias);
-                        if self.activation == Activation::Tanh {
-                            for value in row {
-                                *value = tanh(*value);
-                            }
+    fn forward(&self, [x, weight, bias]: [Operand; 3]) -> Result<(Vec<f32>, Shape)> {
+        let mut sums = product((x.storage, x.layout), (weight.storage, weight.layout))?;
+        let (_, outputs) = weight.layout.shape().dims2()?;
+        vectorized(
+            #[inline(always)]
+            || {
+                for row in sums.chunks_exact_mut(outputs) {
+                    add_columns(row, bias.values);
+                    if self.has_tanh {
+                        for value in row {
+                            *value = tanh(*value);
                         }
                     }
-                },
-            );
-        }
+                }
+            },
+        );
+        let rows = sums.len() / outputs;
         Ok((sums, Shape::from((rows, outputs))))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        x: &Tensor,
-        weight: &Tensor,
-        _bias: &Tensor,
-        y: &Tensor,
-        gradient: &Tensor,
-    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (x, weight) = (x.detach(), weight.detach());
-        let gradient = match self.activation {
-            Activation::None => gradient.contiguous()?,
-            Activation::Tanh => through_tanh(y, gradient)?,
+        [x, weight, bias]: [Operand; 3],
+        output: Operand,
+        gradient: Operand,
+    ) -> Result<[Option<Vec<f32>>; 3]> {
+        let (through_tanh, contiguous);
+        let for_sums = if self.has_tanh {
+            through_tanh = CpuStorage::F32(gradient_through_tanh(output.values, gradient.values));
+            contiguous = Layout::contiguous(gradient.layout.shape());
+            (&through_tanh, &contiguous)
+        } else {
+            (gradient.storage, gradient.layout)
         };
-        let mut sums = vec![0.0; gradient.dim(1)?];
-        with_values(&gradient, |gradient| {
-            vectorized(
-                #[inline(always)]
-                || add_columns(&mut sums, gradient),
-            );
-        })?;
-        let for_bias = Tensor::from_vec(sums, gradient.dim(1)?, gradient.device())?;
-        let for_weight = x.t()?.matmul(&gradient)?;
-        let for_x = self
-            .wants_input_gradient
-            .then(|| gradient.matmul(&weight.t()?))
+        let mut for_bias = vec![0.0; bias.values.len()];
+        let values = slice(for_sums.0, for_sums.1)?;
+        sum_columns(&mut for_bias, values);
+        let for_weight = product((x.storage, &x.layout.transpose(0, 1)?), for_sums)?;
+        let for_x = x
+            .is_tracked
+            .then(|| product(for_sums, (weight.storage, &weight.layout.transpose(0, 1)?)))
             .transpose()?;
-        Ok((for_x, Some(for_weight), Some(for_bias)))
+        Ok([for_x, Some(for_weight), Some(for_bias)])
     }
 }
 
 /// The gradient of y = tanh(sum) for the sum: gradient · (1 − y²).
-fn through_tanh(y: &Tensor, gradient: &Tensor) -> candle_core::Result<Tensor> {
-    let columns = y.dim(1)?;
-    let product = with_values(y, |y| {
-        with_values(gradient, |gradient| {
-            vectorized(
-                #[inline(always)]
-                || {
-                    y.iter()
-                        .zip(gradient)
-                        .map(|(y, gradient)| gradient * (1.0 - y * y))
-                        .collect()
-                },
-            )
-        })
-    })??;
-    matrix(product, columns)
+fn gradient_through_tanh(y: &[f32], gradient: &[f32]) -> Vec<f32> {
+    vectorized(
+        #[inline(always)]
+        || {
+            let pairs = y.iter().zip(gradient);
+            pairs.map(|(y, gradient)| gradient * (1.0 - y * y)).collect()
+        },
+    )
 }

@@ -2,31 +2,35 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
+use candle_nn::Module as _;
 
 use super::activation::sigmoid;
-use crate::nn::tensors::{slice, with_values};
+use super::linear::Linear;
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::vectorized;
 
 /// x · σ(x) of each value ("`SiLU`").
 pub(in crate::nn) fn silu(x: &Tensor) -> Result<Tensor> {
-    let x = x.contiguous()?;
-    if x.track_op() {
-        x.apply_op1(Silu)
-    } else {
-        x.apply_op1_no_bwd(&Silu)
+    apply(Silu, [x])
+}
+
+/// Linear layers with [`silu`] between them.
+pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor> {
+    let mut values = x.clone();
+    for (index, layer) in layers.iter().enumerate() {
+        if index > 0 {
+            values = silu(&values)?;
+        }
+        values = layer.forward(&values)?;
     }
+    Ok(values)
 }
 
 /// SiLU(x · (1 + scale) + shift) of x `[N, …, C]`, with `modulation` `[N, 2 · C]`: the scales of an item, then its shifts.
 /// Errors: shapes that do not fit.
 pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<Tensor> {
-    let (x, modulation) = (x.contiguous()?, modulation.contiguous()?);
-    if x.track_op() || modulation.track_op() {
-        x.apply_op2(&modulation, ModulatedSilu)
-    } else {
-        x.apply_op2_no_bwd(&modulation, &ModulatedSilu)
-    }
+    apply(ModulatedSilu, [x, modulation])
 }
 
 #[inline(always)]
@@ -42,67 +46,52 @@ fn slope(x: f32) -> f32 {
 
 struct Silu;
 
-impl CustomOp1 for Silu {
-    fn name(&self) -> &'static str {
-        "silu"
-    }
+impl FusedOperation<1> for Silu {
+    const NAME: &'static str = "silu";
 
-    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = slice(x, layout)?;
-        let mut values = vec![0.0; x.len()];
+    fn forward(&self, [x]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let mut values = vec![0.0; x.values.len()];
         // Not `collect`: it is not inlined, so its loop would do without vector instructions.
         vectorized(
             #[inline(always)]
             || {
-                for (value, &x) in values.iter_mut().zip(x) {
+                for (value, &x) in values.iter_mut().zip(x.values) {
                     *value = activate(x);
                 }
             },
         );
-        Ok((CpuStorage::F32(values), layout.shape().clone()))
+        Ok((values, x.layout.shape().clone()))
     }
 
-    fn bwd(&self, x: &Tensor, _y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let mut values = vec![0.0; x.elem_count()];
-        with_values(x, |x| {
-            with_values(gradient, |gradient| {
-                vectorized(
-                    #[inline(always)]
-                    || {
-                        for ((value, &x), gradient) in values.iter_mut().zip(x).zip(gradient) {
-                            *value = gradient * slope(x);
-                        }
-                    },
-                );
-            })
-        })??;
-        Ok(Some(Tensor::from_vec(values, x.dims(), x.device())?))
+    fn backward(&self, [x]: [Operand; 1], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let mut values = vec![0.0; x.values.len()];
+        vectorized(
+            #[inline(always)]
+            || {
+                for ((value, &x), gradient) in values.iter_mut().zip(x.values).zip(gradient.values) {
+                    *value = gradient * slope(x);
+                }
+            },
+        );
+        Ok([Some(values)])
     }
 }
 
 struct ModulatedSilu;
 
-impl CustomOp2 for ModulatedSilu {
-    fn name(&self) -> &'static str {
-        "modulated-silu"
-    }
+impl FusedOperation<2> for ModulatedSilu {
+    const NAME: &'static str = "modulated-silu";
 
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        modulation: &CpuStorage,
-        modulation_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let shape = x_layout.shape();
-        let (count, channels) = sizes(shape.dims(), modulation_layout.dims())?;
-        let (x, modulation) = (slice(x, x_layout)?, slice(modulation, modulation_layout)?);
-        let mut out = x.to_vec();
-        let item = x.len() / count;
+    fn forward(&self, [x, modulation]: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
+        let (item, channels) = sizes(x, modulation)?;
+        let mut out = x.values.to_vec();
+        let items = out
+            .chunks_exact_mut(item)
+            .zip(modulation.values.chunks_exact(2 * channels));
         vectorized(
             #[inline(always)]
             || {
-                for (values, modulation) in out.chunks_exact_mut(item).zip(modulation.chunks_exact(2 * channels)) {
+                for (values, modulation) in items {
                     let (scale, shift) = modulation.split_at(channels);
                     for row in values.chunks_exact_mut(channels) {
                         for ((value, scale), shift) in row.iter_mut().zip(scale).zip(shift) {
@@ -112,44 +101,32 @@ impl CustomOp2 for ModulatedSilu {
                 }
             },
         );
-        Ok((CpuStorage::F32(out), shape.clone()))
+        Ok((out, x.layout.shape().clone()))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        x: &Tensor,
-        modulation: &Tensor,
-        _y: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let (count, channels) = sizes(x.dims(), modulation.dims())?;
-        let item = x.elem_count() / count;
-        let mut for_x = Vec::new();
-        let mut for_modulation = vec![0.0; modulation.elem_count()];
-        with_values(x, |x| {
-            with_values(modulation, |modulation| {
-                with_values(gradient, |gradient| {
-                    for_x = gradient.to_vec();
-                    let items = for_x
-                        .chunks_exact_mut(item)
-                        .zip(x.chunks_exact(item))
-                        .zip(modulation.chunks_exact(2 * channels))
-                        .zip(for_modulation.chunks_exact_mut(2 * channels));
-                    vectorized(
-                        #[inline(always)]
-                        || {
-                            for (((gradient, x), modulation), sums) in items {
-                                item_gradient(gradient, x, modulation, sums);
-                            }
-                        },
-                    );
-                })
-            })
-        })???;
-        Ok((
-            Some(Tensor::from_vec(for_x, x.dims(), x.device())?),
-            Some(Tensor::from_vec(for_modulation, modulation.dims(), x.device())?),
-        ))
+        [x, modulation]: [Operand; 2],
+        _output: Operand,
+        gradient: Operand,
+    ) -> Result<[Option<Vec<f32>>; 2]> {
+        let (item, channels) = sizes(x, modulation)?;
+        let mut for_x = gradient.values.to_vec();
+        let mut for_modulation = vec![0.0; modulation.values.len()];
+        let items = for_x
+            .chunks_exact_mut(item)
+            .zip(x.values.chunks_exact(item))
+            .zip(modulation.values.chunks_exact(2 * channels))
+            .zip(for_modulation.chunks_exact_mut(2 * channels));
+        vectorized(
+            #[inline(always)]
+            || {
+                for (((gradient, x), modulation), sums) in items {
+                    item_gradient(gradient, x, modulation, sums);
+                }
+            },
+        );
+        Ok([Some(for_x), Some(for_modulation)])
     }
 }
 
@@ -170,11 +147,13 @@ fn item_gradient(gradient: &mut [f32], x: &[f32], modulation: &[f32], sums: &mut
     }
 }
 
-/// Items and channels.
-fn sizes(x: &[usize], modulation: &[usize]) -> Result<(usize, usize)> {
-    match (x, modulation) {
-        ([count, .., channels], [items, both]) if count == items && *both == 2 * channels => Ok((*count, *channels)),
-        _ => bail!("a modulation of shape {modulation:?} does not fit {x:?}"),
+/// Values of an item, and channels.
+fn sizes(x: Operand, modulation: Operand) -> Result<(usize, usize)> {
+    match (x.dims(), modulation.dims()) {
+        (&[count, .., channels], &[items, both]) if count == items && both == 2 * channels => {
+            Ok((x.values.len() / count, channels))
+        }
+        (x, modulation) => bail!("a modulation of shape {modulation:?} does not fit {x:?}"),
     }
 }
 

@@ -1,80 +1,60 @@
 //! Moves pixels between channels and places: blocks of 2×2 pixels become four groups of channels, and back.
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
+use candle_core::{Result, Shape, Tensor};
 
-use crate::nn::tensors::slice;
+use crate::nn::fused::{FusedOperation, Operand, apply};
 
 /// Spreads 4 · C channels over twice the sides: `[N, H, W, 4 · C]` → `[N, 2H, 2W, C]`. Channel group `2 · row + column` goes
 /// to that row and column of each 2×2 block.
 pub(in crate::nn) fn pixel_shuffle(x: &Tensor) -> Result<Tensor> {
-    PixelShuffle { is_inverse: false }.apply(x)
+    apply(PixelShuffle { is_inverse: false }, [x])
 }
 
 /// The inverse of [`pixel_shuffle`]: `[N, 2H, 2W, C]` → `[N, H, W, 4 · C]`.
 pub(in crate::nn) fn pixel_unshuffle(x: &Tensor) -> Result<Tensor> {
-    PixelShuffle { is_inverse: true }.apply(x)
+    apply(PixelShuffle { is_inverse: true }, [x])
 }
 
-#[derive(Clone, Copy)]
 struct PixelShuffle {
     is_inverse: bool,
 }
 
-impl PixelShuffle {
-    fn apply(self, x: &Tensor) -> Result<Tensor> {
-        let x = x.contiguous()?;
-        if x.track_op() {
-            x.apply_op1(self)
-        } else {
-            x.apply_op1_no_bwd(&self)
+impl FusedOperation<1> for PixelShuffle {
+    const NAME: &'static str = "pixel-shuffle";
+
+    fn forward(&self, [x]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let (count, height, width, channels) = x.layout.shape().dims4()?;
+        if self.is_inverse {
+            let moved = rows_to_columns(x.values, width / 2, 2, 2 * channels);
+            return Ok((moved, Shape::from((count, height / 2, width / 2, 4 * channels))));
         }
+        let moved = rows_to_columns(x.values, 2, width, channels / 2);
+        Ok((moved, Shape::from((count, 2 * height, 2 * width, channels / 4))))
+    }
+
+    fn backward(&self, [x]: [Operand; 1], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let (_, _, width, channels) = x.layout.shape().dims4()?;
+        let moved = if self.is_inverse {
+            rows_to_columns(gradient.values, 2, width / 2, 2 * channels)
+        } else {
+            rows_to_columns(gradient.values, width, 2, channels / 2)
+        };
+        Ok([Some(moved)])
     }
 }
 
-impl CustomOp1 for PixelShuffle {
-    fn name(&self) -> &'static str {
-        "pixel-shuffle"
-    }
-
-    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (count, height, width, channels) = layout.shape().dims4()?;
-        let values = slice(x, layout)?;
-        let mut out = vec![0.0; values.len()];
-        // Rows, columns and channels on the fine side.
-        let (rows, columns, depth) = if self.is_inverse {
-            (height, width, channels)
-        } else {
-            (2 * height, 2 * width, channels / 4)
-        };
-        let half = columns / 2 * 4 * depth;
-        for row in 0..count * rows {
-            // Both rows of a block lie in the same row of blocks; sides are even, so items need no care.
-            let blocks = row / 2 * half + row % 2 * 2 * depth;
-            for column in 0..columns {
-                let coarse = blocks + column / 2 * 4 * depth + column % 2 * depth;
-                let fine = (row * columns + column) * depth;
-                let (from, to) = if self.is_inverse {
-                    (fine, coarse)
-                } else {
-                    (coarse, fine)
-                };
-                out[to..to + depth].copy_from_slice(&values[from..from + depth]);
-            }
+/// Turns each matrix `[columns, rows]`, whose values are `length` numbers each, into one `[rows, columns]`. A row of 2×2
+/// blocks is such a matrix: of two halves of its channels for each block, or of a half for each block in two rows.
+fn rows_to_columns(values: &[f32], rows: usize, columns: usize, length: usize) -> Vec<f32> {
+    let mut out = vec![0.0; values.len()];
+    let size = rows * columns * length;
+    for (from, to) in values.chunks_exact(size).zip(out.chunks_exact_mut(size)) {
+        for (index, value) in from.chunks_exact(length).enumerate() {
+            let place = index % rows * columns + index / rows;
+            to[place * length..(place + 1) * length].copy_from_slice(value);
         }
-        let shape = if self.is_inverse {
-            (count, height / 2, width / 2, 4 * channels)
-        } else {
-            (count, rows, columns, depth)
-        };
-        Ok((CpuStorage::F32(out), Shape::from(shape)))
     }
-
-    fn bwd(&self, _x: &Tensor, _y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let inverse = Self {
-            is_inverse: !self.is_inverse,
-        };
-        Ok(Some(inverse.apply(&gradient.detach())?))
-    }
+    out
 }
 
 #[cfg(test)]

@@ -2,9 +2,9 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 
-use crate::nn::tensors::{slice, with_values};
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::vectorized;
 
 /// The four pixels around a place, and the shares of the right column and of the lower row.
@@ -101,16 +101,8 @@ pub(in crate::nn) fn own_places(size: ImageSize) -> Vec<f32> {
 /// Features `[B, h, w, C]` sampled at `places` (columns and rows, `[M, h, w, 2]`); item m samples image `image_of[m]`:
 /// `[M, h, w, C]`. Zero where a place lies more than a pixel outside. Gradients go to the features only.
 pub(in crate::nn) fn sample_features(features: &Tensor, places: Vec<f32>, image_of: &[u32]) -> Result<Tensor> {
-    let features = features.contiguous()?;
-    let operation = FeatureSampling {
-        places,
-        image_of: image_of.to_vec(),
-    };
-    if features.track_op() {
-        features.apply_op1(operation)
-    } else {
-        features.apply_op1_no_bwd(&operation)
-    }
+    let image_of = image_of.to_vec();
+    apply(FeatureSampling { places, image_of }, [features])
 }
 
 struct FeatureSampling {
@@ -119,32 +111,35 @@ struct FeatureSampling {
 }
 
 impl FeatureSampling {
-    /// Calls `visit` with each output place, its image and its neighbourhood, where that is not outside.
+    /// Calls `visit` with each output place, each pixel (among those of all images) around it, and that one's share. A
+    /// place outside has none.
     #[inline(always)]
-    fn visit(&self, size: ImageSize, mut visit: impl FnMut(usize, usize, Neighbourhood)) {
+    fn visit(&self, size: ImageSize, mut visit: impl FnMut(usize, usize, f32)) {
         let (x_range, y_range) = (-1.0..=size.width as f32, -1.0..=size.height as f32);
         for (index, place) in self.places.chunks_exact(2).enumerate() {
             let (x, y) = (place[0], place[1]);
-            if x_range.contains(&x) && y_range.contains(&y) {
-                visit(index, self.image_of[index / size.pixels()] as usize, size.around(x, y));
+            if !x_range.contains(&x) || !y_range.contains(&y) {
+                continue;
+            }
+            let around = size.around(x, y);
+            let first = self.image_of[index / size.pixels()] as usize * size.pixels();
+            for (pixel, share) in around.pixels.into_iter().zip(around.shares()) {
+                visit(index, first + pixel, share);
             }
         }
     }
 }
 
-impl CustomOp1 for FeatureSampling {
-    fn name(&self) -> &'static str {
-        "sample-features"
-    }
+impl FusedOperation<1> for FeatureSampling {
+    const NAME: &'static str = "sample-features";
 
-    fn cpu_fwd(&self, features: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (images, height, width, channels) = layout.shape().dims4()?;
+    fn forward(&self, [features]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
+        let (images, height, width, channels) = features.layout.shape().dims4()?;
         let size = ImageSize { height, width };
-        let count = self.places.len() / 2;
-        if count != size.pixels() * self.image_of.len() || self.image_of.iter().any(|&image| image as usize >= images) {
+        let (count, items) = (self.places.len() / 2, self.image_of.len());
+        if count != size.pixels() * items || self.image_of.iter().any(|&image| image as usize >= images) {
             bail!("{count} places do not fit {images} images of {width}×{height}");
         }
-        let values = slice(features, layout)?;
         let mut out = vec![0.0; count * channels];
         vectorized(
             #[inline(always)]
@@ -152,49 +147,36 @@ impl CustomOp1 for FeatureSampling {
                 self.visit(
                     size,
                     #[inline(always)]
-                    |index, image, around| {
-                        let out = &mut out[index * channels..(index + 1) * channels];
-                        for (pixel, share) in around.pixels.into_iter().zip(around.shares()) {
-                            let from = (image * size.pixels() + pixel) * channels;
-                            for (out, value) in out.iter_mut().zip(&values[from..from + channels]) {
-                                *out += share * value;
-                            }
-                        }
-                    },
+                    |index, pixel, share| add_scaled(&mut out, index, features.values, pixel, (channels, share)),
                 );
             },
         );
-        Ok((
-            CpuStorage::F32(out),
-            Shape::from((count / size.pixels(), height, width, channels)),
-        ))
+        Ok((out, Shape::from((items, height, width, channels))))
     }
 
-    fn bwd(&self, features: &Tensor, _y: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
-        let (_, height, width, channels) = features.dims4()?;
-        let size = ImageSize { height, width };
-        let mut sums = vec![0.0; features.elem_count()];
-        with_values(gradient, |gradient| {
-            vectorized(
-                #[inline(always)]
-                || {
-                    self.visit(
-                        size,
-                        #[inline(always)]
-                        |index, image, around| {
-                            let gradient = &gradient[index * channels..(index + 1) * channels];
-                            for (pixel, share) in around.pixels.into_iter().zip(around.shares()) {
-                                let to = (image * size.pixels() + pixel) * channels;
-                                for (sum, value) in sums[to..to + channels].iter_mut().zip(gradient) {
-                                    *sum += share * value;
-                                }
-                            }
-                        },
-                    );
-                },
-            );
-        })?;
-        Ok(Some(Tensor::from_vec(sums, features.dims(), features.device())?))
+    fn backward(&self, [features]: [Operand; 1], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
+        let (_, height, width, channels) = features.layout.shape().dims4()?;
+        let mut sums = vec![0.0; features.values.len()];
+        vectorized(
+            #[inline(always)]
+            || {
+                self.visit(
+                    ImageSize { height, width },
+                    #[inline(always)]
+                    |index, pixel, share| add_scaled(&mut sums, pixel, gradient.values, index, (channels, share)),
+                );
+            },
+        );
+        Ok([Some(sums)])
+    }
+}
+
+/// Adds the channels of the place `from` of `values`, times `share`, to those of the place `to` of `sums`.
+#[inline(always)]
+fn add_scaled(sums: &mut [f32], to: usize, values: &[f32], from: usize, (channels, share): (usize, f32)) {
+    let values = &values[from * channels..(from + 1) * channels];
+    for (sum, value) in sums[to * channels..(to + 1) * channels].iter_mut().zip(values) {
+        *sum += share * value;
     }
 }
 

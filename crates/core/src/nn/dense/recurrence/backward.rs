@@ -3,11 +3,11 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use candle_core::{Result, Tensor};
+use candle_core::{CpuStorage, Layout, Result};
 
 use super::steps::{Recurrence, RecurrenceTrace};
 use crate::nn::dense::gates::{self, StepActivations, add_product};
-use crate::nn::tensors::{add_columns, matrix, with_values};
+use crate::nn::tensors::{add_columns, product, rows_times};
 use crate::vectorized::vectorized;
 
 /// Gradients of the backward pass.
@@ -26,7 +26,7 @@ pub(super) struct RecurrenceGradients {
 
 impl Recurrence {
     /// Propagates the gradient of the output backward through every step.
-    pub(super) fn backward(&self, trace: &RecurrenceTrace, gradient: &[f32]) -> Result<RecurrenceGradients> {
+    pub(super) fn propagate(&self, trace: &RecurrenceTrace, gradient: &[f32]) -> Result<RecurrenceGradients> {
         let (hidden, features, steps) = (self.hidden, self.features(), self.steps);
         let batch = trace.h.len() / ((steps + 1) * hidden);
         let rows = batch * hidden;
@@ -48,8 +48,8 @@ impl Recurrence {
                     let step = t * batch * features..(t + 1) * batch * features;
                     add_columns(&mut gradients.first, &gradient[step.clone()]);
                     gradients.features[step].copy_from_slice(&gradients.first);
-                    let d_h = matrix(gradients.first.clone(), features)?.matmul(&feedback.weight.t()?)?;
-                    with_values(&d_h, |d_h| add_columns(&mut gradients.h, d_h))?;
+                    let d_h = rows_times(&gradients.first, &feedback.weight.t()?)?;
+                    add_columns(&mut gradients.h, &d_h);
                     if !feedback.residual {
                         gradients.first.fill(0.0);
                     }
@@ -57,18 +57,16 @@ impl Recurrence {
             }
             self.backward_step(trace, &mut gradients, t, batch);
             let sums = &gradients.sums[t * batch * 4 * hidden..(t + 1) * batch * 4 * hidden];
-            let sums = matrix(sums.to_vec(), 4 * hidden)?;
-            with_values(&sums.matmul(&self.w_h.t()?)?, |h| gradients.h.copy_from_slice(h))?;
+            gradients.h = rows_times(sums, &self.w_h.t()?)?;
             if let Some(feedback) = &self.feedback {
-                let d_features = sums.matmul(&feedback.w_x.t()?)?;
-                with_values(&d_features, |d_features| add_columns(&mut gradients.first, d_features))?;
+                add_columns(&mut gradients.first, &rows_times(sums, &feedback.w_x.t()?)?);
             }
         }
         Ok(gradients)
     }
 
     fn backward_step(&self, trace: &RecurrenceTrace, gradients: &mut RecurrenceGradients, t: usize, batch: usize) {
-        let hidden = self.hidden;
+        let (hidden, peepholes) = (self.hidden, self.peepholes());
         let RecurrenceGradients {
             sums,
             h,
@@ -89,7 +87,7 @@ impl Recurrence {
                     };
                     let d_sums = &mut sums[4 * before..4 * (before + hidden)];
                     let state = row * hidden..(row + 1) * hidden;
-                    gates::backward(step, self.peepholes(), &h[state.clone()], &mut c[state], d_sums);
+                    gates::backward(step, peepholes, &h[state.clone()], &mut c[state], d_sums);
                     add_product(p_i, &d_sums[..hidden], step.c_before);
                     add_product(p_f, &d_sums[hidden..2 * hidden], step.c_before);
                     add_product(p_o, &d_sums[3 * hidden..], step.c);
@@ -103,24 +101,28 @@ impl Recurrence {
         &self,
         trace: &RecurrenceTrace,
         gradients: &RecurrenceGradients,
-        sums: &Tensor,
-    ) -> Result<Tensor> {
+    ) -> Result<Vec<f32>> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = gradients.h.len() / hidden;
-        let before = |values: &[f32], size: usize| matrix(values[..values.len() - batch * size].to_vec(), size);
-        let mut parts = vec![before(&trace.h, hidden)?.t()?.matmul(sums)?.flatten_all()?];
-        for peephole in &gradients.peepholes {
-            parts.push(Tensor::from_slice(peephole, hidden, sums.device())?);
-        }
+        let (h_before, h_after) = (&trace.h[..trace.h.len() - batch * hidden], &trace.h[batch * hidden..]);
+        let mut weights = transposed_times((h_before, hidden), (&gradients.sums, 4 * hidden))?;
+        weights.extend(gradients.peepholes.iter().flatten());
         if self.feedback.is_some() {
-            parts.push(before(&trace.features, features)?.t()?.matmul(sums)?.flatten_all()?);
-            let after = matrix(trace.h[batch * hidden..].to_vec(), hidden)?;
-            let change = matrix(gradients.features.clone(), features)?;
-            parts.push(after.t()?.matmul(&change)?.flatten_all()?);
+            let before = &trace.features[..trace.features.len() - batch * features];
+            weights.extend(transposed_times((before, features), (&gradients.sums, 4 * hidden))?);
+            weights.extend(transposed_times((h_after, hidden), (&gradients.features, features))?);
             let mut bias = vec![0.0; features];
             add_columns(&mut bias, &gradients.features);
-            parts.push(Tensor::from_vec(bias, features, sums.device())?);
+            weights.extend(bias);
         }
-        Tensor::cat(&parts, 0)
+        Ok(weights)
     }
+}
+
+/// The product of a transposed matrix with another, both given by their rows and the length of a row.
+fn transposed_times((left, columns): (&[f32], usize), (right, width): (&[f32], usize)) -> Result<Vec<f32>> {
+    let rows = left.len() / columns;
+    let left_layout = Layout::contiguous((rows, columns)).transpose(0, 1)?;
+    let [left, right] = [left, right].map(|values| CpuStorage::F32(values.to_vec()));
+    product((&left, &left_layout), (&right, &Layout::contiguous((rows, width))))
 }

@@ -2,25 +2,24 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use std::sync::Mutex;
+use std::sync::OnceLock;
 
 use candle_core::{Result, Tensor};
 
-use crate::nn::dense::gates::{self, Peepholes};
-use crate::nn::tensors::{add_columns, matrix, with_values};
+use crate::nn::dense::gates;
+use crate::nn::tensors::{add_columns, rows_times};
 use crate::vectorized::vectorized;
 
 /// The output layer of an autoregressive decoder; its output is an input of the cell's next step.
-#[derive(Clone)]
-pub(super) struct FeedbackLoop {
+pub(in crate::nn::dense) struct FeedbackLoop {
     /// Weights from the features to the cell's sums `[F, 4H]`.
-    pub(super) w_x: Tensor,
+    pub(in crate::nn::dense) w_x: Tensor,
     /// Weights from the cell's output to the features `[H, F]`.
-    pub(super) weight: Tensor,
+    pub(in crate::nn::dense) weight: Tensor,
     /// Bias of the features `[F]`.
-    pub(super) bias: Vec<f32>,
+    pub(in crate::nn::dense) bias: Vec<f32>,
     /// Whether the layer's output is added to the previous features, instead of replacing them.
-    pub(super) residual: bool,
+    pub(in crate::nn::dense) residual: bool,
 }
 
 /// Values of all steps that the backward pass needs. Rows: the B rows of the first step, then those of the next step, …
@@ -36,13 +35,13 @@ pub(super) struct RecurrenceTrace {
 }
 
 /// An LSTM over all steps of a sequence, or of its own output.
-pub(super) struct Recurrence {
+pub(in crate::nn::dense) struct Recurrence {
     pub(super) steps: usize,
     pub(super) hidden: usize,
     pub(super) w_h: Tensor,
     pub(super) peepholes: [Vec<f32>; 3],
     pub(super) feedback: Option<FeedbackLoop>,
-    pub(super) trace: Mutex<Option<RecurrenceTrace>>,
+    pub(super) trace: OnceLock<RecurrenceTrace>,
 }
 
 impl Recurrence {
@@ -50,58 +49,42 @@ impl Recurrence {
         self.feedback.as_ref().map_or(0, |feedback| feedback.bias.len())
     }
 
-    pub(super) fn peepholes(&self) -> Peepholes<'_> {
-        let [i, f, o] = &self.peepholes;
-        Peepholes { i, f, o }
+    /// Diagonals of `W_ci`, `W_cf`, `W_co`, `[H]` each.
+    pub(super) fn peepholes(&self) -> [&[f32]; 3] {
+        self.peepholes.each_ref().map(Vec::as_slice)
     }
 
     /// Computes all steps from `start` `[B, H + H + F]`.
     pub(super) fn run(&self, projection: &[f32], start: &[f32]) -> Result<RecurrenceTrace> {
         let (hidden, features) = (self.hidden, self.features());
         let batch = start.len() / (2 * hidden + features);
-        let mut trace = RecurrenceTrace::new(start, [hidden, hidden, features], self.steps);
+        let mut trace = RecurrenceTrace::new(start, [hidden, features], self.steps);
         for t in 0..self.steps {
-            let before = t * batch..(t + 1) * batch;
-            let h = matrix(trace.h[before.start * hidden..before.end * hidden].to_vec(), hidden)?;
-            let recurrent = h.matmul(&self.w_h)?;
-            let projected_features = match &self.feedback {
-                Some(feedback) => {
-                    let previous = trace.features[before.start * features..before.end * features].to_vec();
-                    Some(matrix(previous, features)?.matmul(&feedback.w_x)?)
-                }
-                None => None,
+            // A step's part of values with this many in a row.
+            let range = |t: usize, size: usize| t * batch * size..(t + 1) * batch * size;
+            let recurrent = rows_times(&trace.h[range(t, hidden)], &self.w_h)?;
+            let fed_back = match &self.feedback {
+                Some(feedback) => rows_times(&trace.features[range(t, features)], &feedback.w_x)?,
+                None => Vec::new(),
             };
             let projection = if projection.len() == 4 * hidden {
                 projection
             } else {
-                &projection[before.start * 4 * hidden..before.end * 4 * hidden]
+                &projection[range(t, 4 * hidden)]
             };
-            let mut advance = |parts: [&[f32]; 3]| self.advance(&mut trace, t, batch, parts);
-            with_values(&recurrent, |recurrent| {
-                if let Some(projected_features) = &projected_features {
-                    with_values(projected_features, |projected_features| {
-                        advance([projection, recurrent, projected_features]);
-                    })
-                } else {
-                    advance([projection, recurrent, &[]]);
-                    Ok(())
-                }
-            })??;
+            self.advance(&mut trace, t, [projection, &recurrent, &fed_back]);
             if let Some(feedback) = &self.feedback {
-                let h = matrix(
-                    trace.h[before.end * hidden..(before.end + batch) * hidden].to_vec(),
-                    hidden,
-                )?;
-                let change = h.matmul(&feedback.weight)?;
-                feedback.advance(&mut trace.features, before.start * features, &change)?;
+                let change = rows_times(&trace.h[range(t + 1, hidden)], &feedback.weight)?;
+                feedback.advance(&mut trace.features[t * batch * features..], &change);
             }
         }
         Ok(trace)
     }
 
     /// Computes step `t` from the parts of its sums.
-    fn advance(&self, trace: &mut RecurrenceTrace, t: usize, batch: usize, parts: [&[f32]; 3]) {
-        let hidden = self.hidden;
+    fn advance(&self, trace: &mut RecurrenceTrace, t: usize, parts: [&[f32]; 3]) {
+        let (hidden, peepholes) = (self.hidden, self.peepholes());
+        let batch = trace.h.len() / ((self.steps + 1) * hidden);
         let RecurrenceTrace { activations, h, c, .. } = trace;
         let (c_before, c) = c[t * batch * hidden..].split_at_mut(batch * hidden);
         let h = &mut h[(t + 1) * batch * hidden..];
@@ -118,7 +101,7 @@ impl Recurrence {
                         let from = if part.len() == 4 * hidden { 0 } else { row * 4 * hidden };
                         add_columns(sums, &part[from..from + 4 * hidden]);
                     }
-                    gates::forward(sums, c_before, self.peepholes(), c, h);
+                    gates::forward(sums, c_before, peepholes, c, h);
                 }
             },
         );
@@ -126,30 +109,24 @@ impl Recurrence {
 }
 
 impl FeedbackLoop {
-    /// Computes the features after the step whose input features start at index `from`.
-    fn advance(&self, features: &mut [f32], from: usize, change: &Tensor) -> Result<()> {
-        let bias = &self.bias;
-        with_values(change, |change| {
-            let (before, after) = features[from..].split_at_mut(change.len());
-            for ((after, change), before) in after
-                .chunks_exact_mut(bias.len())
-                .zip(change.chunks_exact(bias.len()))
-                .zip(before.chunks_exact(bias.len()))
-            {
-                after.copy_from_slice(change);
-                add_columns(after, bias);
-                if self.residual {
-                    add_columns(after, before);
-                }
+    /// Computes the features after a step; `features` begin with those before it.
+    fn advance(&self, features: &mut [f32], change: &[f32]) {
+        let count = self.bias.len();
+        let (before, after) = features.split_at_mut(change.len());
+        let rows = after.chunks_exact_mut(count).zip(change.chunks_exact(count));
+        for ((after, change), before) in rows.zip(before.chunks_exact(count)) {
+            after.copy_from_slice(change);
+            add_columns(after, &self.bias);
+            if self.residual {
+                add_columns(after, before);
             }
-        })
+        }
     }
 }
 
 impl RecurrenceTrace {
     /// Allocates memory for all steps and writes the state before the first step.
-    fn new(start: &[f32], sizes: [usize; 3], steps: usize) -> Self {
-        let [hidden, _, features] = sizes;
+    fn new(start: &[f32], [hidden, features]: [usize; 2], steps: usize) -> Self {
         let width = 2 * hidden + features;
         let batch = start.len() / width;
         let mut trace = Self {
