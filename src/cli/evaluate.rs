@@ -133,8 +133,8 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         progress.update(now.done as u64, now.total as u64, || format!("{} {stage}", now.split));
     })?;
     progress.finish();
-    let inputs = evaluation::figure_inputs(&loaded, &dataset, &report)?;
-    evaluation::write(output.path(), &mut report, &inputs)?;
+    let figures = evaluation::draw_figures(&loaded, &dataset, &report)?;
+    evaluation::write(output.path(), &mut report, &figures)?;
     output.finish()?;
     if args.save_scores {
         let mut scores = report.headline();

@@ -214,10 +214,11 @@ fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
         // Random weights answer to actions at random.
         assert!(plans.rate < 0.8, "{}", plans.rate);
     }
-    let inputs = evaluation::figure_inputs(&model, &dataset, &report).unwrap();
-    let names: Vec<&str> = inputs.samples.iter().map(|sample| sample.name.as_str()).collect();
-    assert_eq!(names.len(), 9);
-    assert_eq!(names[3], "median-unseen-pairs");
+    let figures = evaluation::draw_figures(&model, &dataset, &report).unwrap();
+    let files = figures.iter().map(|figure| figure.about.file.as_str());
+    let predictions: Vec<&str> = files.filter(|file| file.starts_with("prediction-")).collect();
+    assert_eq!(predictions.len(), 9);
+    assert_eq!(predictions[3], "prediction-median-unseen-pairs.png");
 }
 
 #[test]
@@ -228,8 +229,8 @@ fn report_and_figures_are_written_and_read_back() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("report");
     evaluation::prepare(&out).unwrap();
-    let inputs = evaluation::figure_inputs(&model, &dataset, &report).unwrap();
-    evaluation::write(&out, &mut report, &inputs).unwrap();
+    let figures = evaluation::draw_figures(&model, &dataset, &report).unwrap();
+    evaluation::write(&out, &mut report, &figures).unwrap();
     let written: BTreeSet<String> = std::fs::read_dir(&out)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())

@@ -289,8 +289,8 @@ fn a_model_is_trained_and_scored_as_papers_do() {
         ..EvaluateConfig::default()
     };
     let report = evaluation::run(&loaded, &other, &whole, &|_| {}).unwrap();
-    let figures = evaluation::figure_inputs(&loaded, &other, &report).unwrap();
-    assert!(figures.animation.is_some_and(|animation| !animation.moments.is_empty()));
+    let figures = evaluation::draw_figures(&loaded, &other, &report).unwrap();
+    assert!(figures.iter().any(|figure| figure.about.file == "prediction.gif"));
     let scores = report.scores("test").unwrap();
     assert_eq!((scores.windows, scores.trials), (12, 12));
     for row in &scores.methods {

@@ -1,20 +1,19 @@
-//! From a model and a data set to a report that can be trusted: [`run`] scores the model against simple [`baselines`] on
-//! trials that training never saw, [`write()`] writes report, figures and animation into a directory.
+//! From a model and a data set to a report that can be trusted: [`run`] scores the model against simple baselines on
+//! trials that training never saw, [`draw_figures`] draws what the report shows, [`write()`] writes both into a directory.
 //!
 //! Frames are compared as the camera saw them: intensities 0…1, neither inverted nor smoothed.
 
 pub mod actions;
-pub mod baselines;
+mod baselines;
 pub mod bootstrap;
 mod calibrate;
-mod cholesky;
-pub mod compatible;
+mod compatible;
 mod config;
 mod error;
 pub mod figures;
-mod file;
 mod forecast;
-pub mod inference;
+mod inference;
+mod least_squares;
 mod markdown;
 pub mod method;
 pub mod metrics;
@@ -22,8 +21,7 @@ mod output;
 pub mod plans;
 mod progress;
 pub mod report;
-mod samples;
-pub mod score;
+mod score;
 pub mod skill;
 pub mod uncertainty;
 mod windows;
@@ -33,15 +31,16 @@ use std::time::Instant;
 pub use self::calibrate::{calibrate, calibrate_trained};
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 pub use self::error::EvaluationError;
+pub use self::figures::draw_figures;
 pub use self::output::{prepare, write};
-pub use self::progress::{EvaluationContext, EvaluationProgress, EvaluationStage};
+pub use self::progress::{EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
-pub use self::samples::figure_inputs;
 
 use self::baselines::Baselines;
+use self::inference::Inference;
 use self::method::Method;
+use self::progress::EvaluationContext;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
-use self::uncertainty::NoveltyScores;
 use self::windows::{evenly, window_shape};
 use foreframe_core::registry::Model;
 use foreframe_data::dataset::Dataset;
@@ -77,16 +76,17 @@ pub fn run(
             split_seed: split_seed.0,
         });
     }
-    let spec = loaded.spec();
-    let mut baselines = fitted_baselines(loaded, dataset, &splits, config)?;
-    if spec.flow().is_some() {
-        // Its codes are the frames themselves, so there is no codec to measure.
-        baselines = baselines.without(Method::CodecOnly);
-    }
+    let mut evaluation = EvaluationContext {
+        inference: Inference { loaded, dataset },
+        split: Split::Test,
+        config,
+        on_progress,
+    };
+    let baselines = fitted_baselines(&evaluation, &splits)?;
     let (mut sets, mut own_novelty) = (Vec::new(), Vec::new());
     for &split in tests {
-        let watched = config.watched(split, on_progress);
-        let (outcome, novelty) = score_split(loaded, (dataset, &splits), config, &baselines, &watched)?;
+        evaluation.split = split;
+        let (outcome, novelty) = score_split(&evaluation, &splits, &baselines)?;
         sets.push(SetReport {
             split: split.name().to_owned(),
             outcome,
@@ -96,9 +96,21 @@ pub fn run(
             own_novelty = novelty;
         }
     }
+    let compare = |&novel: &&Dataset| {
+        let Some(calibration) = &loaded.manifest.calibration else {
+            let model = loaded.manifest.name.clone();
+            return Err(EvaluationError::NotCalibrated { model });
+        };
+        let novel = EvaluationContext {
+            inference: Inference { loaded, dataset: novel },
+            split: Split::Test,
+            ..evaluation
+        };
+        uncertainty::compare(&novel, calibration, &own_novelty)
+    };
     Ok(EvaluationReport {
-        novelty: compare_novelty(loaded, config, &own_novelty, on_progress)?,
-        stamp: ReportStamp::new(loaded, dataset, split_seed, config, started.elapsed()),
+        novelty: config.novel.iter().map(compare).collect::<Result<_, _>>()?,
+        stamp: ReportStamp::new(&evaluation, split_seed, started.elapsed()),
         model: ModelSummary::of(loaded),
         sets,
         figures: Vec::new(),
@@ -107,60 +119,39 @@ pub fn run(
 
 /// The baselines for this data set. Where all of it is for testing, they are fitted to its own frames, and there is no
 /// training window to find. Errors: those of [`Splits::windows`].
-fn fitted_baselines(
-    loaded: &Model,
-    dataset: &Dataset,
-    splits: &Splits,
-    config: &EvaluateConfig,
-) -> Result<Baselines, EvaluationError> {
-    let shape = window_shape(loaded.spec());
+fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<Baselines, EvaluationError> {
+    let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
+    let (spec, trained_on) = (loaded.spec(), &loaded.manifest.dataset);
+    let fit = |splits: &Splits| Baselines::fit(dataset, splits, window_shape(spec), config.nearest_windows);
     let mut baselines = match config.split {
-        ScoredSplit::WholeSet => {
-            let own = Splits::new(dataset, loaded.manifest.dataset.split_seed);
-            Baselines::fit(dataset, &own, shape, config.nearest_windows)?.without(Method::NearestWindow)
-        }
-        _ => Baselines::fit(dataset, splits, shape, config.nearest_windows)?,
+        ScoredSplit::WholeSet => fit(&Splits::new(dataset, trained_on.split_seed))?.without(Method::NearestWindow),
+        _ => fit(splits)?,
     };
-    let of = |scenario: &Option<String>| scenario.as_deref() == Some(MOVING_MNIST);
-    if of(&loaded.manifest.dataset.scenario) || of(&dataset.info().scenario) {
+    let scenarios = [&trained_on.scenario, &dataset.info().scenario];
+    if scenarios
+        .iter()
+        .any(|scenario| scenario.as_deref() == Some(MOVING_MNIST))
+    {
         baselines = baselines.for_benchmark();
+    }
+    if spec.flow().is_some() {
+        // Its codes are the frames themselves, so there is no codec to measure.
+        baselines = baselines.without(Method::CodecOnly);
     }
     Ok(baselines)
 }
 
-/// How well novelty tells the other data sets from the windows with the novelty `own`.
-fn compare_novelty(
-    loaded: &Model,
-    config: &EvaluateConfig,
-    own: &[f64],
-    on_progress: &(dyn Fn(EvaluationProgress) + Sync),
-) -> Result<Vec<NoveltyScores>, EvaluationError> {
-    let Some(calibration) = &loaded.manifest.calibration else {
-        return match config.novel.first() {
-            Some(_) => Err(EvaluationError::NotCalibrated {
-                model: loaded.manifest.name.clone(),
-            }),
-            None => Ok(Vec::new()),
-        };
-    };
-    let watched = config.watched(Split::Test, on_progress);
-    let compare =
-        |other: &&Dataset| uncertainty::compare(loaded, calibration, (other, own, config.max_windows), &watched);
-    config.novel.iter().map(compare).collect()
-}
-
 /// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
-    loaded: &Model,
-    (dataset, splits): (&Dataset, &Splits),
-    config: &EvaluateConfig,
+    evaluation: &EvaluationContext,
+    splits: &Splits,
     baselines: &Baselines,
-    watched: &EvaluationContext,
 ) -> Result<(SetOutcome, Vec<f64>), EvaluationError> {
-    let spec = loaded.spec();
-    let available = splits.windows(dataset, watched.split, window_shape(spec), config.stride)?;
+    let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
+    let (spec, bootstrap) = (loaded.spec(), config.bootstrap());
+    let available = splits.windows(dataset, evaluation.split, window_shape(spec), config.stride)?;
     if available.is_empty() {
-        let reason = match watched.split {
+        let reason = match evaluation.split {
             Split::UnseenPairs => "the data set has no trials with held-out start/goal pairs",
             Split::UnseenGains => "the data set has no trials with held-out gains",
             _ => "the split has no trials; collect more",
@@ -169,25 +160,21 @@ fn score_split(
         return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
     let windows = evenly(&available, config.max_windows);
-    let windows_scored = score::score(loaded, dataset, &windows, baselines, watched)?;
-    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &watched.bootstrap);
+    let windows_scored = score::score(evaluation, &windows, baselines)?;
+    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &bootstrap);
     if baselines.are_of_benchmark() {
         metrics::add_benchmark(&mut scores.methods, &windows_scored, spec.pixels());
     }
     scores.windows_available = available.len();
     if spec.action_inputs().is_some() {
-        let errors = actions::compare(loaded, &config.twins, dataset, &windows, watched)?;
-        let frames = window_shape(spec).frames();
-        let group_of: Vec<usize> = windows
-            .iter()
-            .map(|&window| bootstrap::resampled_with(dataset, window, frames))
-            .collect();
-        scores.actions = Some(actions::table(&errors, &group_of, &watched.bootstrap));
-        scores.plans = Some(plans::identify(loaded, dataset, &windows, watched)?);
+        let group_of: Vec<usize> = windows_scored.iter().map(|window| window.group).collect();
+        let errors = actions::compare(evaluation, &windows)?;
+        scores.actions = Some(actions::table(&errors, &group_of, &bootstrap));
+        scores.plans = Some(plans::identify(evaluation, &windows)?);
     }
     let mut novelty = Vec::new();
     if let Some(calibration) = &loaded.manifest.calibration {
-        let (measured, found) = uncertainty::measure(loaded, calibration, dataset, &windows, watched)?;
+        let (measured, found) = uncertainty::measure(evaluation, calibration, &windows)?;
         scores.uncertainty = Some(measured);
         novelty = found;
     }

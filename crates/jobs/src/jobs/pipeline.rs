@@ -250,7 +250,7 @@ impl Pipeline {
             report.progress(now.done as u64, now.total as u64, &format!("{} {stage}", now.split));
         });
         let mut found = found.map_err(|error| failed(&error))?;
-        let figures = evaluation::figure_inputs(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
+        let figures = evaluation::draw_figures(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let dir = report_key(report.id());
         // An earlier attempt may have left an incomplete report.
         retry.run(async || self.store.objects().delete(&dir).await)?;

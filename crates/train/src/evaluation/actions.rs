@@ -7,15 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
-use super::inference::{self, ActionSource};
+use super::inference::{ActionSource, Inference};
 use super::metrics::StepCurve;
 use super::progress::{EvaluationContext, EvaluationStage};
-use foreframe_core::frame::preprocess::scale;
-use foreframe_core::frame::quality;
+use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::Window;
 
 /// One row of the action table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -60,7 +59,7 @@ impl Variant {
 
 /// Which row of the table a twin is, by what it lacks. Errors: `Twin` where it takes other windows than the model, has
 /// seen other data, or lacks neither the action nor the state.
-pub fn twin_variant(loaded: &Model, twin: &Model) -> Result<Variant, EvaluationError> {
+pub(super) fn twin_variant(loaded: &Model, twin: &Model) -> Result<Variant, EvaluationError> {
     let (spec, other) = (loaded.spec(), twin.spec());
     let refused = |found: String, wanted: String| EvaluationError::Twin {
         twin: twin.manifest.name.clone(),
@@ -120,12 +119,11 @@ pub struct ActionTable {
 }
 
 /// A variant's mean squared errors, `[window][step]`.
-pub type VariantErrors = (Variant, Vec<Vec<f64>>);
+pub(super) type VariantErrors = (Variant, Vec<Vec<f64>>);
 
 /// For each of `count` windows another one whose actions it gets: a single cycle through all (Sattolo 1986), so none
 /// keeps its own. With a single window there is no other.
-#[must_use]
-pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
+fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
     let mut rng = seed.derive("shuffled actions", 0).rng();
     let mut donors: Vec<usize> = (0..count).collect();
     for last in (1..count).rev() {
@@ -135,73 +133,45 @@ pub fn shuffle(count: usize, seed: Seed) -> Vec<usize> {
 }
 
 /// Errors of each variant, per window and step. Errors: those of the network, `NotFinite`.
-pub fn compare(
-    loaded: &Model,
-    twins: &[&Model],
-    dataset: &Dataset,
+pub(super) fn compare(
+    evaluation: &EvaluationContext,
     windows: &[Window],
-    watched: &EvaluationContext,
 ) -> Result<Vec<VariantErrors>, EvaluationError> {
-    let donors: Vec<Window> = shuffle(windows.len(), watched.bootstrap.seed)
-        .into_iter()
-        .map(|donor| windows[donor])
-        .collect();
-    let mut variants = vec![
-        (Variant::True, loaded),
-        (Variant::Shuffled, loaded),
-        (Variant::Held, loaded),
-        (Variant::Zeroed, loaded),
-    ];
-    for twin in twins {
+    let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
+    let donors = shuffle(windows.len(), config.seed).into_iter();
+    let donors: Vec<Window> = donors.map(|donor| windows[donor]).collect();
+    let own = [Variant::True, Variant::Shuffled, Variant::Held, Variant::Zeroed];
+    let mut variants = own.map(|variant| (variant, loaded)).to_vec();
+    for twin in &config.twins {
         variants.push((twin_variant(loaded, twin)?, twin));
     }
     let total = variants.len() * windows.len();
     let mut all = Vec::new();
     for (variant, model) in variants {
+        let inference = Inference { loaded: model, dataset };
+        let window_values = model.spec().horizon * model.spec().pixels();
         let mut errors = Vec::with_capacity(windows.len());
-        for (batch, donors) in windows.chunks(watched.batch).zip(donors.chunks(watched.batch)) {
+        for (batch, donors) in windows.chunks(config.batch).zip(donors.chunks(config.batch)) {
             let source = match variant {
                 Variant::Shuffled => ActionSource::OfWindows(donors),
                 Variant::Held => ActionSource::Held,
                 Variant::Zeroed => ActionSource::Zero,
                 _ => ActionSource::Recorded,
             };
-            errors.extend(errors_of(model, dataset, batch, source)?);
-            watched.report(
-                EvaluationStage::Actions,
-                all.len() * windows.len() + errors.len(),
-                total,
-            )?;
+            let predicted = inference.predict(batch, source)?.frames;
+            let predicted = predicted.par_chunks_exact(window_values).zip(batch);
+            let found = predicted.map(|(frames, &window)| inference.step_errors(window, frames));
+            errors.extend(found.collect::<Result<Vec<_>, EvaluationError>>()?);
+            let done = all.len() * windows.len() + errors.len();
+            evaluation.report(EvaluationStage::Actions, done, total)?;
         }
         all.push((variant, errors));
     }
     Ok(all)
 }
 
-fn errors_of(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-    source: ActionSource,
-) -> Result<Vec<Vec<f64>>, EvaluationError> {
-    let spec = loaded.spec();
-    let predicted = inference::predict(loaded, dataset, windows, source)?;
-    let frames = predicted.par_chunks_exact(spec.horizon * spec.pixels());
-    let error = |(frames, window): (&[f32], &Window)| {
-        let steps = frames.chunks_exact(spec.pixels()).enumerate();
-        let mse = steps.map(|(step, frame)| {
-            let truth = scale(&dataset.pixels(window.first_frame + spec.context + step)?);
-            Ok(quality::mse(&spec.preprocess.inverse(frame), &truth))
-        });
-        mse.collect()
-    };
-    frames.zip(windows).map(error).collect()
-}
-
 /// The table of these errors per variant, window and step; the true actions come first.
-#[must_use]
-pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
-    let curves: Vec<StepCurve> = errors.iter().map(|(_, windows)| mean_over(windows)).collect();
+pub(super) fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap) -> ActionTable {
     let of_window = |window: usize| -> Vec<f64> {
         let mean = |(_, windows): &VariantErrors| StepCurve::new(windows[window].clone()).mean;
         errors.iter().map(mean).collect()
@@ -219,18 +189,17 @@ pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap
         means.iter().copied().chain(reductions).collect()
     });
     let means = trials.means();
-    let rows: Vec<ActionRow> = errors
-        .iter()
-        .zip(curves)
-        .enumerate()
-        .map(|(row, ((variant, _), mse))| ActionRow {
+    let row = |(row, (variant, windows)): (usize, &VariantErrors)| {
+        let steps = windows.first().map_or(0, Vec::len);
+        ActionRow {
             variant: *variant,
-            mse,
+            mse: StepCurve::mean_over(windows, steps, |window, step| window[step]),
             interval: intervals.as_ref().map(|all| all[row]),
             reduction: reduction(&means, row),
             reduction_interval: intervals.as_ref().map(|all| all[errors.len() + row]),
-        })
-        .collect();
+        }
+    };
+    let rows: Vec<ActionRow> = errors.iter().enumerate().map(row).collect();
     let (conditioning_works, finding) = judge(&rows);
     ActionTable {
         rows,
@@ -239,34 +208,19 @@ pub fn table(errors: &[VariantErrors], trial_of: &[usize], bootstrap: &Bootstrap
     }
 }
 
-fn mean_over(windows: &[Vec<f64>]) -> StepCurve {
-    let mut sums = vec![0.0; windows.first().map_or(0, Vec::len)];
-    for window in windows {
-        for (sum, value) in sums.iter_mut().zip(window) {
-            *sum += value;
-        }
-    }
-    StepCurve::new(sums.into_iter().map(|sum| sum / windows.len() as f64).collect())
-}
-
 /// Conditioning works only where true actions beat all others and a twin without the action, with intervals apart. A twin
 /// without the state says nothing about the action.
 fn judge(rows: &[ActionRow]) -> (bool, String) {
     let Some((truth, others)) = rows.split_first() else {
         return (false, "Nothing was compared.".to_owned());
     };
-    let apart = |row: &&ActionRow| match (&truth.interval, &row.interval) {
+    let is_beaten = |row: &&ActionRow| match (&truth.interval, &row.interval) {
         (Some(truth), Some(other)) => truth.is_below(other),
         _ => false,
     };
-    let labels = |rows: &[&ActionRow]| {
-        rows.iter()
-            .map(|row| row.variant.label())
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
-    let others = || others.iter().filter(|row| row.variant != Variant::TwinWithoutState);
-    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others().partition(apart);
+    let others = others.iter().filter(|row| row.variant != Variant::TwinWithoutState);
+    let (beaten, unbeaten): (Vec<&ActionRow>, Vec<&ActionRow>) = others.partition(is_beaten);
+    let labels = |rows: &[&ActionRow]| comma_separated(&rows.iter().map(|row| row.variant.label()).collect::<Vec<_>>());
     if !unbeaten.is_empty() {
         let finding = format!(
             "Conditioning is not shown to work: the interval of true actions does not lie below that of {}.",
@@ -274,17 +228,16 @@ fn judge(rows: &[ActionRow]) -> (bool, String) {
         );
         return (false, finding);
     }
-    if !others().any(|row| row.variant.is_twin_without_action()) {
+    let beaten_labels = labels(&beaten);
+    if !beaten.iter().any(|row| row.variant.is_twin_without_action()) {
         let finding = format!(
-            "Conditioning is not shown to work yet: true actions beat {} with intervals apart, but no twin without the action was compared.",
-            labels(&beaten)
+            "Conditioning is not shown to work yet: true actions beat {beaten_labels} with intervals apart, but no twin without the action was compared."
         );
         return (false, finding);
     }
-    let least = others().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
+    let least = beaten.iter().map(|row| row.reduction).fold(f64::INFINITY, f64::min);
     let finding = format!(
-        "Conditioning works: true actions beat {} with intervals apart, by at least {:.0} % of the MSE.",
-        labels(&beaten),
+        "Conditioning works: true actions beat {beaten_labels} with intervals apart, by at least {:.0} % of the MSE.",
         100.0 * least
     );
     (true, finding)

@@ -9,14 +9,14 @@ mod nearest;
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
-pub use self::input::BaselineInput;
+pub(super) use self::input::BaselineInput;
 use self::input::mean;
 use self::nearest::TrainingWindows;
 use super::EvaluationError;
 use super::method::Method;
 use super::windows::evenly;
 use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
-use foreframe_data::dataset::{Dataset, DatasetError, Window};
+use foreframe_data::dataset::{Dataset, DatasetError};
 use foreframe_data::motion::{Shift, phase_correlation, shifted};
 
 /// How the camera's motion follows from the actions.
@@ -26,7 +26,7 @@ enum EgoMotion {
 }
 
 /// The baselines with what they learn from the training split.
-pub struct Baselines {
+pub(super) struct Baselines {
     methods: Vec<Method>,
     width: usize,
     training_mean: Vec<f32>,
@@ -40,22 +40,26 @@ impl Baselines {
     /// training window of that shape exists there is no nearest one. All but the mean training frame look only at a limited
     /// number of windows or frames, evenly spread: the nearest window is one of `searched`. Errors: those of
     /// [`Splits::windows`] and [`Dataset::pixels`].
-    pub fn fit(
+    pub(super) fn fit(
         dataset: &Dataset,
         splits: &Splits,
         shape: WindowShape,
         searched: usize,
     ) -> Result<Self, EvaluationError> {
+        // None where no window of that shape fits.
+        let training_windows = |shape| match splits.windows(dataset, Split::Train, shape, 1) {
+            Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
+            windows => windows,
+        };
         let ego_motion = match CameraTurn::of(dataset.info()) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
-            None => {
-                AffineFlow::fit(dataset, &training_windows(dataset, splits, affine_flow::SHAPE)?)?.map(EgoMotion::Flow)
-            }
+            None => AffineFlow::fit(dataset, &training_windows(affine_flow::SHAPE)?)?.map(EgoMotion::Flow),
         };
-        let windows = training_windows(dataset, splits, shape)?;
-        let nearest = TrainingWindows::new(dataset, &evenly(&windows, searched), shape)?;
-        let single = WindowShape { context: 1, horizon: 1 };
-        let frames = training_windows(dataset, splits, single)?;
+        let nearest = TrainingWindows::new(dataset, &evenly(&training_windows(shape)?, searched), shape)?;
+        // Every frame that has a successor in the split.
+        let pair = WindowShape { context: 1, horizon: 1 };
+        let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
+        let frames: Vec<usize> = pairs.iter().map(|pair| pair.first_frame).collect();
         let methods = Method::ALL.into_iter().filter(|method| match method {
             Method::EgoMotion => ego_motion.is_some(),
             Method::NearestWindow => nearest.is_some(),
@@ -65,7 +69,7 @@ impl Baselines {
         Ok(Self {
             methods: methods.collect(),
             width: dataset.info().frame_width_px as usize,
-            training_mean: training_mean(dataset, splits)?,
+            training_mean: mean_frame(dataset, &frames)?,
             cut_out: CutOut::fit(dataset, &frames)?,
             ego_motion,
             nearest,
@@ -73,35 +77,31 @@ impl Baselines {
     }
 
     /// The same without one of the rows.
-    #[must_use]
-    pub fn without(mut self, method: Method) -> Self {
+    pub(super) fn without(mut self, method: Method) -> Self {
         self.methods.retain(|&other| other != method);
         self
     }
 
     /// The same with what a benchmark of mostly black frames adds: the black frame, and the scores that its papers print.
-    #[must_use]
-    pub fn for_benchmark(mut self) -> Self {
+    pub(super) fn for_benchmark(mut self) -> Self {
         let codec = self.methods.iter().position(|&method| method == Method::CodecOnly);
         self.methods.insert(codec.unwrap_or(self.methods.len()), Method::Black);
         self
     }
 
     /// Whether the scores of published benchmarks are computed too.
-    #[must_use]
-    pub fn are_of_benchmark(&self) -> bool {
+    pub(super) fn are_of_benchmark(&self) -> bool {
         self.methods.contains(&Method::Black)
     }
 
     /// The rows of the tables: the model, the baselines that apply to this data set, the codec.
-    #[must_use]
-    pub fn methods(&self) -> &[Method] {
+    pub(super) fn methods(&self) -> &[Method] {
         &self.methods
     }
 
     /// The frames 1…`horizon` steps ahead as a baseline predicts them; none for a method that is no baseline or that does
     /// not apply to the data set. Errors: those of [`Dataset::pixels`].
-    pub fn predict(
+    pub(super) fn predict(
         &self,
         dataset: &Dataset,
         method: Method,
@@ -133,15 +133,6 @@ impl Baselines {
     }
 }
 
-/// All training windows of that shape; none where none fits.
-fn training_windows(dataset: &Dataset, splits: &Splits, shape: WindowShape) -> Result<Vec<Window>, EvaluationError> {
-    match splits.windows(dataset, Split::Train, shape, 1) {
-        Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
-        windows => Ok(windows?),
-    }
-}
-
-/// A frame of a data set, 0…1.
 /// With times centred on their mean, a pixel's slope is Σ time · value / Σ time².
 fn extrapolate(frames: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
     let mean = mean(frames);
@@ -156,15 +147,14 @@ fn extrapolate(frames: &[Vec<f32>], horizon: usize) -> Vec<Vec<f32>> {
             }
         }
     }
-    (1..=horizon)
-        .map(|step| {
-            let ahead = centre + step as f32;
-            mean.iter()
-                .zip(&slope)
-                .map(|(mean, slope)| (mean + slope * ahead).clamp(0.0, 1.0))
-                .collect()
-        })
-        .collect()
+    let at = |step: usize| {
+        let ahead = centre + step as f32;
+        let pixels = mean.iter().zip(&slope);
+        pixels
+            .map(|(mean, slope)| (mean + slope * ahead).clamp(0.0, 1.0))
+            .collect()
+    };
+    (1..=horizon).map(at).collect()
 }
 
 fn move_on(inputs: &[Vec<f32>], width: usize, horizon: usize) -> Vec<Vec<f32>> {
@@ -172,32 +162,22 @@ fn move_on(inputs: &[Vec<f32>], width: usize, horizon: usize) -> Vec<Vec<f32>> {
         return vec![inputs.last().cloned().unwrap_or_default(); horizon];
     };
     let Shift { x_px, y_px } = phase_correlation(before, last, width);
-    (1..=horizon)
-        .map(|step| {
-            shifted(
-                last,
-                width,
-                Shift {
-                    x_px: x_px * step as f32,
-                    y_px: y_px * step as f32,
-                },
-            )
-        })
-        .collect()
+    let after = |step: usize| Shift {
+        x_px: x_px * step as f32,
+        y_px: y_px * step as f32,
+    };
+    (1..=horizon).map(|step| shifted(last, width, after(step))).collect()
 }
 
-/// The mean frame of the training split, 0…1, over every frame that has a successor in the split.
-/// Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
-fn training_mean(dataset: &Dataset, splits: &Splits) -> Result<Vec<f32>, EvaluationError> {
-    let pair = WindowShape { context: 1, horizon: 1 };
-    let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
+/// The mean of these frames, 0…1. Errors: those of [`Dataset::pixels`].
+fn mean_frame(dataset: &Dataset, frames: &[usize]) -> Result<Vec<f32>, EvaluationError> {
     let mut sums = vec![0_u64; dataset.info().frame_pixels()];
-    for pair in &pairs {
-        for (sum, &value) in sums.iter_mut().zip(&*dataset.pixels(pair.first_frame)?) {
+    for &frame in frames {
+        for (sum, &value) in sums.iter_mut().zip(&*dataset.pixels(frame)?) {
             *sum += u64::from(value);
         }
     }
-    let scale = 1.0 / (255.0 * pairs.len().max(1) as f64);
+    let scale = 1.0 / (255.0 * frames.len().max(1) as f64);
     Ok(sums.into_iter().map(|sum| (sum as f64 * scale) as f32).collect())
 }
 
@@ -206,9 +186,10 @@ mod tests {
     use rand::Rng;
 
     use super::*;
+    use crate::evaluation::windows::true_frame;
     use foreframe_core::frame::quality::mse;
     use foreframe_core::types::{Channel, Seed};
-    use foreframe_data::dataset::{DatasetInfo, EpisodeData};
+    use foreframe_data::dataset::{DatasetInfo, EpisodeData, Window};
 
     const SIDE: usize = 16;
 
@@ -255,7 +236,7 @@ mod tests {
         let (baselines, splits) = fitted(dataset, searched);
         let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
         let errors = windows.iter().flat_map(|&window| {
-            let frame = |step: usize| input::frame_of(dataset, window.first_frame + step).unwrap();
+            let frame = |step: usize| true_frame(dataset, window.first_frame + step).unwrap();
             let inputs: Vec<Vec<f32>> = (0..SHAPE.context).map(frame).collect();
             let input = BaselineInput::of_window(dataset, window, SHAPE, &inputs);
             let predicted = baselines.predict(dataset, method, &input, SHAPE.horizon).unwrap();
@@ -325,7 +306,7 @@ mod tests {
         let shape = WindowShape { context: 1, horizon: 1 };
         let splits = Splits::new(&dataset, Seed(1));
         let baselines = Baselines::fit(&dataset, &splits, shape, usize::MAX).unwrap();
-        let inputs = [input::frame_of(&dataset, 0).unwrap()];
+        let inputs = [true_frame(&dataset, 0).unwrap()];
         let window = Window {
             episode: 0,
             first_frame: 0,

@@ -11,7 +11,7 @@ use foreframe_data::dataset::{Dataset, Window};
 const BLOCK_WINDOWS: usize = 5;
 
 /// Share of the resampled values that an [`Interval`] holds.
-pub const CONFIDENCE: f64 = 0.95;
+pub(super) const CONFIDENCE: f64 = 0.95;
 
 /// The range of the middle [`CONFIDENCE`] of the values computed from resampled trials.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,8 +32,7 @@ impl Interval {
 
 /// What a window is resampled with, windows having this number of frames: its trial, or in a recording the block of frames in
 /// which it starts, by the block's first frame.
-#[must_use]
-pub fn resampled_with(dataset: &Dataset, window: Window, frames: usize) -> usize {
+pub(super) fn resampled_with(dataset: &Dataset, window: Window, frames: usize) -> usize {
     let episode = &dataset.episodes()[window.episode];
     if episode.trial.is_some() {
         return window.episode;
@@ -45,23 +44,23 @@ pub fn resampled_with(dataset: &Dataset, window: Window, frames: usize) -> usize
 
 /// How often to resample, from which seed.
 #[derive(Clone, Copy, Debug)]
-pub struct Bootstrap {
+pub(super) struct Bootstrap {
     /// Number of resamples.
-    pub samples: usize,
+    pub(super) samples: usize,
     /// The same seed draws the same trials, so values computed separately are resampled in the same way.
-    pub seed: Seed,
+    pub(super) seed: Seed,
 }
 
 /// Sums of the windows' values for each trial: all that resampling of trials needs.
 #[derive(Clone, Debug)]
-pub struct TrialSums {
+pub(super) struct TrialSums {
     windows: Vec<f64>,
     sums: Vec<Vec<f64>>,
 }
 
 impl TrialSums {
     /// Groups windows by their trial. `values` holds one row of equal length for every window, in the order of `trial_of`.
-    pub fn group<R: AsRef<[f64]>>(trial_of: &[usize], values: impl Iterator<Item = R>) -> Self {
+    pub(super) fn group<R: AsRef<[f64]>>(trial_of: &[usize], values: impl Iterator<Item = R>) -> Self {
         let mut known: Vec<usize> = trial_of.to_vec();
         known.sort_unstable();
         known.dedup();
@@ -84,14 +83,12 @@ impl TrialSums {
     }
 
     /// Number of trials.
-    #[must_use]
-    pub fn count(&self) -> usize {
+    pub(super) fn count(&self) -> usize {
         self.windows.len()
     }
 
     /// Mean over all windows, of each value.
-    #[must_use]
-    pub fn means(&self) -> Vec<f64> {
+    pub(super) fn means(&self) -> Vec<f64> {
         self.means_of(0..self.count())
     }
 
@@ -111,7 +108,11 @@ impl TrialSums {
     }
 
     /// The interval of each value of `statistic`, a function of the means; none with fewer than two trials.
-    pub fn intervals(&self, bootstrap: &Bootstrap, statistic: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Interval>> {
+    pub(super) fn intervals(
+        &self,
+        bootstrap: &Bootstrap,
+        statistic: impl Fn(&[f64]) -> Vec<f64>,
+    ) -> Option<Vec<Interval>> {
         let count = self.count();
         if count < 2 || bootstrap.samples == 0 {
             return None;

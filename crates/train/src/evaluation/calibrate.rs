@@ -1,15 +1,16 @@
 //! Fits a model's [`Calibration`]: what a training context looks like and which actions and states it has, from the
 //! training split; how large the errors are and how they follow from what is known beforehand, from the validation split.
 
+use std::array;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use super::cholesky;
 use super::config::EvaluateConfig;
 use super::forecast::{Forecast, contexts, forecasts};
-use super::progress::EvaluationProgress;
-use super::windows::evenly;
-use super::windows::window_shape;
+use super::inference::Inference;
+use super::least_squares::{factor, forward, mean_and_deviation, second_moments, solve};
+use super::progress::{EvaluationContext, EvaluationProgress};
+use super::windows::{evenly, window_shape};
 use super::{EvaluationError, compatible};
 use foreframe_core::registry::calibration::{
     APPEARANCE, Calibration, ContextStatistics, ERROR_INPUTS, NoveltyScale, StepErrors, ValueRange,
@@ -55,20 +56,18 @@ pub fn calibrate(
             split_seed: split_seed.0,
         });
     }
-    let watched = |split| config.watched(split, on_progress);
-    let seen = contexts(
-        loaded,
-        dataset,
-        &evenly(&training, TRAINING_WINDOWS),
-        &watched(Split::Train),
-    )?;
+    let evaluation = |split| EvaluationContext {
+        inference: Inference { loaded, dataset },
+        split,
+        config,
+        on_progress,
+    };
+    let seen = contexts(&evaluation(Split::Train), &evenly(&training, TRAINING_WINDOWS))?;
     let mut novelty = novelty_scale(&seen);
     let validation = evenly(&validation, config.max_windows);
-    let found = forecasts(loaded, dataset, &validation, &novelty, &watched(Split::Validation))?;
-    let distances: Vec<f64> = found
-        .iter()
-        .map(|forecast| novelty.distance(&forecast.context))
-        .collect();
+    let found = forecasts(&evaluation(Split::Validation), &validation, &novelty)?;
+    let distances = found.iter().map(|forecast| novelty.distance(&forecast.context));
+    let distances: Vec<f64> = distances.collect();
     novelty.quantiles = (0..=QUANTILE_STEPS)
         .map(|step| quantile(distances.clone(), step as f64 / QUANTILE_STEPS as f64) as f32)
         .collect();
@@ -104,13 +103,11 @@ pub fn calibrate_trained(model_dir: &Path, dataset: &Dataset, cancelled: &Atomic
 
 /// The smallest and largest value of each channel over all frames of the windows.
 fn ranges(windows: &[Window], frames: usize, channels: usize, values: &dyn Fn(usize) -> Vec<f32>) -> Vec<ValueRange> {
-    let mut ranges = vec![
-        ValueRange {
-            min: f32::INFINITY,
-            max: f32::NEG_INFINITY,
-        };
-        channels
-    ];
+    let none = ValueRange {
+        min: f32::INFINITY,
+        max: f32::NEG_INFINITY,
+    };
+    let mut ranges = vec![none; channels];
     let mut next = 0;
     for window in windows {
         // Windows overlap; each frame is read once.
@@ -127,32 +124,17 @@ fn ranges(windows: &[Window], frames: usize, channels: usize, values: &dyn Fn(us
 
 /// What the contexts of the training look like. The quantiles are filled in later.
 fn novelty_scale(seen: &[ContextStatistics]) -> NoveltyScale {
-    let count = seen.len() as f64;
-    let mean: [f64; APPEARANCE] =
-        std::array::from_fn(|at| seen.iter().map(|context| context.appearance[at]).sum::<f64>() / count);
-    let spread: [f64; APPEARANCE] = std::array::from_fn(|at| {
-        let squares = seen.iter().map(|context| (context.appearance[at] - mean[at]).powi(2));
-        (squares.sum::<f64>() / count).sqrt() + LEAST_SPREAD
-    });
-    let mut correlations = vec![0.0; APPEARANCE * APPEARANCE];
-    for context in seen {
-        let z: [f64; APPEARANCE] = std::array::from_fn(|at| (context.appearance[at] - mean[at]) / spread[at]);
-        for (place, sum) in correlations.iter_mut().enumerate() {
-            *sum += z[place / APPEARANCE] * z[place % APPEARANCE] / count;
-        }
-    }
-    for at in 0..APPEARANCE {
-        correlations[at * APPEARANCE + at] += RIDGE;
-    }
-    let factor =
-        cholesky::factor(&correlations, APPEARANCE).expect("correlations with a ridge that are not positive is a bug");
+    let statistics: [[f64; 2]; APPEARANCE] =
+        array::from_fn(|at| mean_and_deviation(seen.iter().map(|context| context.appearance[at])));
+    let mean = statistics.map(|[mean, _]| mean);
+    let spread = statistics.map(|[_, deviation]| deviation + LEAST_SPREAD);
+    let scaled = |context: &ContextStatistics| array::from_fn(|at| (context.appearance[at] - mean[at]) / spread[at]);
+    let rows: Vec<[f64; APPEARANCE]> = seen.iter().map(scaled).collect();
+    let factor = factor(&second_moments(&rows), APPEARANCE, RIDGE)
+        .expect("correlations with a ridge that are not positive is a bug");
     // Column by column: the inverse of the factor, over the spread.
-    let columns: Vec<Vec<f64>> = (0..APPEARANCE)
-        .map(|at| {
-            let unit = (0..APPEARANCE).map(|other| f64::from(u8::from(other == at))).collect();
-            cholesky::forward(&factor, unit)
-        })
-        .collect();
+    let column = |at: usize| forward(&factor, (0..APPEARANCE).map(|row| f64::from(row == at)).collect());
+    let columns: [Vec<f64>; APPEARANCE] = array::from_fn(column);
     let row = |row: usize| (0..=row).map(|at| rounded(columns[at][row] / spread[at])).collect();
     let still: Vec<f64> = seen.iter().map(|context| context.still).collect();
     let still_median = quantile(still.clone(), 0.5);
@@ -172,49 +154,30 @@ fn novelty_scale(seen: &[ContextStatistics]) -> NoveltyScale {
 
 /// Least squares of the logarithm of the errors of a step, and the factors that its residuals give.
 fn step_errors(found: &[Forecast], step: usize) -> StepErrors {
-    let rows: Vec<([f64; ERROR_INPUTS], f64)> = found
-        .iter()
-        .map(|forecast| (forecast.inputs[step], forecast.errors[step].max(LEAST_ERROR)))
-        .collect();
-    let count = rows.len() as f64;
-    let mean: [f64; ERROR_INPUTS] = std::array::from_fn(|at| rows.iter().map(|(x, _)| x[at]).sum::<f64>() / count);
-    let spread: [f64; ERROR_INPUTS] = std::array::from_fn(|at| {
-        let squares = rows.iter().map(|(x, _)| (x[at] - mean[at]).powi(2));
-        (squares.sum::<f64>() / count).sqrt()
-    });
-    // An input that never changes, such as the actions' size without actions, says nothing.
-    let z = |x: &[f64; ERROR_INPUTS], at: usize| {
-        if spread[at] > LEAST_SPREAD {
-            (x[at] - mean[at]) / spread[at]
-        } else {
-            0.0
-        }
-    };
-    let mean_log = rows.iter().map(|(_, error)| error.ln()).sum::<f64>() / count;
-    let mut matrix = vec![0.0; ERROR_INPUTS * ERROR_INPUTS];
+    let errors = || found.iter().map(|forecast| forecast.errors[step].max(LEAST_ERROR));
+    let [mean_log, _] = mean_and_deviation(errors().map(f64::ln));
+    let statistics: [[f64; 2]; ERROR_INPUTS] =
+        array::from_fn(|at| mean_and_deviation(found.iter().map(|forecast| forecast.inputs[step][at])));
+    let mean = statistics.map(|[mean, _]| mean);
+    // An input that never changes, such as the actions' size without actions, says nothing: its weight is 0.
+    let spread = statistics.map(|[_, spread]| if spread > LEAST_SPREAD { spread } else { f64::INFINITY });
+    let scaled = |forecast: &Forecast| array::from_fn(|at| (forecast.inputs[step][at] - mean[at]) / spread[at]);
+    let rows: Vec<[f64; ERROR_INPUTS]> = found.iter().map(scaled).collect();
+    let count = found.len() as f64;
     let mut right_side = vec![0.0; ERROR_INPUTS];
-    for (x, error) in &rows {
-        for (at, sum) in right_side.iter_mut().enumerate() {
-            *sum += z(x, at) * (error.ln() - mean_log) / count;
-            for other in 0..ERROR_INPUTS {
-                matrix[at * ERROR_INPUTS + other] += z(x, at) * z(x, other) / count;
-            }
+    for (row, error) in rows.iter().zip(errors()) {
+        for (sum, value) in right_side.iter_mut().zip(row) {
+            *sum += value * (error.ln() - mean_log) / count;
         }
     }
-    for at in 0..ERROR_INPUTS {
-        matrix[at * ERROR_INPUTS + at] += RIDGE;
-    }
-    let factor =
-        cholesky::factor(&matrix, ERROR_INPUTS).expect("mean squares with a ridge that are not positive is a bug");
-    let slopes = cholesky::solve(&factor, right_side);
-    let weight = |at: usize| {
-        if spread[at] > LEAST_SPREAD {
-            slopes[at] / spread[at]
-        } else {
-            0.0
-        }
-    };
-    let weights: Vec<f64> = (0..ERROR_INPUTS).map(weight).collect();
+    let factor = factor(&second_moments(&rows), ERROR_INPUTS, RIDGE)
+        .expect("mean squares with a ridge that are not positive is a bug");
+    let slopes = solve(&factor, right_side);
+    let weights: Vec<f64> = slopes
+        .iter()
+        .zip(spread)
+        .map(|(slope, spread)| slope / spread)
+        .collect();
     let intercept = mean_log - weights.iter().zip(mean).map(|(w, m)| w * m).sum::<f64>();
     let mut fitted = StepErrors {
         intercept: rounded(intercept),
@@ -223,9 +186,10 @@ fn step_errors(found: &[Forecast], step: usize) -> StepErrors {
         low_factor: 1.0,
         high_factor: 1.0,
     };
-    let ratios: Vec<f64> = rows
-        .iter()
-        .map(|(x, error)| error / f64::from(fitted.expected(x).mse))
+    let median = |forecast: &Forecast| f64::from(fitted.expected(&forecast.inputs[step]).mse);
+    let ratios: Vec<f64> = errors()
+        .zip(found)
+        .map(|(error, forecast)| error / median(forecast))
         .collect();
     fitted.mean_factor = rounded(ratios.iter().sum::<f64>() / count);
     fitted.low_factor = rounded(quantile(ratios.clone(), TAIL));

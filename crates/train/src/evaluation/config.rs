@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
 use super::bootstrap::Bootstrap;
-use super::progress::{EvaluationContext, EvaluationProgress};
 use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
@@ -113,21 +112,11 @@ impl EvaluateConfig<'_> {
         Ok(())
     }
 
-    /// What a pass over this split needs besides its windows.
-    pub(super) fn watched<'a>(
-        &'a self,
-        split: Split,
-        on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
-    ) -> EvaluationContext<'a> {
-        EvaluationContext {
-            split,
-            batch: self.batch,
-            bootstrap: Bootstrap {
-                samples: self.bootstrap_samples,
-                seed: self.seed,
-            },
-            on_progress,
-            cancelled: self.cancelled,
+    /// How intervals are resampled.
+    pub(super) fn bootstrap(&self) -> Bootstrap {
+        Bootstrap {
+            samples: self.bootstrap_samples,
+            seed: self.seed,
         }
     }
 }

@@ -25,48 +25,16 @@ pub enum EvaluationError {
         /// The data set's name.
         dataset: String,
     },
-    /// The frames have another size.
-    #[error(
-        "data set \"{dataset}\" has frames of {width}×{height} px; model \"{model}\" takes {wanted_width}×{wanted_height}"
-    )]
-    FrameSize {
+    /// The model takes other frames, another frame period, or other actions or states.
+    #[error("data set \"{dataset}\" has {found}; model \"{model}\" {wanted}")]
+    Mismatch {
         /// The data set's name.
         dataset: String,
-        /// Width of its frames.
-        width: u32,
-        /// Height of its frames.
-        height: u32,
-        /// The model's name.
-        model: ModelName,
-        /// Width that it takes.
-        wanted_width: u32,
-        /// Height that it takes.
-        wanted_height: u32,
-    },
-    /// The frames are further apart, or closer, than the model's.
-    #[error("data set \"{dataset}\" has a frame every {period_s} s; model \"{model}\" predicts one every {wanted_s} s")]
-    FramePeriod {
-        /// The data set's name.
-        dataset: String,
-        /// Seconds between its frames.
-        period_s: f64,
-        /// The model's name.
-        model: ModelName,
-        /// Seconds between the model's frames.
-        wanted_s: f64,
-    },
-    /// Actions or states have other components.
-    #[error("data set \"{dataset}\" has the {kind} [{found}]; model \"{model}\" takes [{wanted}]")]
-    Channels {
-        /// The data set's name.
-        dataset: String,
-        /// `action` or `state`.
-        kind: &'static str,
-        /// Its components with units.
+        /// What it has.
         found: String,
         /// The model's name.
         model: ModelName,
-        /// The components that it takes, with units.
+        /// What it takes or predicts.
         wanted: String,
     },
     /// Another split would test on what the model was trained on.
@@ -185,9 +153,7 @@ impl HasErrorKind for EvaluationError {
         match self {
             Self::Dataset(error) => error.kind(),
             Self::Registry(error) => error.kind(),
-            Self::FrameSize { .. }
-            | Self::FramePeriod { .. }
-            | Self::Channels { .. }
+            Self::Mismatch { .. }
             | Self::SplitSeed { .. }
             | Self::Twin { .. }
             | Self::Setting { .. }

@@ -1,18 +1,21 @@
 //! Windows through a model, batch by batch.
 
+use std::ops::Range;
+
 use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::EvaluationError;
-use foreframe_core::frame::preprocess::Preprocess;
+use super::windows::true_frame;
 use foreframe_core::frame::resize::{Resize, resize};
+use foreframe_core::frame::{Frame, quality};
 use foreframe_core::nn::{ConditioningTensors, Feedback, ModelSpec};
 use foreframe_core::registry::Model;
 use foreframe_data::dataset::{Dataset, Window};
 
 /// Which future actions the model gets.
 #[derive(Clone, Copy, Debug)]
-pub enum ActionSource<'a> {
+pub(super) enum ActionSource<'a> {
     /// Those that were carried out.
     Recorded,
     /// For each window, in the order of the batch, those carried out in another one.
@@ -23,87 +26,8 @@ pub enum ActionSource<'a> {
     Zero,
 }
 
-/// What a model computed from a batch of windows. All frames are `[window][step]`, P values each, one after another, in the
-/// model's space and not clamped.
-#[derive(Clone, Debug)]
-pub struct Predicted {
-    /// The predicted frames.
-    pub frames: Vec<f32>,
-    /// The true frames to come.
-    pub truth: Vec<f32>,
-    /// The true frames to come through the frame encoder and decoder.
-    pub codec: Vec<f32>,
-    /// The frames seen as the model reconstructs them; empty if it does not.
-    pub reconstructed: Vec<f32>,
-}
-
-/// Predicts each window's frames to come. Errors: those of the network, `NotFinite`.
-pub fn predict(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-    source: ActionSource,
-) -> Result<Vec<f32>, EvaluationError> {
-    let spec = loaded.spec();
-    let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
-    let frames = Tensor::from_vec(inputs, (windows.len(), spec.context, spec.pixels()), &Device::Cpu)?;
-    let condition = condition(spec, dataset, windows, source)?;
-    let predicted = values(&loaded.network.predict_frames(&frames, &condition)?)?;
-    let window_values = spec.horizon * spec.pixels();
-    match predicted.iter().position(|value| !value.is_finite()) {
-        Some(place) => Err(EvaluationError::NotFinite {
-            model: loaded.manifest.name.clone(),
-            frame: windows
-                .get(place / window_values)
-                .map_or(0, |window| window.first_frame),
-        }),
-        None => Ok(predicted),
-    }
-}
-
-/// As [`predict`] with the true actions, the true frames to come through the frame encoder and decoder, and the
-/// reconstruction of those seen.
-pub fn predict_with_ceiling(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-) -> Result<Predicted, EvaluationError> {
-    let spec = loaded.spec();
-    let frames = predict(loaded, dataset, windows, ActionSource::Recorded)?;
-    let truth = model_space(
-        dataset,
-        spec.preprocess,
-        windows,
-        spec.context..spec.context + spec.horizon,
-    )?;
-    let targets = Tensor::from_slice(&truth, (windows.len() * spec.horizon, spec.pixels()), &Device::Cpu)?;
-    let codec = values(&loaded.network.decode_frames(&loaded.network.encode_frames(&targets)?)?)?;
-    Ok(Predicted {
-        frames,
-        truth,
-        codec,
-        reconstructed: reconstruct(loaded, dataset, windows)?,
-    })
-}
-
-/// The windows' inputs as the model reconstructs them: `[window][step]`, P values each, in the model's space. Empty if it
-/// does not reconstruct.
-pub fn reconstruct(loaded: &Model, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f32>, EvaluationError> {
-    let (model, spec) = (&loaded.network, loaded.spec());
-    let (batch, context) = (windows.len(), spec.context);
-    let inputs = model_space(dataset, spec.preprocess, windows, 0..context)?;
-    let frames = Tensor::from_vec(inputs, (batch * context, spec.pixels()), &Device::Cpu)?;
-    let features = model
-        .encode_frames(&frames)?
-        .reshape((batch, context, spec.code_len()))?;
-    let Some(features) = model.reconstruct(&features)? else {
-        return Ok(Vec::new());
-    };
-    values(&model.decode_frames(&features.reshape((batch * context, spec.code_len()))?)?)
-}
-
-/// A batch of windows with the codes behind the frames, one window after another.
-pub(super) struct PredictedCodes {
+/// What a model predicted from a batch of windows, one window after another.
+pub(super) struct Predicted {
     /// Codes of the frames seen.
     pub(super) seen: Vec<f32>,
     /// Codes of the predicted frames.
@@ -114,118 +38,135 @@ pub(super) struct PredictedCodes {
     pub(super) actions: Vec<f32>,
 }
 
-/// As [`predict`], with the codes. Errors: those of the network.
-pub(super) fn predict_with_codes(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-    source: ActionSource,
-) -> Result<PredictedCodes, EvaluationError> {
-    let (model, spec) = (&loaded.network, loaded.spec());
-    let (batch, code) = (windows.len(), spec.code_len());
-    let inputs = model_space(dataset, spec.preprocess, windows, 0..spec.context)?;
-    let seen = encode(loaded, &inputs)?;
-    let condition = condition(spec, dataset, windows, source)?;
-    let contexts = Tensor::from_slice(&seen, (batch, spec.context, code), &Device::Cpu)?;
-    let codes = model.predict(&contexts, &condition, Feedback::Prediction)?;
-    let frames = model.decode_frames(&codes.reshape((batch * spec.horizon, code))?)?;
-    Ok(PredictedCodes {
-        seen,
-        codes: values(&codes)?,
-        frames: values(&frames)?,
-        actions: condition.actions.as_ref().map(values).transpose()?.unwrap_or_default(),
-    })
+/// A model on a data set.
+#[derive(Clone, Copy)]
+pub(super) struct Inference<'a> {
+    pub(super) loaded: &'a Model,
+    pub(super) dataset: &'a Dataset,
 }
 
-/// Codes of frames in the model's space, both one after another. Errors: those of the network.
-pub(super) fn encode(loaded: &Model, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
-    let pixels = loaded.spec().pixels();
-    let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
-    values(&loaded.network.encode_frames(&frames)?)
-}
-
-/// Frames of a data set of any size in the model's space, one after another. Another size is cropped and resized.
-pub(super) fn resized_frames(
-    dataset: &Dataset,
-    spec: &ModelSpec,
-    frames: &[usize],
-) -> Result<Vec<f32>, EvaluationError> {
-    let mut all = Vec::with_capacity(frames.len() * spec.pixels());
-    for &frame in frames {
-        let frame = resize(
-            &dataset.frame(frame)?,
-            spec.frame_width_px,
-            spec.frame_height_px,
-            Resize::Crop,
-        )?;
-        all.extend(spec.preprocess.forward(&frame));
+impl<'a> Inference<'a> {
+    /// The model's specification.
+    pub(super) fn spec(&self) -> &'a ModelSpec {
+        self.loaded.spec()
     }
-    Ok(all)
+
+    /// Predicts each window's frames to come. Errors: those of the network, `NotFinite`.
+    pub(super) fn predict(&self, windows: &[Window], source: ActionSource) -> Result<Predicted, EvaluationError> {
+        let (network, spec) = (&self.loaded.network, self.spec());
+        let seen = self.encode(&self.frames(windows, 0..spec.context)?)?;
+        let contexts = Tensor::from_slice(&seen, (windows.len(), spec.context, spec.code_len()), &Device::Cpu)?;
+        let condition = self.condition(windows, source)?;
+        let codes = network.predict(&contexts, &condition, Feedback::Prediction)?;
+        let frames = values(&network.decode_frames(&codes.flatten(0, 1)?)?)?;
+        if let Some(place) = frames.iter().position(|value| !value.is_finite()) {
+            return Err(EvaluationError::NotFinite {
+                model: self.loaded.manifest.name.clone(),
+                frame: windows[place / (spec.horizon * spec.pixels())].first_frame,
+            });
+        }
+        Ok(Predicted {
+            seen,
+            codes: values(&codes)?,
+            frames,
+            actions: condition.actions.as_ref().map(values).transpose()?.unwrap_or_default(),
+        })
+    }
+
+    /// Frames of windows as the model reconstructs them from the codes of the frames seen, in the model's space. Empty if it
+    /// does not reconstruct. Errors: those of the network.
+    pub(super) fn reconstruct(&self, seen: &[f32]) -> Result<Vec<f32>, EvaluationError> {
+        let (context, code) = (self.spec().context, self.spec().code_len());
+        let codes = Tensor::from_slice(seen, (seen.len() / (context * code), context, code), &Device::Cpu)?;
+        match self.loaded.network.reconstruct(&codes)? {
+            Some(codes) => values(&self.loaded.network.decode_frames(&codes.flatten(0, 1)?)?),
+            None => Ok(Vec::new()),
+        }
+    }
+
+    /// Frames in the model's space through its frame encoder and decoder. Errors: those of the network.
+    pub(super) fn through_codec(&self, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
+        let shape = (frames.len() / self.spec().pixels(), self.spec().code_len());
+        let codes = Tensor::from_vec(self.encode(frames)?, shape, &Device::Cpu)?;
+        values(&self.loaded.network.decode_frames(&codes)?)
+    }
+
+    /// Codes of frames in the model's space, both one after another. Errors: those of the network.
+    pub(super) fn encode(&self, frames: &[f32]) -> Result<Vec<f32>, EvaluationError> {
+        let pixels = self.spec().pixels();
+        let frames = Tensor::from_slice(frames, (frames.len() / pixels, pixels), &Device::Cpu)?;
+        values(&self.loaded.network.encode_frames(&frames)?)
+    }
+
+    /// Those steps of each window in the model's space, one after another. Frames of another size are cropped and resized.
+    pub(super) fn frames(&self, windows: &[Window], steps: Range<usize>) -> Result<Vec<f32>, EvaluationError> {
+        let spec = self.spec();
+        let (width, height, pixels) = (spec.frame_width_px, spec.frame_height_px, spec.pixels());
+        let mut all = vec![0.0; windows.len() * steps.len() * pixels];
+        let places = all.par_chunks_exact_mut(pixels).enumerate();
+        places.try_for_each(|(index, place)| -> Result<(), EvaluationError> {
+            let frame = windows[index / steps.len()].first_frame + steps.start + index % steps.len();
+            let frame = resize(&self.dataset.frame(frame)?, width, height, Resize::Crop)?;
+            place.copy_from_slice(&spec.preprocess.forward(&frame));
+            Ok(())
+        })?;
+        Ok(all)
+    }
+
+    /// Frames as the camera would see them, of values in the model's space. Errors: `Frame` where one is not finite.
+    pub(super) fn camera_frames(&self, values: &[f32]) -> Result<Vec<Frame>, EvaluationError> {
+        let spec = self.spec();
+        let frames = values.chunks_exact(spec.pixels());
+        let (width, height) = (spec.frame_width_px, spec.frame_height_px);
+        let frames = frames.map(|frame| spec.preprocess.frame_from(frame, width, height));
+        Ok(frames.collect::<Result<_, _>>()?)
+    }
+
+    /// The mean squared error of each of a window's predicted frames, which are in the model's space; intensities 0…1.
+    pub(super) fn step_errors(&self, window: Window, predicted: &[f32]) -> Result<Vec<f64>, EvaluationError> {
+        let spec = self.spec();
+        let future = window.first_frame + spec.context..;
+        let error = |(frame, predicted): (usize, &[f32])| {
+            let truth = true_frame(self.dataset, frame)?;
+            Ok(quality::mse(&spec.preprocess.inverse(predicted), &truth))
+        };
+        future.zip(predicted.chunks_exact(spec.pixels())).map(error).collect()
+    }
+
+    /// Action k of a window is the one recorded at the frame before its k-th predicted frame.
+    fn condition(&self, windows: &[Window], source: ActionSource) -> Result<ConditioningTensors, EvaluationError> {
+        let (dataset, spec, batch) = (self.dataset, self.spec(), windows.len());
+        let last = spec.context - 1;
+        let mut condition = ConditioningTensors::none();
+        if let Some(count) = spec.action_inputs() {
+            let mut actions = Vec::with_capacity(batch * spec.horizon * count);
+            let acting = match source {
+                ActionSource::OfWindows(others) => others,
+                _ => windows,
+            };
+            for window in acting {
+                for step in 0..spec.horizon {
+                    let place = match source {
+                        ActionSource::Held => last.saturating_sub(1),
+                        _ => last + step,
+                    };
+                    actions.extend_from_slice(dataset.action(window.first_frame + place));
+                }
+            }
+            if matches!(source, ActionSource::Zero) {
+                actions.fill(0.0);
+            }
+            condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);
+        }
+        if let Some(count) = spec.state_inputs() {
+            let states = windows.iter().map(|window| dataset.state(window.first_frame + last));
+            let states = states.collect::<Vec<_>>().concat();
+            condition.state = Some(Tensor::from_vec(states, (batch, count), &Device::Cpu)?);
+        }
+        Ok(condition)
+    }
 }
 
 fn values(tensor: &Tensor) -> Result<Vec<f32>, EvaluationError> {
     Ok(tensor.flatten_all()?.to_vec1::<f32>()?)
-}
-
-/// Those steps of each window in the model's space.
-fn model_space(
-    dataset: &Dataset,
-    preprocess: Preprocess,
-    windows: &[Window],
-    steps: std::ops::Range<usize>,
-) -> Result<Vec<f32>, EvaluationError> {
-    let frames: Vec<usize> = windows
-        .iter()
-        .flat_map(|window| steps.clone().map(|step| window.first_frame + step))
-        .collect();
-    let size = dataset.info().frame_pixels();
-    let mut all = vec![0.0; frames.len() * size];
-    all.par_chunks_mut(size)
-        .zip(frames)
-        .try_for_each(|(out, frame)| -> Result<(), EvaluationError> {
-            out.copy_from_slice(&preprocess.forward(&dataset.frame(frame)?));
-            Ok(())
-        })?;
-    Ok(all)
-}
-
-/// Action k of a window is the one recorded at the frame before its k-th predicted frame.
-fn condition(
-    spec: &ModelSpec,
-    dataset: &Dataset,
-    windows: &[Window],
-    source: ActionSource,
-) -> Result<ConditioningTensors, EvaluationError> {
-    let batch = windows.len();
-    let mut condition = ConditioningTensors::none();
-    if let Some(count) = spec.action_inputs() {
-        let recorded = |windows: &[Window]| -> Vec<f32> {
-            let frames = windows.iter().flat_map(|window| {
-                let last = window.first_frame + spec.context - 1;
-                last..last + spec.horizon
-            });
-            frames.flat_map(|frame| dataset.action(frame).iter().copied()).collect()
-        };
-        let actions = match source {
-            ActionSource::Recorded => recorded(windows),
-            ActionSource::OfWindows(others) => recorded(others),
-            ActionSource::Held => windows
-                .iter()
-                .flat_map(|window| {
-                    let before = window.first_frame + spec.context.saturating_sub(2);
-                    dataset.action(before).repeat(spec.horizon)
-                })
-                .collect(),
-            ActionSource::Zero => vec![0.0; batch * spec.horizon * count],
-        };
-        condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);
-    }
-    if let Some(count) = spec.state_inputs() {
-        let states: Vec<f32> = windows
-            .iter()
-            .flat_map(|window| dataset.state(window.first_frame + spec.context - 1).iter().copied())
-            .collect();
-        condition.state = Some(Tensor::from_vec(states, (batch, count), &Device::Cpu)?);
-    }
-    Ok(condition)
 }

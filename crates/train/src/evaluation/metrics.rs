@@ -7,42 +7,41 @@ use foreframe_core::frame::quality;
 
 /// The greatest PSNR of a frame, in dB: that of rounding to 8 bits. Without it, one perfect frame would make a mean
 /// infinite.
-pub const PSNR_CAP_DB: f64 = 59.0;
+pub(super) const PSNR_CAP_DB: f64 = 59.0;
 
 /// Scores of one predicted frame against the true one, intensities 0…1.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct FrameScore {
+pub(super) struct FrameScore {
     /// Mean squared error per pixel.
-    pub mse: f64,
+    pub(super) mse: f64,
     /// Peak signal-to-noise ratio in dB, at most [`PSNR_CAP_DB`].
-    pub psnr_db: f64,
+    pub(super) psnr_db: f64,
     /// Structural similarity, −1…1.
-    pub ssim: f64,
+    pub(super) ssim: f64,
     /// The same with the even windows of published benchmarks; 0 where that was not asked for.
-    pub ssim_even: f64,
+    pub(super) ssim_even: f64,
     /// Sum of squared errors over the pixels of moving robots in the true frame.
-    pub mover_squared_error: f64,
+    pub(super) mover_squared_error: f64,
     /// Number of such pixels.
-    pub mover_pixels: usize,
+    pub(super) mover_pixels: usize,
 }
 
 /// A true frame and the mask of its movers.
 #[derive(Clone, Copy, Debug)]
-pub struct TargetFrame<'a> {
+pub(super) struct TargetFrame<'a> {
     /// Intensities 0…1.
-    pub pixels: &'a [f32],
+    pub(super) pixels: &'a [f32],
     /// 0 for pixels of the scene, other values for pixels of movers; absent for recordings.
-    pub mask: Option<&'a [u8]>,
+    pub(super) mask: Option<&'a [u8]>,
     /// Width in pixels.
-    pub width: usize,
+    pub(super) width: usize,
     /// Whether the scores of published benchmarks are computed too.
-    pub for_benchmark: bool,
+    pub(super) for_benchmark: bool,
 }
 
 impl FrameScore {
     /// Compares a predicted frame with the true one.
-    #[must_use]
-    pub fn of(predicted: &[f32], truth: &TargetFrame) -> Self {
+    pub(super) fn of(predicted: &[f32], truth: &TargetFrame) -> Self {
         let mse = quality::mse(predicted, truth.pixels);
         let mut score = Self {
             mse,
@@ -79,29 +78,34 @@ impl StepCurve {
         let mean = per_step.iter().sum::<f64>() / per_step.len().max(1) as f64;
         Self { per_step, mean }
     }
+
+    /// The mean over the items of the value that each has at a step.
+    pub(super) fn mean_over<T>(items: &[T], steps: usize, value: impl Fn(&T, usize) -> f64) -> Self {
+        let mean_at = |step| items.iter().map(|item| value(item, step)).sum::<f64>() / items.len() as f64;
+        Self::new((0..steps).map(mean_at).collect())
+    }
 }
 
 /// All scores of one window.
 #[derive(Clone, Debug)]
-pub struct WindowScores {
+pub(super) struct WindowScores {
     /// Position of its trial in the data set.
-    pub episode: usize,
+    pub(super) episode: usize,
     /// Its first frame in the data set.
-    pub first_frame: usize,
+    pub(super) first_frame: usize,
     /// What it is resampled with: windows of the same number are not independent.
-    pub group: usize,
+    pub(super) group: usize,
     /// `frames[row][step]`, one row for each method that was scored.
-    pub frames: Vec<Vec<FrameScore>>,
+    pub(super) frames: Vec<Vec<FrameScore>>,
     /// Mean squared error of the model in its own space, per step.
-    pub model_space_mse: Vec<f64>,
+    pub(super) model_space_mse: Vec<f64>,
     /// Mean squared error of the reconstruction of each frame seen, the oldest first.
-    pub reconstruction_mse: Vec<f64>,
+    pub(super) reconstruction_mse: Vec<f64>,
 }
 
 impl WindowScores {
     /// Mean squared error of the model over all steps.
-    #[must_use]
-    pub fn model_mse(&self) -> f64 {
+    pub(super) fn model_mse(&self) -> f64 {
         let steps = self.frames.first().map_or(&[][..], Vec::as_slice);
         steps.iter().map(|score| score.mse).sum::<f64>() / steps.len().max(1) as f64
     }
@@ -135,7 +139,7 @@ pub struct BenchmarkScores {
 }
 
 /// Adds the benchmark's scores to the rows of [`summarize`], for frames of `frame_pixels` pixels.
-pub fn add_benchmark(rows: &mut [MethodScores], windows: &[WindowScores], frame_pixels: usize) {
+pub(super) fn add_benchmark(rows: &mut [MethodScores], windows: &[WindowScores], frame_pixels: usize) {
     for (row, scores) in rows.iter_mut().enumerate() {
         scores.benchmark = Some(BenchmarkScores {
             squared_error: mean_curve(windows, row, |score| score.mse * frame_pixels as f64),
@@ -145,8 +149,7 @@ pub fn add_benchmark(rows: &mut [MethodScores], windows: &[WindowScores], frame_
 }
 
 /// The tables' rows from the windows' scores of these methods.
-#[must_use]
-pub fn summarize(methods: &[Method], windows: &[WindowScores]) -> Vec<MethodScores> {
+pub(super) fn summarize(methods: &[Method], windows: &[WindowScores]) -> Vec<MethodScores> {
     methods
         .iter()
         .enumerate()
@@ -166,8 +169,9 @@ fn steps(windows: &[WindowScores], row: usize) -> usize {
 }
 
 fn mean_curve(windows: &[WindowScores], row: usize, value: impl Fn(&FrameScore) -> f64) -> StepCurve {
-    let mean_at = |step: usize| windows.iter().map(|w| value(&w.frames[row][step])).sum::<f64>() / windows.len() as f64;
-    StepCurve::new((0..steps(windows, row)).map(mean_at).collect())
+    StepCurve::mean_over(windows, steps(windows, row), |window, step| {
+        value(&window.frames[row][step])
+    })
 }
 
 fn mover_curve(windows: &[WindowScores], row: usize) -> Option<StepCurve> {

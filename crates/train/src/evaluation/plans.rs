@@ -8,19 +8,18 @@ use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
 use super::bootstrap::{Interval, TrialSums};
-use super::inference::{self, ActionSource};
+use super::inference::{ActionSource, Inference};
 use super::progress::{EvaluationContext, EvaluationStage};
-use super::windows::evenly;
+use super::windows::{evenly, true_frame};
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::Model;
 use foreframe_core::types::{Action, Seed};
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::Window;
 use foreframe_sim::{World, WorldConfig};
 
 /// Plans at each context: the one that was carried out, and those of other windows.
-pub const PLANS: usize = 8;
+const PLANS: usize = 8;
 /// Contexts at most, evenly spread over the windows.
 const MAX_CONTEXTS: usize = 60;
 /// A replayed frame that differs by more than this mean squared error is not the recorded one.
@@ -58,16 +57,12 @@ pub struct PlanIdentification {
 type Futures = Option<Vec<Vec<f32>>>;
 
 /// Measures a model that takes actions on these windows. Errors: those of the network and the simulator, `Cancelled`.
-pub fn identify(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-    watched: &EvaluationContext,
-) -> Result<PlanOutcome, EvaluationError> {
+pub(super) fn identify(evaluation: &EvaluationContext, windows: &[Window]) -> Result<PlanOutcome, EvaluationError> {
+    let (inference, config) = (evaluation.inference, evaluation.config);
+    let (dataset, spec) = (inference.dataset, inference.spec());
     let skipped = |reason: &str| {
-        Ok(PlanOutcome::Skipped {
-            reason: reason.to_owned(),
-        })
+        let reason = reason.to_owned();
+        Ok(PlanOutcome::Skipped { reason })
     };
     let Some(world) = &dataset.info().world else {
         return skipped("the data set is a recording, so no other plan can be tried");
@@ -82,41 +77,35 @@ pub fn identify(
     if !windows.iter().all(drives) {
         return skipped("the camera stands still in this scenario, whatever the plan");
     }
-    let spec = loaded.spec();
     let contexts = evenly(windows, MAX_CONTEXTS);
+    let plans: Vec<Vec<Window>> = (0..)
+        .zip(&contexts)
+        .map(|(index, &own)| plans_of(own, windows, config.seed.derive("plans", index)))
+        .collect();
+    let together = (config.batch / PLANS).max(1);
     let mut identified = Vec::with_capacity(contexts.len());
-    for (first, part) in contexts.chunks((watched.batch / PLANS).max(1)).enumerate() {
-        let first = first * (watched.batch / PLANS).max(1);
-        let plans: Vec<Vec<Window>> = (first..)
-            .zip(part)
-            .map(|(index, &own)| plans_of(own, windows, watched.bootstrap.seed.derive("plans", index as u64)))
-            .collect();
-        let futures: Result<Vec<Futures>, EvaluationError> = part
-            .par_iter()
-            .zip(&plans)
-            .map(|(&context, plans)| futures(spec, dataset, world, context, plans))
-            .collect();
-        let Some(futures) = futures?.into_iter().collect::<Option<Vec<_>>>() else {
+    for (contexts_now, plans) in contexts.chunks(together).zip(plans.chunks(together)) {
+        let futures = contexts_now.par_iter().zip(plans);
+        let futures = futures.map(|(&context, plans)| futures_of(inference, world, context, plans));
+        let Some(futures) = futures.collect::<Result<Option<Vec<_>>, EvaluationError>>()? else {
             return skipped("the simulator no longer reproduces the frames of this data set");
         };
-        let repeated: Vec<Window> = part.iter().flat_map(|&context| [context; PLANS]).collect();
-        let predicted = inference::predict(loaded, dataset, &repeated, ActionSource::OfWindows(&plans.concat()))?;
+        let repeated: Vec<Window> = contexts_now.iter().flat_map(|&context| [context; PLANS]).collect();
+        let plans = plans.concat();
+        let predicted = inference.predict(&repeated, ActionSource::OfWindows(&plans))?.frames;
         let predicted = predicted.par_chunks_exact(PLANS * spec.horizon * spec.pixels());
-        identified.par_extend(
-            predicted
-                .zip(&futures)
-                .map(|(predicted, futures)| share_identified(spec, predicted, futures)),
-        );
-        watched.report(EvaluationStage::Plans, identified.len(), contexts.len())?;
+        let shares = predicted.zip(&futures);
+        identified.par_extend(shares.map(|(predicted, futures)| share_identified(spec, predicted, futures)));
+        evaluation.report(EvaluationStage::Plans, identified.len(), contexts.len())?;
     }
     let trial_of: Vec<usize> = contexts.iter().map(|context| context.episode).collect();
     let trials = TrialSums::group(&trial_of, identified.iter().map(|&share| [share]));
-    let interval = trials.intervals(&watched.bootstrap, <[f64]>::to_vec);
+    let interval = trials.intervals(&config.bootstrap(), <[f64]>::to_vec);
     Ok(PlanOutcome::Measured(PlanIdentification {
         contexts: contexts.len(),
         plans: PLANS,
-        rate: trials.means().first().copied().unwrap_or(0.0),
-        interval: interval.and_then(|all| all.first().copied()),
+        rate: trials.means()[0],
+        interval: interval.map(|all| all[0]),
         chance: 1.0 / PLANS as f64,
     }))
 }
@@ -135,18 +124,19 @@ fn plans_of(own: Window, windows: &[Window], seed: Seed) -> Vec<Window> {
 }
 
 /// Replays the trial up to the context's last frame, once for each plan, and carries the plan out.
-fn futures(
-    spec: &ModelSpec,
-    dataset: &Dataset,
+fn futures_of(
+    inference: Inference,
     world: &WorldConfig,
     context: Window,
     plans: &[Window],
 ) -> Result<Futures, EvaluationError> {
+    let (dataset, spec) = (inference.dataset, inference.spec());
     let episode = &dataset.episodes()[context.episode];
     let Some(trial) = &episode.trial else {
         return Ok(None);
     };
     let last = context.first_frame + spec.context - 1;
+    let recorded = true_frame(dataset, last)?;
     let action = |frame: usize| Action::try_from(dataset.action(frame).to_vec()).map_err(EvaluationError::Action);
     let mut futures = Vec::with_capacity(plans.len());
     for plan in plans {
@@ -154,8 +144,7 @@ fn futures(
         for frame in episode.first_frame..last {
             branch.step(&action(frame)?)?;
         }
-        let replayed = scale(branch.observe().frame.pixels());
-        if quality::mse(&replayed, &scale(&dataset.pixels(last)?)) > REPLAY_TOLERANCE {
+        if quality::mse(&scale(branch.observe().frame.pixels()), &recorded) > REPLAY_TOLERANCE {
             return Ok(None);
         }
         let first_action = plan.first_frame + spec.context - 1;
@@ -171,20 +160,14 @@ fn futures(
 
 /// The share of the futures whose own prediction is the nearest.
 fn share_identified(spec: &ModelSpec, predicted: &[f32], futures: &[Vec<f32>]) -> f64 {
-    let predicted: Vec<Vec<f32>> = predicted
-        .chunks_exact(spec.horizon * spec.pixels())
-        .map(|frames| spec.preprocess.inverse(frames))
-        .collect();
-    let is_own = |(plan, future): &(usize, &Vec<f32>)| {
-        let own = predicted
-            .get(*plan)
-            .map_or(f64::INFINITY, |own| quality::mse(own, future));
-        let others = predicted.iter().enumerate().filter(|(other, _)| other != plan);
-        others
-            .map(|(_, other)| quality::mse(other, future))
-            .all(|other| own < other)
+    let predicted = predicted.chunks_exact(spec.horizon * spec.pixels());
+    let predicted: Vec<Vec<f32>> = predicted.map(|frames| spec.preprocess.inverse(frames)).collect();
+    let is_own = |&plan: &usize| {
+        let error = |other: usize| quality::mse(&predicted[other], &futures[plan]);
+        let own = error(plan);
+        (0..predicted.len()).all(|other| other == plan || own < error(other))
     };
-    futures.iter().enumerate().filter(is_own).count() as f64 / futures.len().max(1) as f64
+    (0..futures.len()).filter(is_own).count() as f64 / futures.len().max(1) as f64
 }
 
 #[cfg(test)]

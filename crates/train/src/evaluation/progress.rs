@@ -1,9 +1,11 @@
-//! The progress of an evaluation, and what each of its passes over a set needs to report it.
+//! The progress of an evaluation, and what each of its passes over windows needs.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use super::EvaluationError;
-use super::bootstrap::Bootstrap;
+use super::config::EvaluateConfig;
+use super::inference::Inference;
+use foreframe_data::dataset::Window;
 use foreframe_data::dataset::sampler::Split;
 
 /// What is being computed.
@@ -45,13 +47,13 @@ pub struct EvaluationProgress {
     pub total: usize,
 }
 
-/// What every pass over a set needs besides its windows.
-pub struct EvaluationContext<'a> {
+/// What every pass over windows of a data set needs besides them.
+#[derive(Clone, Copy)]
+pub(super) struct EvaluationContext<'a> {
+    pub(super) inference: Inference<'a>,
     pub(super) split: Split,
-    pub(super) batch: usize,
-    pub(super) bootstrap: Bootstrap,
+    pub(super) config: &'a EvaluateConfig<'a>,
     pub(super) on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
-    pub(super) cancelled: Option<&'a AtomicBool>,
 }
 
 impl EvaluationContext<'_> {
@@ -63,9 +65,24 @@ impl EvaluationContext<'_> {
             done,
             total,
         });
-        match self.cancelled {
+        match self.config.cancelled {
             Some(cancelled) if cancelled.load(Ordering::Acquire) => Err(EvaluationError::Cancelled),
             _ => Ok(()),
         }
+    }
+
+    /// What `compute` gives for the windows, batch by batch. Errors: those of `compute`, `Cancelled`.
+    pub(super) fn in_batches<T>(
+        &self,
+        stage: EvaluationStage,
+        windows: &[Window],
+        compute: impl Fn(&[Window]) -> Result<Vec<T>, EvaluationError>,
+    ) -> Result<Vec<T>, EvaluationError> {
+        let mut found = Vec::with_capacity(windows.len());
+        for batch in windows.chunks(self.config.batch) {
+            found.extend(compute(batch)?);
+            self.report(stage, found.len(), windows.len())?;
+        }
+        Ok(found)
     }
 }

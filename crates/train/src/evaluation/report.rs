@@ -7,16 +7,16 @@ use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
 use super::bootstrap::{Bootstrap, TrialSums};
-use super::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
-use super::figures::FigureFile;
+use super::config::{NEAREST_WINDOWS, ScoredSplit};
 use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
+use super::progress::EvaluationContext;
 use super::skill::{Skill, skill};
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::{ModelName, Seed};
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::Window;
 
 /// The result of an evaluation, and how to repeat it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -50,6 +50,10 @@ impl EvaluationReport {
             let Some(scores) = set.outcome.scores() else { continue };
             let Some(model) = scores.methods.first() else { continue };
             let interval = scores.skill.mean_interval.as_ref();
+            let plan_rate = match &scores.plans {
+                Some(PlanOutcome::Measured(plans)) => Some(plans.rate),
+                _ => None,
+            };
             let mut summary = json!({
                 "skill": scores.skill.skill.mean,
                 "strongest_baseline": scores.skill.best_mean_baseline,
@@ -58,7 +62,7 @@ impl EvaluationReport {
                 "psnr_db": model.psnr_db.mean,
                 "ssim": model.ssim.mean,
                 "mover_mse": model.mover_mse.as_ref().map(|mse| mse.mean),
-                "plan_identification": scores.plan_rate(),
+                "plan_identification": plan_rate,
                 "band_90_coverage": scores.uncertainty.as_ref().map(|scores| scores.coverage.mean),
                 "windows": scores.windows,
                 "trials": scores.trials,
@@ -115,18 +119,13 @@ pub struct ReportStamp {
 }
 
 impl ReportStamp {
-    pub(super) fn new(
-        loaded: &Model,
-        dataset: &Dataset,
-        split_seed: Seed,
-        config: &EvaluateConfig,
-        wall_time: Duration,
-    ) -> Self {
+    pub(super) fn new(evaluation: &EvaluationContext, split_seed: Seed, wall_time: Duration) -> Self {
+        let (info, config) = (evaluation.inference.dataset.info(), evaluation.config);
         let named = |model: &Model| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
-        let (model, model_sha256) = named(loaded);
+        let (model, model_sha256) = named(evaluation.inference.loaded);
         Self {
-            dataset: dataset.info().name.clone(),
-            dataset_content_hash: dataset.info().content_hash.clone(),
+            dataset: info.name.clone(),
+            dataset_content_hash: info.content_hash.clone(),
             split_seed,
             model,
             model_sha256,
@@ -153,11 +152,9 @@ fn nearest_windows() -> usize {
 /// From `/proc/cpuinfo`; the architecture where that does not exist.
 fn cpu_name() -> String {
     let listed = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    listed
-        .lines()
-        .find(|line| line.starts_with("model name"))
-        .and_then(|line| line.split_once(':'))
-        .map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+    let named = listed.lines().find(|line| line.starts_with("model name"));
+    let name = named.and_then(|line| line.split_once(':'));
+    name.map_or(std::env::consts::ARCH, |(_, name)| name.trim()).to_owned()
 }
 
 /// The model's sizes.
@@ -287,14 +284,6 @@ impl SetScores {
             samples: SampleWindow::choose(windows),
         }
     }
-
-    /// Share of the plans that were identified, where that was measured.
-    fn plan_rate(&self) -> Option<f64> {
-        match &self.plans {
-            Some(PlanOutcome::Measured(plans)) => Some(plans.rate),
-            _ => None,
-        }
-    }
 }
 
 /// A window that the figures show, chosen by the model's error alone.
@@ -322,21 +311,25 @@ impl SampleWindow {
     fn choose(windows: &[WindowScores]) -> Vec<Self> {
         let mut ranked: Vec<&WindowScores> = windows.iter().collect();
         ranked.sort_by(|a, b| a.model_mse().total_cmp(&b.model_mse()));
-        let places = [
-            ("median", ranked.len() / 2),
-            ("best", 0),
-            ("worst", ranked.len().saturating_sub(1)),
-        ];
-        places
-            .into_iter()
-            .filter_map(|(rank, place)| {
-                ranked.get(place).map(|window| Self {
-                    rank: rank.to_owned(),
-                    episode: window.episode,
-                    first_frame: window.first_frame,
-                    mse: window.model_mse(),
-                })
+        let middle = ranked.get(ranked.len() / 2);
+        let places = [("median", middle), ("best", ranked.first()), ("worst", ranked.last())];
+        let found = places.into_iter().filter_map(|(rank, window)| {
+            window.map(|window| Self {
+                rank: rank.to_owned(),
+                episode: window.episode,
+                first_frame: window.first_frame,
+                mse: window.model_mse(),
             })
-            .collect()
+        });
+        found.collect()
     }
+}
+
+/// A picture in the report's directory, and what it shows.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FigureFile {
+    /// Its name in the directory.
+    pub file: String,
+    /// What it shows, in a phrase.
+    pub caption: String,
 }

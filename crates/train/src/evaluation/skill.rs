@@ -25,8 +25,7 @@ pub struct Skill {
 }
 
 /// The skill of the model over these windows, whose rows are the model, the baselines and perhaps the codec.
-#[must_use]
-pub fn skill(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
+pub(super) fn skill(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
     let baselines: Vec<Method> = methods.iter().copied().filter(|method| method.is_baseline()).collect();
     let rows = 1 + baselines.len();
     let errors_by_row = |window: &WindowScores| -> Vec<f64> {

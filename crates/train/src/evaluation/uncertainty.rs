@@ -9,9 +9,8 @@ use super::forecast::{Forecast, contexts, forecasts};
 use super::metrics::StepCurve;
 use super::progress::EvaluationContext;
 use super::windows::evenly;
-use foreframe_core::registry::Model;
 use foreframe_core::registry::calibration::Calibration;
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::Window;
 
 /// How well the expected errors of a set's windows fit the true ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -44,35 +43,34 @@ pub struct NoveltyScores {
 
 /// Scores the calibration on these windows; also gives their novelty. Errors: those of the network, `Cancelled`.
 pub(super) fn measure(
-    loaded: &Model,
+    evaluation: &EvaluationContext,
     calibration: &Calibration,
-    dataset: &Dataset,
     windows: &[Window],
-    watched: &EvaluationContext,
 ) -> Result<(UncertaintyScores, Vec<f64>), EvaluationError> {
-    let found = forecasts(loaded, dataset, windows, &calibration.novelty, watched)?;
-    let novelty: Vec<f64> = found
+    let found = forecasts(evaluation, windows, &calibration.novelty)?;
+    let novelty = found
         .iter()
-        .map(|forecast| f64::from(calibration.novelty.novelty(&forecast.context)))
-        .collect();
-    let steps = 0..calibration.steps.len().min(loaded.spec().horizon);
-    let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new(steps.clone().map(of).collect());
-    let mean = |value: &dyn Fn(&Forecast) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
-    Ok((
-        UncertaintyScores {
-            coverage: curve(&|step| mean(&|forecast| f64::from(u8::from(is_inside(forecast, step))))),
-            width: curve(&|step| {
-                mean(&|forecast| f64::from(forecast.expected[step].high - forecast.expected[step].low))
-            }),
-            constant_width: curve(&|step| {
-                let errors: Vec<f64> = found.iter().map(|forecast| forecast.errors[step]).collect();
-                quantile(errors.clone(), 0.95) - quantile(errors, 0.05)
-            }),
-            correlation: curve(&|step| correlation(&found, step)),
-            novelty: novelty.iter().sum::<f64>() / novelty.len().max(1) as f64,
-        },
-        novelty,
-    ))
+        .map(|forecast| calibration.novelty.novelty(&forecast.context));
+    let novelty: Vec<f64> = novelty.map(f64::from).collect();
+    let steps = calibration.steps.len();
+    let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new((0..steps).map(of).collect());
+    let scores = UncertaintyScores {
+        coverage: StepCurve::mean_over(&found, steps, |forecast, step| f64::from(is_inside(forecast, step))),
+        width: StepCurve::mean_over(&found, steps, |forecast, step| {
+            f64::from(forecast.expected[step].high - forecast.expected[step].low)
+        }),
+        constant_width: curve(&|step| {
+            let errors: Vec<f64> = found.iter().map(|forecast| forecast.errors[step]).collect();
+            quantile(errors.clone(), 0.95) - quantile(errors, 0.05)
+        }),
+        correlation: curve(&|step| correlation(&found, step)),
+        novelty: mean(&novelty),
+    };
+    Ok((scores, novelty))
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
 }
 
 fn is_inside(forecast: &Forecast, step: usize) -> bool {
@@ -80,19 +78,19 @@ fn is_inside(forecast: &Forecast, step: usize) -> bool {
     (f64::from(expected.low)..=f64::from(expected.high)).contains(&forecast.errors[step])
 }
 
+/// Of the logarithms of the expected and the true errors of a step.
 fn correlation(found: &[Forecast], step: usize) -> f64 {
-    let pairs = || {
-        found.iter().map(|forecast| {
-            (
-                f64::from(forecast.expected[step].mse).ln(),
-                forecast.errors[step].max(1e-9).ln(),
-            )
-        })
+    let pair = |forecast: &Forecast| {
+        let expected = f64::from(forecast.expected[step].mse);
+        (expected.ln(), forecast.errors[step].max(1e-9).ln())
     };
-    let count = found.len().max(1) as f64;
-    let (x_mean, y_mean) = pairs().fold((0.0, 0.0), |(x, y), pair| (x + pair.0 / count, y + pair.1 / count));
+    let pairs: Vec<(f64, f64)> = found.iter().map(pair).collect();
+    let count = pairs.len() as f64;
+    let (x_mean, y_mean) = pairs
+        .iter()
+        .fold((0.0, 0.0), |(x, y), pair| (x + pair.0 / count, y + pair.1 / count));
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for (x, y) in pairs() {
+    for (x, y) in pairs {
         xx += (x - x_mean).powi(2);
         xy += (x - x_mean) * (y - y_mean);
         yy += (y - y_mean).powi(2);
@@ -100,42 +98,37 @@ fn correlation(found: &[Forecast], step: usize) -> f64 {
     xy / (xx * yy).sqrt().max(f64::MIN_POSITIVE)
 }
 
-/// Compares the novelty of another data set's contexts with that of `own`. Frames of another size are cropped and resized.
-/// Errors: those of the network, `NoContext` if no recording is long enough.
+/// Compares the novelty of the contexts of this data set, which is another one, with that of `own`. Frames of another size
+/// are cropped and resized. Errors: those of the network, `NoContext` if no recording is long enough.
 pub(super) fn compare(
-    loaded: &Model,
+    evaluation: &EvaluationContext,
     calibration: &Calibration,
-    (other, own, limit): (&Dataset, &[f64], usize),
-    watched: &EvaluationContext,
+    own: &[f64],
 ) -> Result<NoveltyScores, EvaluationError> {
-    let context = loaded.spec().context;
-    let windows: Vec<Window> = other
-        .episodes()
-        .iter()
-        .flat_map(|episode| {
-            let last = (episode.first_frame + episode.frame_count + 1).saturating_sub(context);
-            (episode.first_frame..last).map(|first_frame| Window {
-                episode: episode.index,
-                first_frame,
-            })
-        })
-        .collect();
+    let (dataset, context) = (evaluation.inference.dataset, evaluation.inference.spec().context);
+    let mut windows = Vec::new();
+    for episode in dataset.episodes() {
+        let last = (episode.first_frame + episode.frame_count + 1).saturating_sub(context);
+        windows.extend((episode.first_frame..last).map(|first_frame| Window {
+            episode: episode.index,
+            first_frame,
+        }));
+    }
     if windows.is_empty() {
         return Err(EvaluationError::NoContext {
-            dataset: other.info().name.clone(),
+            dataset: dataset.info().name.clone(),
             context,
         });
     }
-    let windows = evenly(&windows, limit);
-    let seen = contexts(loaded, other, &windows, watched)?;
-    let novelty: Vec<f64> = seen
-        .iter()
-        .map(|context| f64::from(calibration.novelty.novelty(context)))
+    let windows = evenly(&windows, evaluation.config.max_windows);
+    let novelty = contexts(evaluation, &windows)?.into_iter();
+    let novelty: Vec<f64> = novelty
+        .map(|context| f64::from(calibration.novelty.novelty(&context)))
         .collect();
     Ok(NoveltyScores {
-        dataset: other.info().name.clone(),
+        dataset: dataset.info().name.clone(),
         windows: windows.len(),
-        novelty: novelty.iter().sum::<f64>() / novelty.len() as f64,
+        novelty: mean(&novelty),
         auroc: auroc(own, &novelty),
     })
 }

@@ -4,8 +4,9 @@
 use rayon::prelude::*;
 
 use super::input::BaselineInput;
+use crate::evaluation::EvaluationError;
+use crate::evaluation::least_squares::{factor, mean_and_deviation, solve};
 use crate::evaluation::windows::evenly;
-use crate::evaluation::{EvaluationError, cholesky};
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::frame::warp::sample;
 use foreframe_data::dataset::sampler::WindowShape;
@@ -53,7 +54,14 @@ impl AffineFlow {
             return Ok(None);
         }
         let pairs = evenly(windows, MAX_PAIRS);
-        let (mean, scale) = spread(dataset, &pairs);
+        let channels = 0..info.action_channels.len();
+        let (mean, scale): (Vec<f64>, Vec<f64>) = channels
+            .map(|channel| {
+                let values = pairs.iter().map(|pair| dataset.action(pair.first_frame + 1)[channel]);
+                let [mean, deviation] = mean_and_deviation(values.map(f64::from));
+                (mean, deviation.max(1e-6))
+            })
+            .unzip();
         let regressors = 1 + 2 * mean.len();
         let mut flow = Self {
             width: info.frame_width_px as usize,
@@ -68,13 +76,9 @@ impl AffineFlow {
                 invert: false,
             };
             for _ in 0..STEPS {
-                let equations = pairs
-                    .par_iter()
-                    .map(|pair| flow.equations_of(dataset, pair, smooth))
-                    .try_reduce(
-                        || NormalEquations::new(AFFINE * regressors),
-                        |sum, more| Ok(sum.plus(&more)),
-                    )?;
+                let equations = pairs.par_iter().map(|pair| flow.equations_of(dataset, pair, smooth));
+                let none = || NormalEquations::new(AFFINE * regressors);
+                let equations = equations.try_reduce(none, |sum, more| Ok(sum.plus(&more)))?;
                 let Some(steps) = equations.solve() else {
                     return Ok(None);
                 };
@@ -156,7 +160,6 @@ impl AffineFlow {
     ) -> Result<NormalEquations, EvaluationError> {
         let (before, after) = (pair.first_frame + 1, pair.first_frame + 2);
         let regressors = self.regressors(dataset.action(pair.first_frame), dataset.action(before));
-        let mut equations = NormalEquations::new(self.parameters.len());
         let source = smooth.forward(&dataset.frame(before)?);
         let target = smooth.forward(&dataset.frame(after)?);
         let mut grid = self.identity();
@@ -182,35 +185,12 @@ impl AffineFlow {
                 }
             }
         }
-        equations.add(&own, &regressors);
-        Ok(equations)
+        Ok(NormalEquations::of_pair(&own, &regressors))
     }
-}
-
-/// Mean and standard deviation of each action channel over the pairs.
-fn spread(dataset: &Dataset, pairs: &[Window]) -> (Vec<f64>, Vec<f64>) {
-    let actions = || pairs.iter().map(|pair| dataset.action(pair.first_frame + 1));
-    let channels = 0..dataset.info().action_channels.len();
-    let mean_of = |channel: usize, value: &dyn Fn(f64) -> f64| {
-        actions().map(|action| value(f64::from(action[channel]))).sum::<f64>() / pairs.len().max(1) as f64
-    };
-    let mean: Vec<f64> = channels
-        .clone()
-        .map(|channel| mean_of(channel, &|value| value))
-        .collect();
-    let scale = channels
-        .map(|channel| {
-            mean_of(channel, &|value| (value - mean[channel]).powi(2))
-                .sqrt()
-                .max(1e-6)
-        })
-        .collect();
-    (mean, scale)
 }
 
 /// Sums of products of a least-squares problem.
 struct NormalEquations {
-    size: usize,
     /// Row by row.
     matrix: Vec<f64>,
     right_side: Vec<f64>,
@@ -219,49 +199,43 @@ struct NormalEquations {
 impl NormalEquations {
     fn new(size: usize) -> Self {
         Self {
-            size,
             matrix: vec![0.0; size * size],
             right_side: vec![0.0; size],
         }
     }
 
-    /// Adds the sums of one pair, whose motion has these regressors.
-    fn add(&mut self, own: &[[f64; AFFINE + 1]; AFFINE], regressors: &[f64]) {
-        for (r, one) in regressors.iter().enumerate() {
-            for (i, sums) in own.iter().enumerate() {
-                let row = r * AFFINE + i;
-                for (s, other) in regressors.iter().enumerate() {
-                    for (j, sum) in sums.iter().take(AFFINE).enumerate() {
-                        self.matrix[row * self.size + s * AFFINE + j] += one * other * sum;
-                    }
+    /// Those of one pair of frames: the sums over its pixels, for a motion with these regressors.
+    fn of_pair(own: &[[f64; AFFINE + 1]; AFFINE], regressors: &[f64]) -> Self {
+        let mut equations = Self::new(0);
+        for one in regressors {
+            for sums in own {
+                for other in regressors {
+                    let products = sums.iter().take(AFFINE).map(|sum| one * other * sum);
+                    equations.matrix.extend(products);
                 }
-                self.right_side[row] += one * sums[AFFINE];
+                equations.right_side.push(one * sums[AFFINE]);
             }
         }
+        equations
     }
 
     fn plus(mut self, other: &Self) -> Self {
-        for (sum, value) in self.matrix.iter_mut().zip(&other.matrix) {
-            *sum += value;
-        }
-        for (sum, value) in self.right_side.iter_mut().zip(&other.right_side) {
+        let sums = self.matrix.iter_mut().chain(&mut self.right_side);
+        for (sum, value) in sums.zip(other.matrix.iter().chain(&other.right_side)) {
             *sum += value;
         }
         self
     }
 
     /// The solution with a small ridge, by Cholesky's factorization; none where the frames say nothing.
-    fn solve(mut self) -> Option<Vec<f64>> {
-        let size = self.size;
-        let trace: f64 = (0..size).map(|i| self.matrix[i * size + i]).sum();
+    fn solve(self) -> Option<Vec<f64>> {
+        let size = self.right_side.len();
+        let trace: f64 = self.matrix.iter().step_by(size + 1).sum();
         if trace <= 0.0 || !trace.is_finite() {
             return Some(vec![0.0; size]);
         }
-        for i in 0..size {
-            self.matrix[i * size + i] += RIDGE * trace / size as f64;
-        }
-        let factor = cholesky::factor(&self.matrix, size)?;
-        Some(cholesky::solve(&factor, self.right_side))
+        let factor = factor(&self.matrix, size, RIDGE * trace / size as f64)?;
+        Some(solve(&factor, self.right_side))
     }
 }
 
@@ -272,7 +246,6 @@ mod tests {
     #[test]
     fn the_solution_solves_its_equations() {
         let equations = NormalEquations {
-            size: 2,
             matrix: vec![4.0, 1.0, 1.0, 3.0],
             right_side: vec![1.0, 2.0],
         };

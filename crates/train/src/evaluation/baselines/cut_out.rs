@@ -1,12 +1,11 @@
 //! The moving object cut out of the last frame and moved on at constant velocity over the background: what a tracker
 //! before a standing camera would predict. It never sees the true mask.
 
-use std::collections::VecDeque;
-
 use super::input::mean;
 use crate::evaluation::EvaluationError;
+use foreframe_core::frame::preprocess::scale;
+use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::background::{Background, MAX_CHANGED_SHARE, differing};
-use foreframe_data::dataset::{Dataset, Window};
 
 /// Smaller objects are noise; share of the frame's pixels.
 const MIN_OBJECT_SHARE: f32 = 0.002;
@@ -31,13 +30,10 @@ pub(super) struct CutOut {
 }
 
 impl CutOut {
-    /// Takes the median of every pixel over the first frames of these windows.
-    /// Errors: those of [`Dataset::pixels`].
-    pub(super) fn fit(dataset: &Dataset, windows: &[Window]) -> Result<Self, EvaluationError> {
-        let frames: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
-        let background = Background::of(dataset, &frames)?.pixels;
+    /// Takes the median of every pixel over these frames. Errors: those of [`Dataset::pixels`].
+    pub(super) fn fit(dataset: &Dataset, frames: &[usize]) -> Result<Self, EvaluationError> {
         Ok(Self {
-            background: background.into_iter().map(|value| f32::from(value) / 255.0).collect(),
+            background: scale(&Background::of(dataset, frames)?.pixels),
             width: dataset.info().frame_width_px as usize,
         })
     }
@@ -52,11 +48,9 @@ impl CutOut {
             return vec![mean(inputs); horizon];
         };
         let [right, down] = self.velocity(inputs, &background, &object);
+        let moved = |step: usize| [right * step as f32, down * step as f32];
         (1..=horizon)
-            .map(|step| {
-                let moved = [right * step as f32, down * step as f32];
-                self.compose(&background, last, &object.mask, moved)
-            })
+            .map(|step| self.compose(&background, last, &object.mask, moved(step)))
             .collect()
     }
 
@@ -66,16 +60,12 @@ impl CutOut {
         if changed as f32 <= MAX_CHANGED_SHARE * last.len() as f32 {
             return self.background.clone();
         }
-        let mut values = vec![0.0; inputs.len()];
-        (0..last.len())
-            .map(|pixel| {
-                for (value, frame) in values.iter_mut().zip(inputs) {
-                    *value = frame[pixel];
-                }
-                values.sort_by(f32::total_cmp);
-                values[values.len() / 2]
-            })
-            .collect()
+        let median = |pixel: usize| {
+            let mut values: Vec<f32> = inputs.iter().map(|frame| frame[pixel]).collect();
+            values.sort_by(f32::total_cmp);
+            values[values.len() / 2]
+        };
+        (0..last.len()).map(median).collect()
     }
 
     /// Pixels a frame to the right and down: the least-squares line through the object's centres, as far back as it is
@@ -96,19 +86,15 @@ impl CutOut {
             later = (object.pixel_count, object.centre);
         }
         let middle = (centres.len() - 1) as f32 / 2.0;
-        let mut slope = [0.0, 0.0];
-        let mut spread = 0.0;
+        let (mut slope, mut spread) = ([0.0, 0.0], 0.0);
         for (back, centre) in centres.iter().enumerate() {
             let time = middle - back as f32;
             spread += time * time;
             slope[0] += time * centre[0];
             slope[1] += time * centre[1];
         }
-        if spread > 0.0 {
-            slope.map(|sum| sum / spread)
-        } else {
-            [0.0, 0.0]
-        }
+        // With a single centre, spread and slope are 0.
+        slope.map(|sum| if spread > 0.0 { sum / spread } else { sum })
     }
 
     /// The background with the object drawn where it has moved to.
@@ -125,16 +111,14 @@ impl CutOut {
                 let (left, top) = (x.floor(), y.floor());
                 let (across, along) = (x - left, y - top);
                 let (mut cover, mut colour) = (0.0, 0.0);
-                for (corner_x, corner_y, weight) in [
-                    (left, top, (1.0 - across) * (1.0 - along)),
-                    (left + 1.0, top, across * (1.0 - along)),
-                    (left, top + 1.0, (1.0 - across) * along),
-                    (left + 1.0, top + 1.0, across * along),
-                ] {
-                    if weight > 0.0 && inside(corner_x, corner_y) {
-                        let source = corner_y as usize * width + corner_x as usize;
-                        cover += weight * mask[source];
-                        colour += weight * mask[source] * last[source];
+                for (row, row_share) in [(top, 1.0 - along), (top + 1.0, along)] {
+                    for (column, column_share) in [(left, 1.0 - across), (left + 1.0, across)] {
+                        let weight = row_share * column_share;
+                        if weight > 0.0 && inside(column, row) {
+                            let source = row as usize * width + column as usize;
+                            cover += weight * mask[source];
+                            colour += weight * mask[source] * last[source];
+                        }
                     }
                 }
                 colour + (1.0 - cover) * behind
@@ -160,12 +144,10 @@ impl MovingObject {
         if (largest.len() as f32) < least {
             return None;
         }
-        let count = largest.len() as f32;
-        let sum = |of: fn(usize, usize) -> usize| largest.iter().map(|&pixel| of(pixel, width) as f32).sum::<f32>();
-        let centre = [
-            sum(|pixel, width| pixel % width) / count,
-            sum(|pixel, width| pixel / width) / count,
-        ];
+        let mean = |of: fn(usize, usize) -> usize| {
+            let sum: f32 = largest.iter().map(|&pixel| of(pixel, width) as f32).sum();
+            sum / largest.len() as f32
+        };
         let mut mask = vec![0.0; frame.len()];
         for &pixel in &largest {
             mask[pixel] = 1.0;
@@ -176,21 +158,21 @@ impl MovingObject {
         Some(Self {
             mask,
             pixel_count: largest.len(),
-            centre,
+            centre: [mean(|pixel, width| pixel % width), mean(|pixel, width| pixel / width)],
         })
     }
 }
 
 /// Takes a pixel out of the open ones together with all open pixels that are connected with it.
 fn take_group(open: &mut [bool], start: usize, width: usize) -> Vec<usize> {
-    let mut group = Vec::new();
-    let mut queue = VecDeque::from([start]);
+    let mut group = vec![start];
     open[start] = false;
-    while let Some(pixel) = queue.pop_front() {
-        group.push(pixel);
+    let mut visited = 0;
+    while let Some(&pixel) = group.get(visited) {
+        visited += 1;
         for next in neighbours(pixel, width, open.len()) {
             if std::mem::take(&mut open[next]) {
-                queue.push_back(next);
+                group.push(next);
             }
         }
     }

@@ -1,27 +1,28 @@
 //! What a baseline may look at.
 
-use crate::evaluation::EvaluationError;
-use foreframe_core::frame::preprocess::scale;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
 /// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
-#[derive(Clone, Debug)]
-pub struct BaselineInput<'a> {
+pub(in crate::evaluation) struct BaselineInput<'a> {
     /// The input frames, oldest first; at least one.
-    pub inputs: &'a [Vec<f32>],
+    pub(super) inputs: &'a [Vec<f32>],
     /// The action that led to the last input frame; the first of `actions` where only one frame is known.
-    pub previous_action: &'a [f32],
+    pub(super) previous_action: &'a [f32],
     /// The actions that lead to each predicted frame.
-    pub actions: Vec<&'a [f32]>,
+    pub(super) actions: Vec<&'a [f32]>,
     /// The state at the last input frame.
-    pub state: &'a [f32],
+    pub(super) state: &'a [f32],
 }
 
 impl<'a> BaselineInput<'a> {
     /// The input of a window of that shape, whose first frames are `inputs`.
-    #[must_use]
-    pub fn of_window(dataset: &'a Dataset, window: Window, shape: WindowShape, inputs: &'a [Vec<f32>]) -> Self {
+    pub(in crate::evaluation) fn of_window(
+        dataset: &'a Dataset,
+        window: Window,
+        shape: WindowShape,
+        inputs: &'a [Vec<f32>],
+    ) -> Self {
         let last = window.first_frame + shape.context - 1;
         Self {
             inputs,
@@ -32,11 +33,6 @@ impl<'a> BaselineInput<'a> {
             state: dataset.state(last),
         }
     }
-}
-
-/// A frame of the data set, 0…1.
-pub(super) fn frame_of(dataset: &Dataset, frame: usize) -> Result<Vec<f32>, EvaluationError> {
-    Ok(scale(&dataset.pixels(frame)?))
 }
 
 /// The mean of the frames, pixel by pixel.

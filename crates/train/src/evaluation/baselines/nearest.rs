@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::input::frame_of;
 use crate::evaluation::EvaluationError;
+use crate::evaluation::windows::true_frame;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -34,16 +34,14 @@ impl TrainingWindows {
         let width = dataset.info().frame_width_px as usize;
         let window_values = shape.context * SMALL_SIDE * SMALL_SIDE;
         let mut small = vec![0.0; windows.len() * window_values];
-        small
-            .par_chunks_exact_mut(window_values)
-            .zip(windows)
-            .try_for_each(|(small, window)| {
-                let frames = small.chunks_exact_mut(SMALL_SIDE * SMALL_SIDE);
-                for (step, small) in frames.enumerate() {
-                    small.copy_from_slice(&shrunk(&frame_of(dataset, window.first_frame + step)?, width));
-                }
-                Ok::<(), EvaluationError>(())
-            })?;
+        let places = small.par_chunks_exact_mut(window_values).zip(windows);
+        places.try_for_each(|(small, window)| {
+            let frames = small.chunks_exact_mut(SMALL_SIDE * SMALL_SIDE);
+            for (small, frame) in frames.zip(window.first_frame..) {
+                small.copy_from_slice(&shrunk(&true_frame(dataset, frame)?, width));
+            }
+            Ok::<(), EvaluationError>(())
+        })?;
         Ok(Some(Self {
             windows: windows.to_vec(),
             shape,
@@ -59,28 +57,25 @@ impl TrainingWindows {
         inputs: &[Vec<f32>],
         horizon: usize,
     ) -> Result<Vec<Vec<f32>>, EvaluationError> {
-        let first_frame = self.nearest(dataset, inputs)?.first_frame + self.shape.context;
-        (0..horizon).map(|step| frame_of(dataset, first_frame + step)).collect()
+        let future = self.nearest(dataset, inputs)?.first_frame + self.shape.context..;
+        let frames = future.take(horizon).map(|frame| Ok(true_frame(dataset, frame)?));
+        frames.collect()
     }
 
     /// The window with the least squared error. Means of blocks never differ by more than their pixels do, so the windows
     /// that are close in small are compared first, until no other can be nearer.
     fn nearest(&self, dataset: &Dataset, inputs: &[Vec<f32>]) -> Result<Window, EvaluationError> {
         let wanted: Vec<f32> = inputs.iter().flat_map(|frame| shrunk(frame, self.width)).collect();
-        let mut ranked: Vec<(f32, Window)> = self
-            .small
-            .chunks_exact(wanted.len())
-            .zip(&self.windows)
+        let known = self.small.chunks_exact(wanted.len()).zip(&self.windows);
+        let mut ranked: Vec<(f32, Window)> = known
             .map(|(small, &window)| (squared_distance(small, &wanted), window))
             .collect();
         let candidates = MAX_CANDIDATES.min(ranked.len());
         ranked.select_nth_unstable_by(candidates - 1, |one, other| one.0.total_cmp(&other.0));
         ranked.truncate(candidates);
         ranked.sort_by(|one, other| one.0.total_cmp(&other.0));
-        let pixels: Vec<Vec<u8>> = inputs
-            .iter()
-            .map(|frame| frame.iter().map(|value| (value * 255.0).round() as u8).collect())
-            .collect();
+        let bytes = |frame: &Vec<f32>| frame.iter().map(|value| (value * 255.0).round() as u8).collect();
+        let pixels: Vec<Vec<u8>> = inputs.iter().map(bytes).collect();
         let block_pixels = inputs.first().map_or(0, Vec::len) as f32 / (SMALL_SIDE * SMALL_SIDE) as f32;
         let mut best = (u64::MAX, ranked[0].1);
         for (in_small, window) in ranked {
@@ -103,23 +98,17 @@ impl TrainingWindows {
 
 /// The means of a frame's blocks, [`SMALL_SIDE`] a side.
 fn shrunk(frame: &[f32], width: usize) -> Vec<f32> {
-    let height = frame.len() / width;
+    // A side shorter than that has blocks of one pixel, some of them the same.
     let block = |index: usize, side: usize| {
         let start = index * side / SMALL_SIDE;
-        start
-            ..((index + 1) * side / SMALL_SIDE)
-                .max(start + 1)
-                .min(side.max(start + 1))
+        start..((index + 1) * side / SMALL_SIDE).max(start + 1)
     };
     let mut small = Vec::with_capacity(SMALL_SIDE * SMALL_SIDE);
     for row in 0..SMALL_SIDE {
         for column in 0..SMALL_SIDE {
-            let (rows, columns) = (block(row, height), block(column, width));
+            let (rows, columns) = (block(row, frame.len() / width), block(column, width));
             let count = (rows.len() * columns.len()) as f32;
-            let sum: f32 = rows
-                .filter_map(|y| frame.get(y * width + columns.start..y * width + columns.end))
-                .flatten()
-                .sum();
+            let sum: f32 = rows.flat_map(|y| &frame[y * width..][columns.clone()]).sum();
             small.push(sum / count);
         }
     }
@@ -138,15 +127,8 @@ fn squared_distance(one: &[f32], other: &[f32]) -> f32 {
 }
 
 fn squared_byte_distance(one: &[u8], other: &[u8]) -> u64 {
-    let row = |(one, other): (&[u8], &[u8])| -> u64 {
-        let sum: u32 = one
-            .iter()
-            .zip(other)
-            .map(|(&a, &b)| u32::from(a.abs_diff(b)) * u32::from(a.abs_diff(b)))
-            .sum();
-        u64::from(sum)
-    };
-    one.chunks(4096).zip(other.chunks(4096)).map(row).sum()
+    let squares = one.iter().zip(other).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
+    squares.sum()
 }
 
 #[cfg(test)]

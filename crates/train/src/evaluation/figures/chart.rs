@@ -1,6 +1,6 @@
 //! Error by horizon as an SVG line chart.
 
-use std::fmt::Display;
+use std::error::Error;
 
 use plotters::coord::Shift;
 use plotters::coord::combinators::BindKeyPoints;
@@ -11,8 +11,6 @@ use plotters::prelude::{
 };
 use plotters::style::{Color, ShapeStyle};
 
-use super::Chart;
-use crate::evaluation::EvaluationError;
 use crate::evaluation::method::Method;
 
 const SIZE_PX: (u32, u32) = (920, 480);
@@ -23,28 +21,26 @@ const UNIT: f64 = 1e-4;
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-/// The chart as the text of an SVG file. Errors: `Chart`.
-pub fn draw(chart: &Chart) -> Result<String, EvaluationError> {
+/// The values of a method at t+1, t+2, …
+pub(super) type Series = (Method, Vec<f64>);
+
+/// The chart as the text of an SVG file. Errors: those of the drawing library.
+pub(super) fn draw(series: &[Series]) -> Result<String, Box<dyn Error>> {
     let mut svg = String::new();
-    draw_into(&mut svg, chart).map_err(|reason| EvaluationError::Chart {
-        file: chart.file.clone(),
-        reason,
-    })?;
+    {
+        let area = SVGBackend::with_string(&mut svg, SIZE_PX).into_drawing_area();
+        area.fill(&WHITE)?;
+        let (plot, legend) = area.split_horizontally(SIZE_PX.0 - LEGEND_WIDTH_PX);
+        draw_plot(&plot, series)?;
+        draw_legend(&legend, series)?;
+        area.present()?;
+    }
     Ok(svg)
 }
 
-fn draw_into(svg: &mut String, chart: &Chart) -> Result<(), String> {
-    let area = SVGBackend::with_string(svg, SIZE_PX).into_drawing_area();
-    area.fill(&WHITE).map_err(as_text)?;
-    let (plot, legend) = area.split_horizontally(SIZE_PX.0 - LEGEND_WIDTH_PX);
-    draw_plot(&plot, chart)?;
-    draw_legend(&legend, chart)?;
-    area.present().map_err(as_text)
-}
-
-fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
-    let steps = chart.series.iter().map(|(_, values)| values.len()).max().unwrap_or(0);
-    let (low, high) = bounds(chart);
+fn draw_plot(area: &Area, series: &[Series]) -> Result<(), Box<dyn Error>> {
+    let steps = series.iter().map(|(_, values)| values.len()).max().unwrap_or(0);
+    let (low, high) = bounds(series);
     let mut plot = ChartBuilder::on(area)
         .margin(16)
         .x_label_area_size(50)
@@ -52,8 +48,7 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
         .build_cartesian_2d(
             0.8..steps as f64 + 0.2,
             (low..high).log_scale().with_key_points(ticks(low, high)),
-        )
-        .map_err(as_text)?;
+        )?;
     plot.configure_mesh()
         .x_labels(steps.min(12) + 1)
         .x_label_formatter(&|step| {
@@ -66,49 +61,37 @@ fn draw_plot(area: &Area, chart: &Chart) -> Result<(), String> {
         .label_style(("sans-serif", 16))
         .max_light_lines(0)
         .bold_line_style(RGBColor(225, 225, 225))
-        .draw()
-        .map_err(as_text)?;
+        .draw()?;
     // The model is the first series and is drawn last, over the others.
-    for (method, values) in chart.series.iter().rev() {
-        let points: Vec<(f64, f64)> = (1..)
-            .zip(values)
-            .map(|(step, value)| (f64::from(step), shown(*value, low)))
-            .collect();
-        if is_dashed(*method) {
-            plot.draw_series(DashedLineSeries::new(points.iter().copied(), 6, 5, stroke(*method)))
-                .map_err(as_text)?;
+    for &(method, ref values) in series.iter().rev() {
+        let points = (1..).zip(values);
+        // A logarithmic axis has no zero; a value of 0 is drawn at the bottom.
+        let points = points.map(|(step, value)| (f64::from(step), (value / UNIT).max(low)));
+        if is_dashed(method) {
+            plot.draw_series(DashedLineSeries::new(points.clone(), 6, 5, stroke(method)))?;
         } else {
-            plot.draw_series(LineSeries::new(points.iter().copied(), stroke(*method)))
-                .map_err(as_text)?;
+            plot.draw_series(LineSeries::new(points.clone(), stroke(method)))?;
         }
-        plot.draw_series(
-            points
-                .iter()
-                .map(|&point| Circle::new(point, 4, color(*method).filled())),
-        )
-        .map_err(as_text)?;
+        plot.draw_series(points.map(|point| Circle::new(point, 4, color(method).filled())))?;
     }
     Ok(())
 }
 
-fn draw_legend(area: &Area, chart: &Chart) -> Result<(), String> {
+fn draw_legend(area: &Area, series: &[Series]) -> Result<(), Box<dyn Error>> {
     // From the greatest to the least error at the last step, in the order of the lines' ends.
-    let last = |(_, values): &&(Method, Vec<f64>)| values.last().copied().unwrap_or(0.0);
-    let mut series: Vec<_> = chart.series.iter().collect();
+    let last = |(_, values): &&Series| values.last().copied().unwrap_or(0.0);
+    let mut series: Vec<_> = series.iter().collect();
     series.sort_by(|one, other| last(other).total_cmp(&last(one)));
     for (place, &(method, _)) in (0..).zip(series) {
         let y = 40 + place * LEGEND_LINE_PX;
         let ends = [(8, y), (40, y)];
         if is_dashed(method) {
-            area.draw(&DashedPathElement::new(ends, 6, 5, stroke(method)))
+            area.draw(&DashedPathElement::new(ends, 6, 5, stroke(method)))?;
         } else {
-            area.draw(&PathElement::new(ends, stroke(method)))
+            area.draw(&PathElement::new(ends, stroke(method)))?;
         }
-        .map_err(as_text)?;
-        area.draw(&Circle::new((24, y), 4, color(method).filled()))
-            .map_err(as_text)?;
-        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 18)))
-            .map_err(as_text)?;
+        area.draw(&Circle::new((24, y), 4, color(method).filled()))?;
+        area.draw(&Text::new(method.label(), (50, y - 9), ("sans-serif", 18)))?;
     }
     Ok(())
 }
@@ -122,27 +105,12 @@ fn stroke(method: Method) -> ShapeStyle {
     color(method).stroke_width(if method == Method::Model { 4 } else { 2 })
 }
 
-fn as_text(error: impl Display) -> String {
-    error.to_string()
-}
-
-/// A logarithmic axis has no zero; a value of 0 is drawn at the bottom.
-fn shown(value: f64, low: f64) -> f64 {
-    (value / UNIT).max(low)
-}
-
 /// Bounds of the axis, with some room; a perfect or still scene gives 0 everywhere.
-fn bounds(chart: &Chart) -> (f64, f64) {
-    let values = || {
-        chart
-            .series
-            .iter()
-            .flat_map(|(_, values)| values)
-            .map(|value| value / UNIT)
-            .filter(|v| *v > 0.0)
-    };
-    let low = values().fold(f64::INFINITY, f64::min);
-    let high = values().fold(0.0, f64::max);
+fn bounds(series: &[Series]) -> (f64, f64) {
+    let values = series.iter().flat_map(|(_, values)| values).map(|value| value / UNIT);
+    let values: Vec<f64> = values.filter(|&value| value > 0.0).collect();
+    let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = values.iter().copied().fold(0.0, f64::max);
     if high > 0.0 {
         (low / 1.5, high * 1.5)
     } else {
@@ -188,16 +156,12 @@ mod tests {
 
     #[test]
     fn the_legend_has_the_order_of_the_lines_ends() {
-        let chart = Chart {
-            file: "error.svg".to_owned(),
-            caption: String::new(),
-            series: vec![
-                (Method::Model, vec![1e-4, 2e-4]),
-                (Method::CopyLast, vec![3e-4, 9e-4]),
-                (Method::CodecOnly, vec![1e-4, 1e-4]),
-            ],
-        };
-        let svg = draw(&chart).unwrap();
+        let series = [
+            (Method::Model, vec![1e-4, 2e-4]),
+            (Method::CopyLast, vec![3e-4, 9e-4]),
+            (Method::CodecOnly, vec![1e-4, 1e-4]),
+        ];
+        let svg = draw(&series).unwrap();
         let place = |method: Method| svg.find(method.label()).unwrap();
         assert!(place(Method::CopyLast) < place(Method::Model) && place(Method::Model) < place(Method::CodecOnly));
     }

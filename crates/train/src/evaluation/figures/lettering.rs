@@ -6,41 +6,35 @@ use font8x8::{BASIC_FONTS, LATIN_FONTS, UnicodeFonts};
 const LETTER_PX: usize = 8;
 
 /// Width of a line of text in pixels.
-#[must_use]
-pub fn width_px(text: &str, scale: usize) -> usize {
+pub(super) fn width_px(text: &str, scale: usize) -> usize {
     text.chars().count() * LETTER_PX * scale
 }
 
 /// Height of a line of text in pixels.
-#[must_use]
-pub fn height_px(scale: usize) -> usize {
+pub(super) const fn height_px(scale: usize) -> usize {
     LETTER_PX * scale
 }
 
 /// A gray image to draw on.
 #[derive(Clone, Debug)]
-pub struct Canvas {
+pub(super) struct Canvas {
     /// Width in pixels.
-    pub width: usize,
-    /// Height in pixels.
-    pub height: usize,
+    width: usize,
     /// Intensities, row by row.
-    pub pixels: Vec<u8>,
+    pub(super) pixels: Vec<u8>,
 }
 
 impl Canvas {
     /// A canvas of one intensity.
-    #[must_use]
-    pub fn new(width: usize, height: usize, background: u8) -> Self {
+    pub(super) fn new(width: usize, height: usize, background: u8) -> Self {
         Self {
             width,
-            height,
             pixels: vec![background; width * height],
         }
     }
 
     /// Sets a pixel; outside the canvas nothing happens.
-    pub fn set(&mut self, x: usize, y: usize, value: u8) {
+    pub(super) fn set(&mut self, x: usize, y: usize, value: u8) {
         if x < self.width
             && let Some(pixel) = self.pixels.get_mut(y * self.width + x)
         {
@@ -49,13 +43,10 @@ impl Canvas {
     }
 
     /// Writes a line of text from its top left corner. Letters that the font lacks stay blank.
-    pub fn write(&mut self, (left, top): (usize, usize), text: &str, scale: usize, ink: u8) {
+    pub(super) fn write(&mut self, (left, top): (usize, usize), text: &str, scale: usize, ink: u8) {
         for (place, letter) in text.chars().enumerate() {
-            let glyph = BASIC_FONTS
-                .get(letter)
-                .or_else(|| LATIN_FONTS.get(letter))
-                .unwrap_or_default();
-            for (row, bits) in glyph.into_iter().enumerate() {
+            let glyph = BASIC_FONTS.get(letter).or_else(|| LATIN_FONTS.get(letter));
+            for (row, bits) in glyph.into_iter().flatten().enumerate() {
                 for column in (0..LETTER_PX).filter(|column| bits >> column & 1 == 1) {
                     let (x, y) = (left + (place * LETTER_PX + column) * scale, top + row * scale);
                     for dot in 0..scale * scale {

@@ -1,13 +1,17 @@
 //! Rows of labelled frames in one image: contact sheets, and panels like the paper's.
 
+use std::iter::{repeat, repeat_n};
+
 use super::lettering::{Canvas, height_px, width_px};
-use foreframe_core::frame::{Frame, FrameError};
+use foreframe_core::frame::{Frame, FrameError, MAX_SIDE_PX};
 
 const PAPER: u8 = 255;
 const INK: u8 = 30;
 const MARGIN_PX: usize = 16;
 const GAP_PX: usize = 8;
 const LETTER_SCALE: usize = 3;
+/// A line of text and the gap below it.
+const LINE_PX: usize = height_px(LETTER_SCALE) + GAP_PX;
 /// Frames are enlarged to at least this width.
 pub const CELL_WIDTH_PX: u32 = 256;
 /// Frames in a row at most; longer rows are wrapped.
@@ -30,17 +34,12 @@ impl MontageRow {
     /// Consecutive frames captioned `t-1`, `t`, `t+1`, …; `first` is the first one's distance from t.
     #[must_use]
     pub fn in_time(label: &str, frames: &[Frame], first: i64) -> Self {
-        let caption = |step: i64| {
-            if step == 0 {
-                "t".to_owned()
-            } else {
-                format!("t{step:+}")
-            }
+        let caption = |step: i64| match step {
+            0 => "t".to_owned(),
+            _ => format!("t{step:+}"),
         };
-        let cells = frames
-            .iter()
-            .zip(first..)
-            .map(|(frame, step)| (caption(step), frame.clone()));
+        let cells = frames.iter().zip(first..);
+        let cells = cells.map(|(frame, step)| (caption(step), frame.clone()));
         Self {
             label: label.to_owned(),
             cells: cells.collect(),
@@ -77,26 +76,30 @@ fn enlargement(width_px: u32) -> usize {
 /// looks at. Errors: `Size` if it gets too large.
 pub fn enlarged(frame: &Frame) -> Result<Frame, FrameError> {
     let scale = enlargement(frame.width());
-    let (width, height) = (frame.width() as usize, frame.height() as usize);
-    // The size is checked before the pixels are allocated.
-    let sides = [width, height].map(|side| u32::try_from(side * scale).unwrap_or(u32::MAX));
-    if sides.iter().any(|&side| side > foreframe_core::frame::MAX_SIDE_PX) {
-        return Err(FrameError::Size {
-            width: sides[0],
-            height: sides[1],
-        });
-    }
-    let mut pixels = Vec::with_capacity(width * height * scale * scale);
-    for row in frame.pixels().chunks_exact(width) {
-        let wide: Vec<u8> = row
-            .iter()
-            .flat_map(|&value| std::iter::repeat_n(value, scale))
-            .collect();
+    let [width, height] = sides(frame.width() as usize * scale, frame.height() as usize * scale)?;
+    Frame::new(width, height, enlarged_pixels(frame, scale))
+}
+
+/// The pixels of a frame, each as a square of that side.
+fn enlarged_pixels(frame: &Frame, scale: usize) -> Vec<u8> {
+    let mut pixels = Vec::with_capacity(frame.pixels().len() * scale * scale);
+    for row in frame.pixels().chunks_exact(frame.width() as usize) {
+        let wide: Vec<u8> = row.iter().flat_map(|&value| repeat_n(value, scale)).collect();
         for _ in 0..scale {
             pixels.extend_from_slice(&wide);
         }
     }
-    Frame::new(sides[0], sides[1], pixels)
+    pixels
+}
+
+/// The sides of a picture, before its pixels are allocated. Errors: `Size`.
+fn sides(width: usize, height: usize) -> Result<[u32; 2], FrameError> {
+    let [width, height] = [width, height].map(|px| u32::try_from(px).unwrap_or(u32::MAX));
+    if (1..=MAX_SIDE_PX).contains(&width) && (1..=MAX_SIDE_PX).contains(&height) {
+        Ok([width, height])
+    } else {
+        Err(FrameError::Size { width, height })
+    }
 }
 
 /// What a model predicted, on one sheet. Time runs from left to right; from the top: the frames seen, the true frames to
@@ -114,11 +117,8 @@ pub(super) fn prediction_panel(
 ) -> Result<Frame, FrameError> {
     let mut rows = wrapped("inputs", seen, 1 - seen.len() as i64);
     let truth = &truth[..truth.len().min(predicted.len())];
-    for (part, first) in predicted.chunks(ROW_CELLS).zip((1..).step_by(ROW_CELLS)) {
-        let known = truth
-            .chunks(ROW_CELLS)
-            .nth((first - 1) as usize / ROW_CELLS)
-            .unwrap_or_default();
+    let known = truth.chunks(ROW_CELLS).chain(repeat(&[][..]));
+    for ((part, known), first) in predicted.chunks(ROW_CELLS).zip(known).zip((1..).step_by(ROW_CELLS)) {
         if !known.is_empty() {
             rows.push(MontageRow::in_time("truth", known, first));
         }
@@ -143,17 +143,10 @@ fn wrapped(label: &str, frames: &[Frame], first: i64) -> Vec<MontageRow> {
 /// The absolute error of every predicted frame, brighter where it is larger, with its mean squared error.
 fn error_row(predicted: &[Frame], truth: &[Frame]) -> Result<MontageRow, FrameError> {
     let cells = predicted.iter().zip(truth).map(|(predicted, truth)| {
-        let differences: Vec<u8> = predicted
-            .pixels()
-            .iter()
-            .zip(truth.pixels())
-            .map(|(&predicted, &truth)| predicted.abs_diff(truth))
-            .collect();
-        let squares: f64 = differences
-            .iter()
-            .map(|&value| (f64::from(value) / 255.0).powi(2))
-            .sum();
-        let mse = squares / differences.len().max(1) as f64;
+        let pairs = predicted.pixels().iter().zip(truth.pixels());
+        let differences: Vec<u8> = pairs.map(|(one, other)| one.abs_diff(*other)).collect();
+        let squares = differences.iter().map(|&value| (f64::from(value) / 255.0).powi(2));
+        let mse = squares.sum::<f64>() / differences.len() as f64;
         let pixels = differences
             .iter()
             .map(|value| value.saturating_mul(ERROR_GAIN))
@@ -172,33 +165,26 @@ fn error_row(predicted: &[Frame], truth: &[Frame]) -> Result<MontageRow, FrameEr
 pub fn montage(title: &str, rows: &[MontageRow], style: &Style) -> Result<Frame, FrameError> {
     let mut style = *style;
     let mut layout = Layout::of(title, rows, &style);
-    while style.scale > 1 && !layout.fits() {
+    while style.scale > 1 && layout.sides().is_err() {
         style.scale -= 1;
         layout = Layout::of(title, rows, &style);
     }
-    let side = |px: usize| u32::try_from(px).unwrap_or(u32::MAX);
-    // The size is checked before the pixels are allocated.
-    if layout.cell_width == 0 || !layout.fits() {
-        return Err(FrameError::Size {
-            width: side(layout.width),
-            height: side(layout.height),
-        });
-    }
+    let [width, height] = layout.sides()?;
     let mut canvas = Canvas::new(layout.width, layout.height, PAPER);
     canvas.write((MARGIN_PX, MARGIN_PX), title, LETTER_SCALE, INK);
     let mut top = layout.top;
-    for (row, height) in rows.iter().zip(&layout.heights) {
+    for (row, row_height) in rows.iter().zip(&layout.heights) {
         draw_row(&mut canvas, row, &style, (top, layout.column));
-        top += height;
+        top += row_height;
     }
-    Frame::new(side(layout.width), side(layout.height), canvas.pixels)
+    Frame::new(width, height, canvas.pixels)
 }
 
 /// Where everything is, in pixels.
 struct Layout {
+    /// 0 if there is no frame.
     width: usize,
     height: usize,
-    cell_width: usize,
     /// From one cell's left edge to the next.
     column: usize,
     /// Below the title.
@@ -209,43 +195,35 @@ struct Layout {
 
 impl Layout {
     fn of(title: &str, rows: &[MontageRow], style: &Style) -> Self {
+        let text_width = |text: &str| width_px(text, LETTER_SCALE);
         let cells = || rows.iter().flat_map(|row| &row.cells);
         let cell_width = cells().map(|(_, frame)| frame.width() as usize).max().unwrap_or(0) * style.scale;
-        let widest_caption = cells()
-            .map(|(caption, _)| width_px(caption, LETTER_SCALE))
-            .max()
-            .unwrap_or(0);
+        let widest_caption = cells().map(|(caption, _)| text_width(caption)).max().unwrap_or(0);
         let column = cell_width.max(widest_caption) + GAP_PX;
         let columns = rows.iter().map(|row| row.cells.len()).max().unwrap_or(0);
         let headings = rows.iter().map(|row| row.label.as_str()).chain([title]);
-        let widest_heading = headings.map(|text| width_px(text, LETTER_SCALE)).max().unwrap_or(0);
-        let line = height_px(LETTER_SCALE) + GAP_PX;
-        let title_height = if title.is_empty() { 0 } else { line + GAP_PX };
-        let heights: Vec<usize> = rows.iter().map(|row| row_height(row, style, line)).collect();
+        let widest_heading = headings.map(text_width).max().unwrap_or(0);
+        let title_height = if title.is_empty() { 0 } else { LINE_PX + GAP_PX };
+        let heights: Vec<usize> = rows.iter().map(|row| row_height(row, style)).collect();
+        let width = 2 * MARGIN_PX + widest_heading.max((columns * column).saturating_sub(GAP_PX));
         Self {
-            width: 2 * MARGIN_PX + widest_heading.max((columns * column).saturating_sub(GAP_PX)),
+            width: if cell_width > 0 { width } else { 0 },
             height: 2 * MARGIN_PX + title_height + heights.iter().sum::<usize>(),
-            cell_width,
             column,
             top: MARGIN_PX + title_height,
             heights,
         }
     }
 
-    fn fits(&self) -> bool {
-        let limit = foreframe_core::frame::MAX_SIDE_PX as usize;
-        self.width <= limit && self.height <= limit
+    fn sides(&self) -> Result<[u32; 2], FrameError> {
+        sides(self.width, self.height)
     }
 }
 
-fn row_height(row: &MontageRow, style: &Style, line: usize) -> usize {
-    let heading = if row.label.is_empty() { 0 } else { line };
-    let captions = if row.cells.iter().all(|(caption, _)| caption.is_empty()) {
-        0
-    } else {
-        line
-    };
-    heading + frames_height(row, style) + captions + GAP_PX
+fn row_height(row: &MontageRow, style: &Style) -> usize {
+    let has_captions = row.cells.iter().any(|(caption, _)| !caption.is_empty());
+    let lines = usize::from(!row.label.is_empty()) + usize::from(has_captions);
+    lines * LINE_PX + frames_height(row, style) + GAP_PX
 }
 
 /// The tallest frame of the row, enlarged.
@@ -257,7 +235,7 @@ fn frames_height(row: &MontageRow, style: &Style) -> usize {
 fn draw_row(canvas: &mut Canvas, row: &MontageRow, style: &Style, (mut top, column): (usize, usize)) {
     if !row.label.is_empty() {
         canvas.write((MARGIN_PX, top), &row.label, LETTER_SCALE, INK);
-        top += height_px(LETTER_SCALE) + GAP_PX;
+        top += LINE_PX;
     }
     let frames = frames_height(row, style);
     for (place, (caption, frame)) in row.cells.iter().enumerate() {
@@ -269,22 +247,15 @@ fn draw_row(canvas: &mut Canvas, row: &MontageRow, style: &Style, (mut top, colu
 }
 
 fn draw_frame(canvas: &mut Canvas, frame: &Frame, style: &Style, (left, top): (usize, usize)) {
-    let (width, height) = (
-        frame.width() as usize * style.scale,
-        frame.height() as usize * style.scale,
-    );
+    let width = frame.width() as usize * style.scale;
     let lines: Vec<usize> = (1..=style.grid_lines)
         .map(|line| line * width / (style.grid_lines + 1))
         .collect();
-    for y in 0..height {
-        for x in 0..width {
-            let value = frame.pixels()[y / style.scale * frame.width() as usize + x / style.scale];
-            let drawn = if lines.contains(&x) {
-                toward_contrast(value)
-            } else {
-                value
-            };
-            canvas.set(left + x, top + y, drawn);
+    let pixels = enlarged_pixels(frame, style.scale);
+    for (y, row) in pixels.chunks_exact(width).enumerate() {
+        for (x, &value) in row.iter().enumerate() {
+            let is_line = lines.contains(&x);
+            canvas.set(left + x, top + y, if is_line { toward_contrast(value) } else { value });
         }
     }
 }
