@@ -158,6 +158,13 @@ impl HasErrorKind for JobError {
     }
 }
 
+impl JobError {
+    fn invalid(field: &'static str, reason: impl Into<String>) -> Self {
+        let reason = reason.into();
+        Self::Invalid { field, reason }
+    }
+}
+
 impl From<DatasetError> for JobError {
     fn from(error: DatasetError) -> Self {
         Self::Dataset(Box::new(error))

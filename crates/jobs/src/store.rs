@@ -13,6 +13,7 @@ pub mod models;
 pub mod objects;
 pub mod reports;
 mod restore;
+mod sqlite;
 mod wal;
 
 use std::error::Error as _;
@@ -35,7 +36,7 @@ pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
 pub use self::restore::restore;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files;
+use foreframe_core::files::{is_transient, write_atomically};
 
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
@@ -49,6 +50,10 @@ const WRITE_PROBE: &str = "write-check";
 const PROBE_BYTES: usize = 16 << 10;
 /// The pause between two attempts to open the database.
 const OPEN_AGAIN_AFTER: Duration = Duration::from_secs(1);
+/// The maximum number of connections to the database.
+const MAX_CONNECTIONS: u32 = 8;
+/// How long a statement waits for a connection or, on SQLite, for another writer.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// The file in the data directory that says that API keys were created.
 const KEYS_MARKER: &str = "api-keys-created";
 
@@ -156,7 +161,7 @@ impl StoreError {
     pub fn is_unavailable(&self) -> bool {
         match self {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
-            Self::Io { source, .. } => files::is_transient(source),
+            Self::Io { source, .. } => is_transient(source),
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
             Self::Away { .. } => true,
             Self::Migrate(error) => {
@@ -167,7 +172,19 @@ impl StoreError {
         }
     }
 
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
+    fn url(flag: &'static str, url: &str, expected: &'static str) -> Self {
+        let scheme = url.split(':').next().unwrap_or_default().chars().take(16).collect();
+        Self::Url { flag, scheme, expected }
+    }
+
+    fn open(database: &'static str, source: sqlx::Error) -> Self {
+        match source {
+            sqlx::Error::Tls(_) if !cfg!(feature = "cloud") => Self::NoTls,
+            source => Self::Open { database, source },
+        }
+    }
+
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }
@@ -269,16 +286,9 @@ impl Store {
     }
 
     async fn write_nothing(&self) -> Result<(), StoreError> {
-        let probe = self.objects.data_dir().join(WRITE_PROBE);
-        let written = probe.clone();
-        let write = move || foreframe_core::files::write_atomically(&written, &[0; PROBE_BYTES]);
-        let written = tokio::task::spawn_blocking(write).await;
-        written
-            .unwrap_or_else(|panic| Err(std::io::Error::other(panic)))
-            .map_err(StoreError::io("write", &probe))?;
+        objects::write(&self.objects.data_dir().join(WRITE_PROBE), vec![0; PROBE_BYTES]).await?;
         let mut tx = self.database.begin().await?;
-        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
-            .await?;
+        tx.lock_numbers().await?;
         tx.commit().await
     }
 
@@ -305,7 +315,7 @@ impl Store {
             return Ok(());
         }
         let text = "API keys were created, so requests need one. To switch authentication off, delete this file and all keys.\n";
-        foreframe_core::files::write_atomically(&marker, text.as_bytes()).map_err(StoreError::io("write", &marker))
+        write_atomically(&marker, text.as_bytes()).map_err(StoreError::io("write", &marker))
     }
 
     /// The files.
@@ -322,7 +332,7 @@ impl Store {
 
     /// Checks that the database answers. Errors: `Query`.
     pub async fn ping(&self) -> Result<(), StoreError> {
-        self.database.fetch("SELECT 1", vec![]).await.map(drop)
+        self.now_s().await.map(drop)
     }
 }
 

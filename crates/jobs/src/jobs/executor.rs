@@ -32,6 +32,16 @@ pub struct JobResult {
     pub measured: Option<ModelMetrics>,
 }
 
+impl JobResult {
+    /// A result without a version or metrics.
+    pub(super) fn of(result: serde_json::Value) -> Self {
+        Self {
+            result,
+            ..Self::default()
+        }
+    }
+}
+
 /// Does the work of jobs.
 pub trait JobExecutor: Send + Sync + 'static {
     /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading

@@ -145,15 +145,8 @@ impl ReportBuffer {
 
     /// Puts back what could not be written, before what was added since.
     pub(super) fn restore_unwritten(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
-        let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
-        lines
-            .into_iter()
-            .chain(later.0)
-            .for_each(|line| push(&mut self.lines, line));
-        points
-            .into_iter()
-            .chain(later.1)
-            .for_each(|point| push(&mut self.points, point));
+        prepend(&mut self.lines, lines);
+        prepend(&mut self.points, points);
     }
 }
 
@@ -162,6 +155,11 @@ fn push<T>(waiting: &mut VecDeque<T>, item: T) {
         waiting.pop_front();
     }
     waiting.push_back(item);
+}
+
+fn prepend<T>(waiting: &mut VecDeque<T>, items: Vec<T>) {
+    let later = std::mem::replace(waiting, items.into());
+    later.into_iter().for_each(|item| push(waiting, item));
 }
 
 #[cfg(test)]

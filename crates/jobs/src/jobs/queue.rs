@@ -37,17 +37,13 @@ impl Jobs {
             ended: Notify::new(),
             stop: watch::Sender::new(false),
         });
-        let runner = if runs {
+        let mut runner = Arc::default();
+        if runs {
             let instance = Instance::claim(shared.store.objects().data_dir())?;
-            let pool = runner::pool(limits.threads)?;
-            Some(tokio::spawn(runner::run(Arc::clone(&shared), instance, pool)))
-        } else {
-            None
-        };
-        Ok(Self {
-            shared,
-            runner: Arc::new(Mutex::new(runner)),
-        })
+            let run = runner::run(Arc::clone(&shared), instance, runner::pool(limits.threads)?);
+            runner = Arc::new(Mutex::new(Some(tokio::spawn(run))));
+        }
+        Ok(Self { shared, runner })
     }
 
     /// Enqueues a job without an API key. Errors: as [`Self::submit_as`].
@@ -219,10 +215,8 @@ fn check_key(key: &str) -> Result<(), JobError> {
     if (1..=MAX_KEY_LENGTH).contains(&key.len()) && key.bytes().all(|byte| byte.is_ascii_graphic()) {
         return Ok(());
     }
-    Err(JobError::Invalid {
-        field: "Idempotency-Key",
-        reason: format!("a key is 1 to {MAX_KEY_LENGTH} visible ASCII characters"),
-    })
+    let reason = format!("a key is 1 to {MAX_KEY_LENGTH} visible ASCII characters");
+    Err(JobError::invalid("Idempotency-Key", reason))
 }
 
 /// The job of an idempotency key. Errors: `Invalid` if its spec is a different one.
@@ -231,18 +225,13 @@ fn same(row: &JobRow, spec: &JobSpec) -> Result<Job, JobError> {
     if job.spec == *spec {
         return Ok(job);
     }
-    Err(JobError::Invalid {
-        field: "Idempotency-Key",
-        reason: format!(
-            "it was used for a different job, {}; use a new key for a new job",
-            job.id
-        ),
-    })
+    let reason = format!(
+        "it was used for a different job, {}; use a new key for a new job",
+        job.id
+    );
+    Err(JobError::invalid("Idempotency-Key", reason))
 }
 
 fn json(value: &impl serde::Serialize) -> Result<String, JobError> {
-    serde_json::to_string(value).map_err(|error| JobError::Invalid {
-        field: "settings",
-        reason: error.to_string(),
-    })
+    serde_json::to_string(value).map_err(|error| JobError::invalid("settings", error.to_string()))
 }

@@ -2,7 +2,7 @@
 //! parent process.
 
 use std::io::Write;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use metrics::gauge;
 use serde::{Deserialize, Serialize};
@@ -47,8 +47,8 @@ pub struct JobReporter {
 
 impl JobReporter {
     /// A reporter into a buffer.
-    pub(super) fn to_buffer(lease: Lease, buffer: ReportBuffer) -> Self {
-        let target = ReportTarget::Buffer(Arc::new(Mutex::new(buffer)));
+    pub(super) fn to_buffer(lease: Lease, buffer: Arc<Mutex<ReportBuffer>>) -> Self {
+        let target = ReportTarget::Buffer(buffer);
         Self { target, lease }
     }
 
@@ -58,22 +58,15 @@ impl JobReporter {
         Self { target, lease }
     }
 
-    /// The buffer, if the report goes to one.
-    pub(super) fn buffer(&self) -> Option<MutexGuard<'_, ReportBuffer>> {
-        match &self.target {
-            ReportTarget::Buffer(buffer) => Some(buffer.lock().unwrap_or_else(PoisonError::into_inner)),
-            ReportTarget::Stdout(_) => None,
-        }
-    }
-
     /// Adds an event to the report.
     pub(super) fn apply(&self, event: ReportEvent) {
-        let Some(mut buffer) = self.buffer() else {
-            if let ReportTarget::Stdout(write) = &self.target {
+        let mut buffer = match &self.target {
+            ReportTarget::Buffer(buffer) => buffer.lock().unwrap_or_else(PoisonError::into_inner),
+            ReportTarget::Stdout(write) => {
                 // The parent has ended if this fails, and this process with it.
                 let _ = write(event, &mut std::io::stdout().lock());
+                return;
             }
-            return;
         };
         match event {
             ReportEvent::Progress(done, total, message) => buffer.progress(done, total, &message, unix_s()),

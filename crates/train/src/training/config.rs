@@ -5,6 +5,7 @@ mod checks;
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
+use super::observer::TrainingStage;
 use super::optimizer::{OptimizerConfig, UpdateRule};
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::nn::loss::Loss;
@@ -303,6 +304,14 @@ impl TrainConfig {
     /// The configuration as TOML text. Errors: `Config`.
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string_pretty(self).map_err(|error| TrainError::Config(error.to_string()))
+    }
+
+    /// The number of updates of a stage, and its highest learning rate.
+    pub(super) fn stage(&self, stage: TrainingStage) -> (usize, f64) {
+        match stage {
+            TrainingStage::Pretrain => (self.pretrain.steps, self.pretrain.learning_rate),
+            TrainingStage::Sequence => (self.sequence.steps, self.sequence.learning_rate),
+        }
     }
 
     /// Context and horizon of a window.

@@ -9,10 +9,9 @@ mod muon;
 
 pub use gradients::Gradients;
 
-use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Tensor};
+use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::nn::Parameters;
@@ -179,13 +178,9 @@ impl Optimizer {
                 muon::update(var, gradient, adam.scale, &mut moments.first, learning_rate)?;
                 continue;
             }
-            with_values(gradient, |gradient| {
-                var.inplace_op1(&AdamUpdate {
-                    rule: adam,
-                    gradient,
-                    moments: RefCell::new(moments),
-                })
-            })??;
+            let mut values = with_values(var, <[f32]>::to_vec)?;
+            with_values(gradient, |gradient| adam.apply(&mut values, gradient, moments))?;
+            var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?;
         }
         Ok(norm)
     }
@@ -257,40 +252,20 @@ struct AdamStep {
 }
 
 impl AdamStep {
-    #[inline(always)]
-    fn apply(self, parameters: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32]) {
-        let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
-        for (((parameter, &gradient), m), v) in values {
-            let gradient = gradient * self.scale;
-            *m = self.beta1 * *m + (1.0 - self.beta1) * gradient;
-            *v = self.beta2 * *v + (1.0 - self.beta2) * gradient * gradient;
-            *parameter -= self.rate * *m / (v.sqrt() + self.epsilon);
-        }
-    }
-}
-
-/// Updates one tensor in place, in one pass over memory. candle's own operations would need a dozen passes.
-struct AdamUpdate<'a> {
-    rule: AdamStep,
-    gradient: &'a [f32],
-    moments: RefCell<&'a mut Moments>,
-}
-
-impl InplaceOp1 for AdamUpdate<'_> {
-    fn name(&self) -> &'static str {
-        "adam"
-    }
-
-    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
-        let (CpuStorage::F32(values), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
-            candle_core::bail!("adam needs contiguous f32 parameters");
-        };
-        let mut moments = self.moments.borrow_mut();
-        let Moments { first, second, .. } = &mut **moments;
+    /// Updates the values of one tensor in one pass. candle's own operations would need a dozen passes.
+    fn apply(self, parameters: &mut [f32], gradient: &[f32], moments: &mut Moments) {
+        let Moments { first, second, .. } = moments;
         vectorized(
             #[inline(always)]
-            || self.rule.apply(&mut values[from..to], self.gradient, first, second),
+            || {
+                let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
+                for (((parameter, &gradient), m), v) in values {
+                    let gradient = gradient * self.scale;
+                    *m = self.beta1 * *m + (1.0 - self.beta1) * gradient;
+                    *v = self.beta2 * *v + (1.0 - self.beta2) * gradient * gradient;
+                    *parameter -= self.rate * *m / (v.sqrt() + self.epsilon);
+                }
+            },
         );
-        Ok(())
     }
 }

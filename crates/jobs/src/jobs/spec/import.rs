@@ -109,7 +109,7 @@ impl ImportSpec {
                 name: self.name.clone(),
                 why: format!("cannot be written because its directory holds {what}"),
             },
-            other => invalid("source", error_text::with_causes(&other)),
+            other => JobError::invalid("source", error_text::with_causes(&other)),
         })
     }
 
@@ -118,11 +118,11 @@ impl ImportSpec {
     pub(in crate::jobs) fn config(&self, data_dir: &Path, import_dir: Option<&Path>) -> Result<ImportConfig, JobError> {
         let Some(import_dir) = import_dir else {
             let why = "imports are off on this server; set its setting import_dir to the directory with the recordings";
-            return Err(invalid("source", why.to_owned()));
+            return Err(JobError::invalid("source", why));
         };
         let root = import_dir.canonicalize().map_err(|error| {
             let why = format!("the server's import_dir cannot be read ({error}); create it, or correct the setting");
-            invalid("source", why)
+            JobError::invalid("source", why)
         })?;
         let source = existing(&root, &self.source, "source")?;
         check_links(&root, &source)?;
@@ -140,9 +140,9 @@ impl ImportSpec {
     fn options(&self) -> Result<ImportOptions, JobError> {
         let wrong = |error: ImportError| match error {
             ImportError::OptionValue { option, value, right } => {
-                invalid(option, format!("{value} is not valid; {right}"))
+                JobError::invalid(option, format!("{value} is not valid; {right}"))
             }
-            other => invalid("source", other.to_string()),
+            other => JobError::invalid("source", other.to_string()),
         };
         let (frame_width_px, frame_height_px) = parse_size(&self.size).map_err(wrong)?;
         let options = ImportOptions {
@@ -165,16 +165,10 @@ impl ImportSpec {
     }
 }
 
-fn invalid(field: &'static str, reason: String) -> JobError {
-    JobError::Invalid { field, reason }
-}
-
 fn wrong_path(field: &'static str, path: &str, what: &str) -> JobError {
     let shown = path.escape_default();
-    invalid(
-        field,
-        format!("\"{shown}\" {what}; give the path of a recording below the server's import_dir, as in mycar/data"),
-    )
+    let right = "give the path of a recording below the server's import_dir, as in mycar/data";
+    JobError::invalid(field, format!("\"{shown}\" {what}; {right}"))
 }
 
 /// The real path of a file or folder below `root`, which is a real path itself. Errors: `Invalid`.
@@ -204,7 +198,7 @@ fn check_links(root: &Path, source: &Path) -> Result<(), JobError> {
             continue;
         }
         let unreadable =
-            |error: io::Error| invalid("source", format!("{} cannot be read: {error}", shown(root, &folder)));
+            |error: io::Error| JobError::invalid("source", format!("{} cannot be read: {error}", shown(root, &folder)));
         for entry in fs::read_dir(&folder).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let kind = entry.file_type().map_err(unreadable)?;
