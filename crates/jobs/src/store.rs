@@ -101,14 +101,8 @@ pub enum StoreError {
         source: Box<StoreError>,
     },
     /// `foreframe restore` did not finish.
-    #[error(
-        "the restore into {} did not finish; run foreframe restore again",
-        data_dir.display()
-    )]
-    Restoring {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
+    #[error("the restore into {} did not finish; run foreframe restore again", .0.display())]
+    Restoring(PathBuf),
     /// The tables could not be migrated to this version of the program.
     #[error("could not migrate the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
@@ -144,13 +138,8 @@ impl HasErrorKind for StoreError {
         }
         match self {
             Self::Url { .. } | Self::NoTls => ErrorKind::Usage,
-            Self::Damaged { .. } | Self::Restoring { .. } => ErrorKind::Unusable,
-            Self::Open { .. }
-            | Self::Away { .. }
-            | Self::Migrate(_)
-            | Self::Query(_)
-            | Self::Io { .. }
-            | Self::Object { .. } => ErrorKind::Internal,
+            Self::Damaged { .. } | Self::Restoring(_) => ErrorKind::Unusable,
+            _ => ErrorKind::Internal,
         }
     }
 }
@@ -168,7 +157,7 @@ impl StoreError {
                 let cause = error.source().and_then(|cause| cause.downcast_ref::<sqlx::Error>());
                 cause.is_some_and(database::is_unavailable)
             }
-            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } => false,
+            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring(_) => false,
         }
     }
 
@@ -205,6 +194,14 @@ impl StoreConfig {
     /// Whether the database is another process, which can be away for a while.
     fn is_remote(&self) -> bool {
         self.database.as_ref().is_some_and(|url| url.starts_with("postgres"))
+    }
+
+    /// The file of SQLite's database; `None` with another database. Errors: `Open`.
+    fn database_file(&self) -> Result<Option<PathBuf>, StoreError> {
+        match &self.database {
+            None => Ok(Some(self.data_dir.join(DATABASE_FILE))),
+            Some(url) => sqlite::file_of(url),
+        }
     }
 
     /// Whether there is a store to open: one in the data directory, or one that is named.
@@ -244,13 +241,12 @@ impl Store {
                 Err(error @ StoreError::Open { .. }) if config.is_remote() && error.is_unavailable() => error,
                 opened => return opened,
             };
+            let waited_s = started.elapsed().as_secs();
             if started.elapsed() >= limit {
-                return Err(StoreError::Away {
-                    waited_s: started.elapsed().as_secs(),
-                    source: Box::new(error),
-                });
+                let source = Box::new(error);
+                return Err(StoreError::Away { waited_s, source });
             }
-            warn!(%error, waited_s = started.elapsed().as_secs(), limit_s = limit.as_secs(), "waiting for the database");
+            warn!(%error, waited_s, limit_s = limit.as_secs(), "waiting for the database");
             tokio::time::sleep(OPEN_AGAIN_AFTER.min(limit)).await;
         }
     }
@@ -259,13 +255,9 @@ impl Store {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;
         if data_dir.join(backup::RESTORING).exists() {
-            let data_dir = data_dir.clone();
-            return Err(StoreError::Restoring { data_dir });
+            return Err(StoreError::Restoring(data_dir.clone()));
         }
-        let database = match &config.database {
-            Some(url) => Database::open(url, is_first).await?,
-            None => Database::open_file(&data_dir.join(DATABASE_FILE), is_first).await?,
-        };
+        let database = Database::open(config, is_first).await?;
         Ok(Self {
             database,
             objects: Objects::open(data_dir, config.objects.as_deref())?,

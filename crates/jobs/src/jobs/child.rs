@@ -14,7 +14,8 @@ use serde::{Deserialize, Serialize};
 
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::pipeline::{JobResources, Pipeline};
-use super::report::{JobReporter, ReportEvent};
+use super::progress::ReportEvent;
+use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};

@@ -44,7 +44,7 @@ impl JobResult {
 
 /// Does the work of jobs.
 pub trait JobExecutor: Send + Sync + 'static {
-    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading
+    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, and the errors of reading
     /// data sets and models.
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 

@@ -89,14 +89,12 @@ impl Jobs {
 
     fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
         match (enqueued, spec.made_dataset()) {
-            (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull { limit: *limit },
-            (EnqueueResult::Taken, Some(name)) => JobError::Taken {
-                name: name.clone(),
-                why: "is the output of another job that has not ended",
-            },
-            _ => JobError::QueueFull {
-                limit: self.shared.limits.queued,
-            },
+            (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull(*limit),
+            (EnqueueResult::Taken, Some(name)) => JobError::taken(
+                name,
+                "is the output of another job that has not ended; choose another name",
+            ),
+            _ => JobError::QueueFull(self.shared.limits.queued),
         }
     }
 
@@ -203,7 +201,7 @@ impl Jobs {
 
     async fn row(&self, id: JobId) -> Result<JobRow, JobError> {
         let found = self.shared.store.job(id).await?;
-        found.ok_or_else(|| JobError::Unknown { id: id.to_string() })
+        found.ok_or_else(|| JobError::Unknown(id.to_string()))
     }
 }
 

@@ -4,31 +4,9 @@
 use std::io::Write;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use metrics::gauge;
-use serde::{Deserialize, Serialize};
-
-use super::progress::ReportBuffer;
+use super::progress::{ReportBuffer, ReportEvent};
 use super::{Losses, unix_s};
 use crate::store::{JobId, Lease, LossRow};
-use foreframe_core::metric_names;
-
-/// A part of a job's report.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum ReportEvent {
-    /// Units done, their total, and what the job is doing.
-    Progress(u64, u64, String),
-    /// A stage with units of another duration starts.
-    Stage,
-    /// The latest losses.
-    Losses(Losses),
-    /// A line for the log.
-    Line(String),
-    /// A point of the loss curves.
-    Point(LossRow),
-    /// Units that are saved.
-    Checkpoint(u64),
-}
 
 type WriteEvent = fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>;
 
@@ -60,28 +38,15 @@ impl JobReporter {
 
     /// Adds an event to the report.
     pub(super) fn apply(&self, event: ReportEvent) {
-        let mut buffer = match &self.target {
-            ReportTarget::Buffer(buffer) => buffer.lock().unwrap_or_else(PoisonError::into_inner),
+        match &self.target {
+            ReportTarget::Buffer(buffer) => {
+                let mut buffer = buffer.lock().unwrap_or_else(PoisonError::into_inner);
+                buffer.apply(event, unix_s());
+            }
             ReportTarget::Stdout(write) => {
                 // The parent has ended if this fails, and this process with it.
                 let _ = write(event, &mut std::io::stdout().lock());
-                return;
             }
-        };
-        match event {
-            ReportEvent::Progress(done, total, message) => buffer.progress(done, total, &message, unix_s()),
-            ReportEvent::Stage => buffer.stage(),
-            ReportEvent::Losses(losses) => {
-                for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
-                    if let Some(loss) = loss {
-                        gauge!(metric_names::TRAINING_LOSS, "split" => split).set(loss);
-                    }
-                }
-                buffer.losses(losses);
-            }
-            ReportEvent::Line(line) => buffer.line(line, unix_s()),
-            ReportEvent::Point(point) => buffer.point(point),
-            ReportEvent::Checkpoint(units) => buffer.checkpoint(units),
         }
     }
 

@@ -185,7 +185,7 @@ impl JobSpec {
     }
 
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
-    /// `Taken`, `Occupied`, `Dataset`.
+    /// `Taken`, `Dataset`.
     pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         match self {
             Self::Collect(spec) => spec.check(available),
@@ -230,23 +230,19 @@ impl CollectSpec {
         }
         match CollectionStatus::of(&config) {
             Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
-            Ok(_) => Err(JobError::Taken {
-                name: self.name.clone(),
-                why: "exists",
-            }),
-            Err(DatasetError::OutExists { .. }) => {
-                Err(self.occupied("cannot be written because other files are in its directory; move them".to_owned()))
+            Ok(_) => Err(JobError::taken(&self.name, "exists; choose another name")),
+            Err(DatasetError::OutExists { .. }) => Err(JobError::taken(
+                &self.name,
+                "cannot be written because other files are in its directory; move them, or choose another name",
+            )),
+            Err(DatasetError::OtherArguments { differences, .. }) => {
+                let why = format!(
+                    "was started with other arguments ({differences}); use those to continue it, or choose another name"
+                );
+                Err(JobError::taken(&self.name, why))
             }
-            Err(DatasetError::OtherArguments { differences, .. }) => Err(self.occupied(format!(
-                "was started with other arguments ({differences}); use those to continue it"
-            ))),
             Err(error) => Err(error.into()),
         }
-    }
-
-    fn occupied(&self, why: String) -> JobError {
-        let name = self.name.clone();
-        JobError::Occupied { name, why }
     }
 
     /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.

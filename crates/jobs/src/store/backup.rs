@@ -33,11 +33,8 @@ const LIST_AGAIN_AFTER: Duration = Duration::from_millis(50);
 #[non_exhaustive]
 pub enum BackupError {
     /// The directory holds files.
-    #[error("{} is not empty; name a new directory", path.display())]
-    NotEmpty {
-        /// The directory.
-        path: PathBuf,
-    },
+    #[error("{} is not empty; name a new directory", .0.display())]
+    NotEmpty(PathBuf),
     /// The backup would contain itself.
     #[error("{} is in the data directory {}; name a directory outside of it", path.display(), data_dir.display())]
     Inside {
@@ -55,26 +52,17 @@ pub enum BackupError {
         reason: String,
     },
     /// A file of the backup is not as it was written.
-    #[error("{} is damaged or missing; restore another backup", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-    },
+    #[error("{} is damaged or missing; restore another backup", .0.display())]
+    Damaged(PathBuf),
     /// The backup holds SQLite's database, but the settings name PostgreSQL.
     #[error("the backup holds an SQLite database, but database_url names PostgreSQL; restore it without database_url")]
     OtherDatabase,
-    /// Another process restores into the directory.
-    #[error("another restore into {} is running; wait for its end", data_dir.display())]
-    Restoring {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
-    /// Files were deleted each time while they were copied.
-    #[error("files in {} are being deleted all the time; try again later", data_dir.display())]
-    Unstable {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
+    /// Another process restores into this data directory.
+    #[error("another restore into {} is running; wait for its end", .0.display())]
+    Restoring(PathBuf),
+    /// Files of this data directory were deleted each time while they were copied.
+    #[error("files in {} are being deleted all the time; try again later", .0.display())]
+    Unstable(PathBuf),
     /// The database could not be copied, or a file could not be read or written.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -85,9 +73,9 @@ impl HasErrorKind for BackupError {
         match self {
             Self::NoBackup { .. } => ErrorKind::NotFound,
             Self::Inside { .. } | Self::OtherDatabase => ErrorKind::Usage,
-            Self::NotEmpty { .. } | Self::Restoring { .. } => ErrorKind::Conflict,
-            Self::Damaged { .. } => ErrorKind::Unusable,
-            Self::Unstable { .. } => ErrorKind::Busy,
+            Self::NotEmpty(_) | Self::Restoring(_) => ErrorKind::Conflict,
+            Self::Damaged(_) => ErrorKind::Unusable,
+            Self::Unstable(_) => ErrorKind::Busy,
             Self::Store(StoreError::Io { .. }) => ErrorKind::Internal,
             Self::Store(error) => error.kind().of_own_data(),
         }
@@ -146,7 +134,7 @@ impl Store {
             return Err(BackupError::Inside { path, data_dir });
         }
         if !is_empty_but(to, |_| false)? {
-            return Err(BackupError::NotEmpty { path: to.to_owned() });
+            return Err(BackupError::NotEmpty(to.to_owned()));
         }
         let mut copied = Copied::default();
         for _ in 0..ROUNDS {
@@ -175,7 +163,7 @@ impl Store {
             write_index(to, &index)?;
             return Ok(index);
         }
-        Err(unstable(data_dir))
+        Err(BackupError::Unstable(data_dir.to_owned()))
     }
 }
 
@@ -227,7 +215,7 @@ async fn settled_files(data_dir: &Path) -> Result<BTreeSet<PathBuf>, BackupError
         before = now;
         tokio::time::sleep(LIST_AGAIN_AFTER).await;
     }
-    Err(unstable(data_dir))
+    Err(BackupError::Unstable(data_dir.to_owned()))
 }
 
 /// The files that belong to a backup, by their path below the data directory.
@@ -241,13 +229,7 @@ fn listed_files(data_dir: &Path) -> Result<BTreeSet<PathBuf>, BackupError> {
             return Ok(files.filter(|file| is_kept(file)).collect());
         }
     }
-    Err(unstable(data_dir))
-}
-
-fn unstable(data_dir: &Path) -> BackupError {
-    BackupError::Unstable {
-        data_dir: data_dir.to_owned(),
-    }
+    Err(BackupError::Unstable(data_dir.to_owned()))
 }
 
 /// Not the database, which is copied by itself, and not what belongs to a process.

@@ -1,7 +1,7 @@
 //! SQLite and PostgreSQL behind one interface: both get the same statements and values. All differences are here. sqlx's own
 //! driver for any database takes its options from a URL alone, which has no busy timeout and not every path.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use futures_util::future::BoxFuture;
@@ -17,7 +17,7 @@ use sqlx::{
 };
 
 use super::job_id::JobId;
-use super::{BUSY_TIMEOUT, MAX_CONNECTIONS, StoreError, sqlite};
+use super::{BUSY_TIMEOUT, DATABASE_FILE, MAX_CONNECTIONS, StoreConfig, StoreError, sqlite};
 use foreframe_core::types::ModelName;
 
 /// The time limit of a statement on PostgreSQL. Without it, a server that was paused or disconnected would be waited for
@@ -151,31 +151,17 @@ fn with_changed_rows(sql: &str) -> impl SqlSafeStr {
 }
 
 impl Database {
-    pub(super) async fn open(url: &str, is_first: bool) -> Result<Self, StoreError> {
-        match url.split(':').next() {
-            Some("sqlite") => Self::open_sqlite(sqlite::options(url)?, is_first).await,
-            Some("postgres" | "postgresql") => Box::pin(Self::open_postgres(url)).await,
-            _ => Err(StoreError::url(
-                "database",
-                url,
-                "sqlite:FILE or postgres://USER@HOST/NAME",
-            )),
-        }
-    }
-
-    pub(super) async fn open_file(path: &Path, is_first: bool) -> Result<Self, StoreError> {
-        Self::open_sqlite(SqliteConnectOptions::new().filename(path), is_first).await
-    }
-
-    async fn open_sqlite(options: SqliteConnectOptions, is_first: bool) -> Result<Self, StoreError> {
+    pub(super) async fn open(config: &StoreConfig, is_first: bool) -> Result<Self, StoreError> {
+        let options = match config.database.as_deref().map(|url| (url, url.split(':').next())) {
+            None => SqliteConnectOptions::new().filename(config.data_dir.join(DATABASE_FILE)),
+            Some((url, Some("sqlite"))) => sqlite::options(url)?,
+            Some((url, Some("postgres" | "postgresql"))) => return Box::pin(Self::open_postgres(url)).await,
+            Some((url, _)) => {
+                let expected = "sqlite:FILE or postgres://USER@HOST/NAME";
+                return Err(StoreError::url("database", url, expected));
+            }
+        };
         sqlite::open(options, is_first, &migrations()).await.map(Self::Sqlite)
-    }
-
-    /// The file that a URL names; `None` if it does not name SQLite. Errors: `Open`.
-    pub(super) fn file_of(url: &str) -> Result<Option<PathBuf>, StoreError> {
-        let is_sqlite = url.starts_with("sqlite:");
-        let options = is_sqlite.then(|| sqlite::options(url)).transpose()?;
-        Ok(options.map(|options| options.get_filename().to_owned()))
     }
 
     /// Writes the present state into a new file, while others read and write. Returns false if this is not possible, because

@@ -82,21 +82,6 @@ impl KeyRow {
 }
 
 impl Store {
-    /// Adds a key that allows everything. Errors: `Query`, also if the id exists.
-    pub async fn create_key(&self, id: &str, name: &str, hash: &str, created_s: f64) -> Result<(), StoreError> {
-        let key = KeyRow {
-            id: id.to_owned(),
-            name: name.to_owned(),
-            hash: hash.to_owned(),
-            created_s,
-            revoked_s: None,
-            scope: KeyScope::Admin,
-            expires_s: None,
-            requests_per_s: None,
-        };
-        self.add_key(key, &Author::CommandLine).await
-    }
-
     /// Adds a key. Errors: `Query`, also if the id exists.
     pub async fn add_key(&self, key: KeyRow, by: &Author) -> Result<(), StoreError> {
         self.mark_keys_created()?;
@@ -125,12 +110,6 @@ impl Store {
             self.mark_keys_created()?;
         }
         read_all(rows)
-    }
-
-    /// A key, revoked or not. Errors: `Query`.
-    pub async fn find_key(&self, id: &str) -> Result<Option<KeyRow>, StoreError> {
-        let sql = "SELECT * FROM api_keys WHERE id = $1";
-        self.database.read_first(sql, values![id]).await
     }
 
     /// Revokes a key. Returns false if there is no such key or it was already revoked. Errors: `Query`.

@@ -1,6 +1,6 @@
 //! Opens SQLite's database, and checks that it can be written and is not damaged.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr as _;
 
 use sqlx::error::DatabaseError as _;
@@ -66,6 +66,12 @@ pub(super) async fn open(
     }
     migrations.run(&pool).await.map_err(StoreError::Migrate)?;
     Ok(pool)
+}
+
+/// The file that a URL names; `None` if it does not name SQLite. Errors: `Open`.
+pub(super) fn file_of(url: &str) -> Result<Option<PathBuf>, StoreError> {
+    let options = url.starts_with("sqlite:").then(|| options(url)).transpose()?;
+    Ok(options.map(|options| options.get_filename().to_owned()))
 }
 
 /// The options in a URL of SQLite. Errors: `Open`.

@@ -22,11 +22,10 @@ pub(super) fn check(database: &Path) -> Result<(), StoreError> {
     let mut path = database.as_os_str().to_owned();
     path.push("-wal");
     let path = Path::new(&path);
-    let read = || {
+    let read = || -> Result<Vec<u32>, StoreError> {
         let log = none_if_missing(std::fs::read(path)).map_err(StoreError::io("read", path))?;
         let log = log.unwrap_or_default();
-        let words = log.as_chunks().0.iter().copied().map(u32::from_be_bytes);
-        Ok(words.collect::<Vec<_>>())
+        Ok(log.as_chunks().0.iter().copied().map(u32::from_be_bytes).collect())
     };
     for _ in 0..READS {
         let log = read()?;

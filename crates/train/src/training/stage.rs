@@ -74,9 +74,10 @@ impl StageRunner<'_> {
                 return Ok(StageEnd::Interrupted);
             }
             let rate = learning_rate * self.schedule(state.progress.step, steps);
+            let step = state.progress.step + 1;
             let diverged = |what| TrainError::Diverged {
                 stage,
-                step: state.progress.step + 1,
+                step,
                 what,
                 checkpoint_step,
             };
@@ -90,8 +91,7 @@ impl StageRunner<'_> {
                 }
                 updated => updated,
             }?;
-            state.progress.step += 1;
-            let step = state.progress.step;
+            state.progress.step = step;
             observer.on_event(TrainingEvent::Step {
                 stage,
                 step,

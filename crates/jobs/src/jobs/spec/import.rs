@@ -95,20 +95,17 @@ impl ImportSpec {
     pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         let config = self.config(available.data_dir, available.import_dir)?;
         if available.datasets.contains(&self.name) {
-            return Err(JobError::Taken {
-                name: self.name.clone(),
-                why: "exists",
-            });
+            return Err(JobError::taken(&self.name, "exists; choose another name"));
         }
         // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
         if is_finished(&config.out) {
             return Ok(());
         }
         check_out(&config).map_err(|error| match error {
-            ImportError::OutExists { what, .. } => JobError::Occupied {
-                name: self.name.clone(),
-                why: format!("cannot be written because its directory holds {what}"),
-            },
+            ImportError::OutExists { what, .. } => JobError::taken(
+                &self.name,
+                format!("cannot be written because its directory holds {what}, or choose another name"),
+            ),
             other => JobError::invalid("source", error_text::with_causes(&other)),
         })
     }
@@ -165,6 +162,8 @@ impl ImportSpec {
     }
 }
 
+const OUTSIDE: &str = "is a link that leads out of import_dir";
+
 fn wrong_path(field: &'static str, path: &str, what: &str) -> JobError {
     let shown = path.escape_default();
     let right = "give the path of a recording below the server's import_dir, as in mycar/data";
@@ -183,11 +182,10 @@ fn existing(root: &Path, path: &str, field: &'static str) -> Result<PathBuf, Job
         .join(path)
         .canonicalize()
         .map_err(|_| wrong_path(field, path, "does not exist"))?;
-    if real.starts_with(root) {
-        Ok(real)
-    } else {
-        Err(wrong_path(field, path, "is a link that leads out of import_dir"))
+    if !real.starts_with(root) {
+        return Err(wrong_path(field, path, OUTSIDE));
     }
+    Ok(real)
 }
 
 /// Errors: `Invalid` if a link in the recording leads out of `root`, or to nothing.
@@ -208,10 +206,7 @@ fn check_links(root: &Path, source: &Path) -> Result<(), JobError> {
             }
             match entry.path().canonicalize() {
                 Ok(real) if real.starts_with(root) => folders.push(real),
-                Ok(_) => {
-                    let what = "is a link that leads out of import_dir";
-                    return Err(wrong_path("source", &shown(root, &entry.path()), what));
-                }
+                Ok(_) => return Err(wrong_path("source", &shown(root, &entry.path()), OUTSIDE)),
                 // A link to nothing is as good as a missing file, which the import reports.
                 Err(_) => {}
             }

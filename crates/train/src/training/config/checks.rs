@@ -74,11 +74,11 @@ impl TrainConfig {
     fn validate_together(&self) -> Result<(), TrainError> {
         let (run, sequence) = (&self.run, &self.sequence);
         if self.model.architecture == ArchitectureKind::Dense {
-            let refused = [
+            let dense_needs = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
                 ("sequence.short_share", sequence.short_share > 0.0, "0"),
             ];
-            if let Some((field, _, needed)) = refused.iter().find(|(_, is_set, _)| *is_set) {
+            if let Some((field, _, needed)) = dense_needs.iter().find(|(_, is_set, _)| *is_set) {
                 return refused(format!(
                     "{field} is for the flow network only; it must be {needed} where model.architecture is dense"
                 ));
