@@ -114,10 +114,10 @@ pub enum JobError {
     Threads(#[source] rayon::ThreadPoolBuildError),
     /// The data sets could not be read.
     #[error(transparent)]
-    Dataset(Box<DatasetError>),
+    Dataset(#[from] DatasetError),
     /// The models could not be read.
     #[error(transparent)]
-    Versions(Box<VersionError>),
+    Versions(#[from] VersionError),
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -150,22 +150,10 @@ impl JobError {
     }
 }
 
-impl From<DatasetError> for JobError {
-    fn from(error: DatasetError) -> Self {
-        Self::Dataset(Box::new(error))
-    }
-}
-
 /// No job has that id: it is not even an id.
 impl From<JobIdError> for JobError {
     fn from(JobIdError(id): JobIdError) -> Self {
         Self::Unknown(id)
-    }
-}
-
-impl From<VersionError> for JobError {
-    fn from(error: VersionError) -> Self {
-        Self::Versions(Box::new(error))
     }
 }
 

@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 use self::augment::Augmentation;
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition, seal, state_entry};
-use self::checkpoint::{RunFiles, io_failed};
+use self::checkpoint::{HISTORY_FILE, MODEL_DIR, RunFiles, io_failed};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
 pub use self::error::TrainError;
@@ -93,7 +93,7 @@ pub fn run(
         start::parameters(&plan, start)?;
     }
     let _lock = files.lock()?;
-    let model_dir = files.model_dir();
+    let model_dir = files.path(MODEL_DIR);
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(TrainingOutcome::Finished { model_dir, manifest });
@@ -141,7 +141,8 @@ pub fn run(
     let history = serde_json::to_vec(&state.progress.history);
     let history =
         history.map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
-    write_atomically(&files.history(), &history).map_err(io_failed("write", &files.history()))?;
+    let history_file = files.path(HISTORY_FILE);
+    write_atomically(&history_file, &history).map_err(io_failed("write", &history_file))?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
     Ok(TrainingOutcome::Finished { model_dir, manifest })
 }
@@ -201,7 +202,7 @@ impl<'a> TrainingPlan<'a> {
             WindowBudget::Count(count) => {
                 splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
             }
-            WindowBudget::All(_) => available,
+            WindowBudget::All => available,
         };
         let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
         let validation = validation.into_iter().step_by(stride).collect();

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::pipeline::{JobResources, Pipeline};
 use super::progress::ReportEvent;
-use super::report::JobReporter;
+use super::report::{JobReporter, ReportTarget};
 use super::retry_policy::RetryPolicy;
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};
@@ -204,7 +204,8 @@ pub fn run() -> Result<(), String> {
         let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         flag.store(true, Ordering::Release);
     });
-    let report = JobReporter::to_writer(order.lease, |event, out| write_line(out, &ChildMessage::Report(event)));
+    let target = ReportTarget::Stdout(|event, out| write_line(out, &ChildMessage::Report(event)));
+    let report = JobReporter::new(order.lease, target);
     let result = work(&order, &report, &cancelled).unwrap_or_else(|reason| Err(JobFailure::Crashed(reason)));
     write_line(&mut std::io::stdout(), &ChildMessage::Result(result)).map_err(|error| error.to_string())
 }

@@ -56,7 +56,7 @@ impl Jobs {
     /// `Store`.
     pub async fn submit_as(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
-        if *shared.stop.borrow() {
+        if shared.is_stopping() {
             return Err(JobError::Stopping);
         }
         if let Some(key) = &key {
@@ -159,7 +159,7 @@ impl Jobs {
     /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
     /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
     pub async fn resume(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
-        if *self.shared.stop.borrow() {
+        if self.shared.is_stopping() {
             return Err(JobError::Stopping);
         }
         let row = self.row(id).await?;

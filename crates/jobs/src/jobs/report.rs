@@ -8,12 +8,11 @@ use super::progress::{ReportBuffer, ReportEvent};
 use super::{Losses, unix_s};
 use crate::store::{JobId, Lease, LossRow};
 
-type WriteEvent = fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>;
-
+/// Where the events of a report go: into a buffer, or each one to standard output.
 #[derive(Clone)]
-enum ReportTarget {
+pub(super) enum ReportTarget {
     Buffer(Arc<Mutex<ReportBuffer>>),
-    Stdout(WriteEvent),
+    Stdout(fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>),
 }
 
 /// Receives the report of a running job.
@@ -24,15 +23,7 @@ pub struct JobReporter {
 }
 
 impl JobReporter {
-    /// A reporter into a buffer.
-    pub(super) fn to_buffer(lease: Lease, buffer: Arc<Mutex<ReportBuffer>>) -> Self {
-        let target = ReportTarget::Buffer(buffer);
-        Self { target, lease }
-    }
-
-    /// A reporter that writes each event to standard output.
-    pub(super) fn to_writer(lease: Lease, write: WriteEvent) -> Self {
-        let target = ReportTarget::Stdout(write);
+    pub(super) fn new(lease: Lease, target: ReportTarget) -> Self {
         Self { target, lease }
     }
 
@@ -72,9 +63,9 @@ impl JobReporter {
         self.apply(ReportEvent::Stage);
     }
 
-    /// Sets the latest losses.
-    pub fn losses(&self, losses: Losses) {
-        self.apply(ReportEvent::Losses(losses));
+    /// Sets the latest losses. A loss that is `None` keeps its last value.
+    pub fn losses(&self, train: Option<f64>, validation: Option<f64>) {
+        self.apply(ReportEvent::Losses(Losses { train, validation }));
     }
 
     /// Adds a line to the job's log.

@@ -94,6 +94,7 @@ fn retry_while_busy<T, E>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::jobs::report::ReportTarget;
     use crate::store::{JobId, Lease, StoreError};
 
     fn away() -> StoreError {
@@ -113,7 +114,7 @@ mod tests {
         };
         let retry = RetryPolicy {
             runtime: runtime.handle(),
-            report: &JobReporter::to_writer(lease, |_, _| Ok(())),
+            report: &JobReporter::new(lease, ReportTarget::Stdout(|_, _| Ok(()))),
             cancelled: &AtomicBool::new(cancelled),
         };
         let (mut tries, mut other) = (0, other);

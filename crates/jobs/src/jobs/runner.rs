@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 
 use metrics::counter;
 use rayon::ThreadPool;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::executor::{JobFailure, JobResult};
 use super::instance::Instance;
 use super::progress::{ReportBuffer, StoredProgress};
-use super::report::JobReporter;
+use super::report::{JobReporter, ReportTarget};
 use super::shared::SharedJobs;
 use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
 use crate::store::{JobId, JobOutcome, JobReport, JobRow, Lease, StoreError};
@@ -38,35 +38,26 @@ pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
 
 pub(super) async fn run(shared: Arc<SharedJobs>, instance: Instance, pool: ThreadPool) {
     let pool = Arc::new(pool);
-    let mut stop = shared.stop.subscribe();
     // This process holds the lock of the id, so all leases under the id are of an earlier process that has ended.
     if let Err(error) = shared.store.release_leases(&instance.id).await {
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     let lease_s = shared.limits.lease.as_secs_f64();
-    while !*stop.borrow() {
+    while !shared.is_stopping() {
         match shared.store.claim(&instance.id, lease_s).await {
-            Ok(Some((row, lease))) => Box::pin(JobRun::new(&shared, row, lease).run(&pool, stop.clone())).await,
-            Ok(None) => pause(&shared, &mut stop).await,
-            Err(error) => {
-                warn!(%error, "could not claim a job");
-                pause(&shared, &mut stop).await;
+            Ok(Some((row, lease))) => {
+                Box::pin(JobRun::new(&shared, row, lease).run(&pool)).await;
+                continue;
             }
+            Ok(None) => {}
+            Err(error) => warn!(%error, "could not claim a job"),
+        }
+        tokio::select! {
+            () = shared.wake.notified() => {}
+            () = tokio::time::sleep(POLL_EVERY) => {}
+            () = shared.stop_requested() => {}
         }
     }
-}
-
-async fn pause(shared: &SharedJobs, stop: &mut watch::Receiver<bool>) {
-    tokio::select! {
-        () = shared.wake.notified() => {}
-        () = tokio::time::sleep(POLL_EVERY) => {}
-        () = stop_requested(stop) => {}
-    }
-}
-
-async fn stop_requested(stop: &mut watch::Receiver<bool>) {
-    // The sender lives as long as the jobs' handle does.
-    let _ = stop.wait_for(|stop| *stop).await;
 }
 
 /// One attempt of a job.
@@ -101,7 +92,7 @@ impl<'a> JobRun<'a> {
         let buffer = Arc::new(Mutex::new(ReportBuffer::new(stored)));
         Self {
             shared,
-            report: JobReporter::to_buffer(lease, Arc::clone(&buffer)),
+            report: JobReporter::new(lease, ReportTarget::Buffer(Arc::clone(&buffer))),
             buffer,
             cancelled: Arc::new(AtomicBool::new(false)),
             cancel_requested: row.cancelling,
@@ -121,8 +112,8 @@ impl<'a> JobRun<'a> {
         self.cancelled.store(true, Ordering::Release);
     }
 
-    async fn run(mut self, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
-        let (id, stopping) = (self.row.id, stop.clone());
+    async fn run(mut self, pool: &Arc<ThreadPool>) {
+        let id = self.row.id;
         info!(job.id = %id, job.attempt = self.row.token, "job started");
         self.report.line(match self.row.token {
             1 => "started".to_owned(),
@@ -131,7 +122,7 @@ impl<'a> JobRun<'a> {
         let mut result = match Job::of(&self.row) {
             Ok(_) if self.cancel_requested => Err(JobFailure::Cancelled),
             Ok(_) if self.row.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
-            Ok(job) => self.supervise(job.spec, pool, stop).await,
+            Ok(job) => self.supervise(job.spec, pool).await,
             Err(error) => Err(JobFailure::Failed(error.to_string())),
         };
         if result == Err(JobFailure::Cancelled) && !self.cancel_requested {
@@ -142,7 +133,8 @@ impl<'a> JobRun<'a> {
             warn!(job.id = %id, "the job's lease was lost; another worker continues it");
             return;
         }
-        let was_stopped_here = result == Err(JobFailure::Cancelled) && !self.cancel_requested && !*stopping.borrow();
+        let was_stopped_here =
+            result == Err(JobFailure::Cancelled) && !self.cancel_requested && !self.shared.is_stopping();
         if was_stopped_here && let Some(failure) = self.reached_limit() {
             result = Err(failure);
         }
@@ -168,14 +160,10 @@ impl<'a> JobRun<'a> {
     }
 
     /// Runs the work on its own thread, and writes its report until the work returns.
-    async fn supervise(
-        &mut self,
-        spec: JobSpec,
-        pool: &Arc<ThreadPool>,
-        mut stop: watch::Receiver<bool>,
-    ) -> Result<JobResult, JobFailure> {
+    async fn supervise(&mut self, spec: JobSpec, pool: &Arc<ThreadPool>) -> Result<JobResult, JobFailure> {
+        let shared = self.shared;
         let (sender, mut result) = oneshot::channel();
-        let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
+        let (execute, pool) = (Arc::clone(&shared.execute), Arc::clone(pool));
         let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
         let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
             priority::lower();
@@ -186,7 +174,7 @@ impl<'a> JobRun<'a> {
         if let Err(error) = thread {
             return Err(JobFailure::Failed(format!("could not start a thread: {error}")));
         }
-        let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
+        let mut ticks = tokio::time::interval(WRITE_EVERY.min(shared.limits.lease / 3));
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut is_stopping = false;
         loop {
@@ -195,11 +183,11 @@ impl<'a> JobRun<'a> {
                     let panicked = || JobFailure::Failed("the job panicked; the server's log says why".to_owned());
                     return result.unwrap_or_else(|_| Err(panicked()));
                 }
-                () = stop_requested(&mut stop), if !is_stopping => {
+                () = shared.stop_requested(), if !is_stopping => {
                     is_stopping = true;
                     self.stop_work();
                     // If the process ends before the work has stopped, that is no failure of the job.
-                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                    if let Err(error) = shared.store.excuse_attempt(self.report.lease()).await {
                         warn!(%error, "could not mark an attempt as stopped");
                     }
                 }
@@ -309,13 +297,10 @@ impl<'a> JobRun<'a> {
         });
         let mut outcome = JobOutcome {
             state: state.name(),
-            error: None,
-            outcome: None,
             // Set when it is written, by the database's clock.
             ended_s: state.is_final().then_some(0.0),
-            published: None,
-            measured: None,
             crashed: matches!(result, Err(JobFailure::Crashed(_))),
+            ..JobOutcome::default()
         };
         match result {
             Ok(done) => {
@@ -331,16 +316,14 @@ impl<'a> JobRun<'a> {
 
     /// Writes the outcome. While the database is away, tries until it is back: nothing else can be claimed meanwhile.
     async fn write_outcome(&self, id: JobId, outcome: JobOutcome) {
-        let (report, stop) = (self.take_report(), self.shared.stop.subscribe());
-        let mut attempt = 0;
-        loop {
-            attempt += 1;
+        let report = self.take_report();
+        for attempt in 1.. {
             match self.try_to_end(outcome.clone(), report.clone()).await {
                 Ok(true) => return self.shared.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),
                 Err(error) => warn!(job.id = %id, %error, attempt, "could not write a job's outcome"),
             }
-            if *stop.borrow() && attempt >= END_ATTEMPTS {
+            if self.shared.is_stopping() && attempt >= END_ATTEMPTS {
                 return;
             }
             tokio::time::sleep(POLL_EVERY).await;

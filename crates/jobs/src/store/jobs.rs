@@ -91,7 +91,7 @@ pub enum EnqueueResult {
 }
 
 /// How an attempt of a job ended.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct JobOutcome {
     /// The state that follows.
     pub state: &'static str,

@@ -4,7 +4,7 @@
 use rand::Rng;
 
 use super::TrainError;
-use super::config::{DataConfig, Mirror, MirrorWord};
+use super::config::{DataConfig, Mirror};
 use foreframe_core::frame::warp::sample;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::background::{Background, MAX_CHANGED_SHARE};
@@ -123,8 +123,8 @@ impl Augmentation {
         }
         Ok(Self {
             mirror: match &config.mirror {
-                Mirror::Word(MirrorWord::Off) => Mirroring::Nothing,
-                Mirror::Word(MirrorWord::Movers) => Mirroring::Movers(standing_background(dataset, frames)?),
+                Mirror::Off => Mirroring::Nothing,
+                Mirror::Movers => Mirroring::Movers(standing_background(dataset, frames)?),
                 Mirror::Channels(names) => Mirroring::Frames(signed_channels(names, info)?),
             },
             reverse: config.reverse,

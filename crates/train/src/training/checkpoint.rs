@@ -28,6 +28,12 @@ const HASH_LENGTH: usize = 64;
 /// Key of the training state in the file's metadata: the file's SHA-256, a space, and the state as JSON. The hash is computed
 /// with zeros in its own place. Both are in one entry, because the order of entries is random.
 const META_KEY: &str = "foreframe.training";
+/// Name of the file with the configuration.
+const CONFIG_FILE: &str = "config.toml";
+/// Name of the file with the loss curves.
+pub(super) const HISTORY_FILE: &str = "history.json";
+/// Name of the folder with the published model.
+pub(super) const MODEL_DIR: &str = "model";
 /// Name of the file with the hash of the training data.
 const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
@@ -50,12 +56,13 @@ impl RunFiles {
             config_text: config.to_toml()?,
             content_hash: content_hash.to_owned(),
         };
-        if files.config().is_file() && files.data().is_file() {
+        let (config, data) = (files.path(CONFIG_FILE), files.path(DATA_FILE));
+        if config.is_file() && data.is_file() {
             for (path, expected, what) in [
-                (files.config(), &files.config_text, "configuration"),
-                (files.data(), &files.content_hash, "data set"),
+                (&config, &files.config_text, "configuration"),
+                (&data, &files.content_hash, "data set"),
             ] {
-                let found = fs::read_to_string(&path).map_err(io_failed("read", &path))?;
+                let found = fs::read_to_string(path).map_err(io_failed("read", path))?;
                 if found.lines().any(|line| line == "[fit]") {
                     return Err(TrainError::RenamedSettings(run_dir.to_owned()));
                 }
@@ -66,7 +73,6 @@ impl RunFiles {
             }
             return Ok(files);
         }
-        let (config, data) = (files.config(), files.data());
         let is_left_by_a_killed_start =
             |path: &Path| path == data || is_partial_of(&data, path) || is_partial_of(&config, path);
         let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
@@ -80,7 +86,7 @@ impl RunFiles {
 
     /// Creates the directory of a new run, if needed, and locks it until the returned file is dropped. Errors: `Busy`, `Io`.
     pub(super) fn lock(&self) -> Result<File, TrainError> {
-        let (config, data) = (self.config(), self.data());
+        let (config, data) = (self.path(CONFIG_FILE), self.path(DATA_FILE));
         if !config.is_file() {
             fs::create_dir_all(&self.run_dir).map_err(io_failed("create", &self.run_dir))?;
             write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
@@ -102,30 +108,9 @@ impl RunFiles {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
 
-    fn config(&self) -> PathBuf {
-        self.run_dir.join("config.toml")
-    }
-
-    fn data(&self) -> PathBuf {
-        self.run_dir.join(DATA_FILE)
-    }
-
-    /// The directory of the published model.
-    pub(super) fn model_dir(&self) -> PathBuf {
-        self.run_dir.join("model")
-    }
-
-    /// The file of the loss curves.
-    pub(super) fn history(&self) -> PathBuf {
-        self.run_dir.join("history.json")
-    }
-
-    fn checkpoint(&self) -> PathBuf {
-        self.run_dir.join(CHECKPOINT_FILE)
-    }
-
-    fn previous_checkpoint(&self) -> PathBuf {
-        self.run_dir.join(PREVIOUS_FILE)
+    /// The path of a file or folder of the run.
+    pub(super) fn path(&self, name: &str) -> PathBuf {
+        self.run_dir.join(name)
     }
 }
 
@@ -214,7 +199,7 @@ fn state_text(entry: &str) -> Option<&str> {
 impl RunFiles {
     /// Replaces the run's checkpoint with this state. Errors: `Io`, `Checkpoint`.
     pub(super) fn save(&self, state: &TrainState) -> Result<(), TrainError> {
-        let path = self.checkpoint();
+        let path = self.path(CHECKPOINT_FILE);
         let failed = |error: &dyn Error| unusable(&path, error.to_string());
         let meta = CheckpointMeta {
             fingerprint: self.fingerprint(),
@@ -237,7 +222,7 @@ impl RunFiles {
         let metadata = HashMap::from([state_entry(&text)]);
         let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(&error))?;
         // If the process is killed between the two, the previous one is the latest.
-        none_if_missing(fs::rename(&path, self.previous_checkpoint())).map_err(io_failed("rename", &path))?;
+        none_if_missing(fs::rename(&path, self.path(PREVIOUS_FILE))).map_err(io_failed("rename", &path))?;
         write_atomically(&path, &seal(bytes)).map_err(io_failed("write", &path))
     }
 
@@ -249,7 +234,7 @@ impl RunFiles {
         run: &RunConfig,
         observer: &mut dyn Observer,
     ) -> Result<Option<TrainState>, TrainError> {
-        for (path, is_previous) in [(self.checkpoint(), false), (self.previous_checkpoint(), true)] {
+        for (path, is_previous) in [(self.path(CHECKPOINT_FILE), false), (self.path(PREVIOUS_FILE), true)] {
             let Some(bytes) = none_if_missing(fs::read(&path)).map_err(io_failed("read", &path))? else {
                 continue;
             };

@@ -116,7 +116,7 @@ fn expected(key: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::training::config::{All, CodecTraining, WindowBudget};
+    use crate::training::config::{CodecTraining, WindowBudget};
     use foreframe_core::types::Seed;
 
     #[test]
@@ -150,7 +150,7 @@ mod tests {
         );
         assert_eq!(
             (config.data.windows, config.sequence.codec),
-            (WindowBudget::All(All::All), CodecTraining::Frozen)
+            (WindowBudget::All, CodecTraining::Frozen)
         );
     }
 

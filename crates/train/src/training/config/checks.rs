@@ -1,6 +1,6 @@
 //! The ranges of all settings of a training, and which settings others must allow.
 
-use super::{Mirror, MirrorWord, TrainConfig, WindowBudget};
+use super::{Mirror, TrainConfig, WindowBudget};
 use crate::training::TrainError;
 use crate::training::optimizer::UpdateRule;
 use foreframe_core::nn::{ArchitectureKind, Conditioning};
@@ -84,7 +84,7 @@ impl TrainConfig {
                 ));
             }
         }
-        if self.data.mirror == Mirror::Word(MirrorWord::Movers) && self.model.conditioning != Conditioning::None {
+        if self.data.mirror == Mirror::Movers && self.model.conditioning != Conditioning::None {
             return refused(format!(
                 "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
                  model.conditioning is {}: set it to none, or data.mirror to off",
