@@ -212,7 +212,7 @@ fn has_enough_windows(config: &TrainConfig, dataset: &Dataset) -> bool {
     };
     let needed = match config.data.windows {
         WindowBudget::Count(count) => count,
-        WindowBudget::All(_) => 1,
+        WindowBudget::All => 1,
     };
     count(Split::Train) >= needed && count(Split::Validation) > 0
 }

@@ -48,10 +48,7 @@ async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
     let server = &config.server;
     let store = open_store_waiting(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
-    let pipeline = Pipeline::new(store.clone(), versions, server.job_threads)
-        .with_memory(server.job_memory())
-        .with_import_dir(server.import_dir.clone())
-        .with_import_disk(server.import_disk_mib);
+    let pipeline = Pipeline::new(store.clone(), versions, server.job_resources());
     let executor = child::executor(pipeline, server.job_process());
     let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
     let (stopping, is_stopping) = watch::channel(false);

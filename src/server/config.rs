@@ -12,6 +12,7 @@ use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
 use foreframe_jobs::jobs::JobLimits;
 use foreframe_jobs::jobs::child::JobProcess;
 use foreframe_jobs::jobs::memory::{self, JobMemory};
+use foreframe_jobs::jobs::pipeline::JobResources;
 use foreframe_jobs::store::StoreConfig;
 
 /// A setting out of range.
@@ -250,19 +251,21 @@ impl ServerConfig {
             program: self.job_program.clone()?,
             store: self.store(),
             models_dir: self.models_dir.clone(),
-            import_dir: self.import_dir.clone(),
-            import_disk_mib: self.import_disk_mib,
-            threads: self.job_threads,
-            memory: self.job_memory(),
+            resources: self.job_resources(),
         })
     }
 
-    /// The memory of one job.
+    /// What one job can use.
     #[must_use]
-    pub fn job_memory(&self) -> JobMemory {
-        JobMemory {
-            limit_mib: self.job_memory_mib,
-            dataset_mib: self.dataset_memory_mib,
+    pub fn job_resources(&self) -> JobResources {
+        JobResources {
+            threads: self.job_threads,
+            memory: JobMemory {
+                limit_mib: self.job_memory_mib,
+                dataset_mib: self.dataset_memory_mib,
+            },
+            import_dir: self.import_dir.clone(),
+            import_disk_mib: self.import_disk_mib,
         }
     }
 

@@ -125,10 +125,7 @@ impl App {
     ) -> Result<Self, ServerError> {
         config.validate()?;
         let predictor = Predictor::start(models, config.predictor())?;
-        let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_threads)
-            .with_memory(config.job_memory())
-            .with_import_dir(config.import_dir.clone())
-            .with_import_disk(config.import_disk_mib);
+        let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_resources());
         let executor = child::executor(pipeline, config.job_process());
         let jobs = Jobs::start(store.clone(), config.jobs(), executor, config.run_jobs)?;
         let app = Self::with_parts(

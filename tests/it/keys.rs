@@ -4,7 +4,7 @@ use axum::body::Body;
 use axum::http::{Request, header};
 use foreframe::server::keys::{Keys, NewKey};
 use foreframe::server::{App, ServerConfig};
-use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreConfig, unix_s};
+use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreConfig, StoreError, unix_s};
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
@@ -24,9 +24,30 @@ async fn app_with_keys(is_required: bool) -> (tempfile::TempDir, Store, Keys, Ap
     (dir, store, keys, app)
 }
 
+/// Adds a key that allows everything. Errors: also if the id exists.
+pub(crate) async fn create_key(
+    store: &Store,
+    id: &str,
+    name: &str,
+    hash: &str,
+    created_s: f64,
+) -> Result<(), StoreError> {
+    let key = KeyRow {
+        id: id.to_owned(),
+        name: name.to_owned(),
+        hash: hash.to_owned(),
+        created_s,
+        revoked_s: None,
+        scope: KeyScope::Admin,
+        expires_s: None,
+        requests_per_s: None,
+    };
+    store.add_key(key, &Author::CommandLine).await
+}
+
 pub(crate) async fn new_key(store: &Store, keys: &Keys) -> NewKey {
     let key = NewKey::generate().unwrap();
-    store.create_key(&key.id, "robot", &key.hash, 1.0).await.unwrap();
+    create_key(store, &key.id, "robot", &key.hash, 1.0).await.unwrap();
     keys.refresh().await.unwrap();
     key
 }

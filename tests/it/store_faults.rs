@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use crate::keys::create_key;
 use foreframe_jobs::store::{EnqueueResult, JobPage, NewJob, Store, StoreConfig, StoreError};
 
 async fn open(dir: &Path) -> Result<Store, StoreError> {
@@ -89,7 +90,7 @@ async fn the_database_file_alone_is_complete_after_a_close() {
     let (dir, copy) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let store = open(dir.path()).await.unwrap();
     let other = open(dir.path()).await.unwrap();
-    store.create_key("a", "robot", "hash", 1.0).await.unwrap();
+    create_key(&store, "a", "robot", "hash", 1.0).await.unwrap();
     assert_eq!(other.list_keys().await.unwrap().len(), 1);
     store.close().await.unwrap();
     std::fs::copy(dir.path().join("foreframe.db"), copy.path().join("foreframe.db")).unwrap();
@@ -198,7 +199,7 @@ async fn a_lost_database_does_not_forget_that_keys_exist() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path()).await.unwrap();
     assert!(!store.keys_were_created());
-    store.create_key("a", "robot", "hash", 1.0).await.unwrap();
+    create_key(&store, "a", "robot", "hash", 1.0).await.unwrap();
     store.close().await.unwrap();
     for file in ["foreframe.db", "foreframe.db-wal", "foreframe.db-shm"] {
         let _ = std::fs::remove_file(dir.path().join(file));

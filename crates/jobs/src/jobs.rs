@@ -40,11 +40,8 @@ pub use state::{JobState, JobTransition};
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
     /// No job has that id.
-    #[error("there is no job \"{id}\"; only the latest ended jobs are kept")]
-    Unknown {
-        /// The requested id.
-        id: String,
-    },
+    #[error("there is no job \"{0}\"; only the latest ended jobs are kept")]
+    Unknown(String),
     /// The job's state does not allow the transition.
     #[error("job {id} is {state}; only a {} job can {event}", event.allowed_states())]
     IllegalTransition {
@@ -55,20 +52,12 @@ pub enum JobError {
         /// The requested transition.
         event: JobTransition,
     },
-    /// The queue is full.
-    #[error("the job queue is full ({limit} jobs are waiting); cancel one or try again later")]
-    QueueFull {
-        /// How many jobs can wait.
-        limit: usize,
-    },
-    /// The submitter's share of the queue is full.
-    #[error(
-        "{limit} jobs of this API key are waiting, which is its share of the job queue; cancel one or try again later"
-    )]
-    ShareFull {
-        /// How many jobs of one key can wait.
-        limit: i64,
-    },
+    /// The queue is full: so many jobs are waiting.
+    #[error("the job queue is full ({0} jobs are waiting); cancel one or try again later")]
+    QueueFull(usize),
+    /// The submitter's share of the queue is full: so many of its jobs are waiting.
+    #[error("{0} jobs of this API key are waiting, which is its share of the job queue; cancel one or try again later")]
+    ShareFull(i64),
     /// A field of the job is not valid.
     #[error("{field}: {reason}")]
     Invalid {
@@ -89,20 +78,13 @@ pub enum JobError {
         /// The existing names.
         available: Vec<String>,
     },
-    /// The job's output exists already, or another job is making it.
-    #[error("name: data set \"{name}\" {why}; choose another name")]
+    /// The job's output exists already, another job is making it, or the output directory holds files that this job cannot
+    /// continue.
+    #[error("name: data set \"{name}\" {why}")]
     Taken {
         /// The requested name.
         name: DatasetName,
-        /// Why it is not free.
-        why: &'static str,
-    },
-    /// The output directory holds files that this job cannot continue.
-    #[error("name: data set \"{name}\" {why}, or choose another name")]
-    Occupied {
-        /// The requested name.
-        name: DatasetName,
-        /// What is in the directory, and how to free it.
+        /// Why it is not free, and how to free it.
         why: String,
     },
     /// A queued or running job needs it.
@@ -132,10 +114,10 @@ pub enum JobError {
     Threads(#[source] rayon::ThreadPoolBuildError),
     /// The data sets could not be read.
     #[error(transparent)]
-    Dataset(Box<DatasetError>),
+    Dataset(#[from] DatasetError),
     /// The models could not be read.
     #[error(transparent)]
-    Versions(Box<VersionError>),
+    Versions(#[from] VersionError),
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -144,12 +126,10 @@ pub enum JobError {
 impl HasErrorKind for JobError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::Unknown { .. } => ErrorKind::NotFound,
+            Self::Unknown(_) => ErrorKind::NotFound,
             Self::Invalid { .. } | Self::NotFound { .. } => ErrorKind::Usage,
-            Self::IllegalTransition { .. } | Self::Taken { .. } | Self::Occupied { .. } | Self::InUse { .. } => {
-                ErrorKind::Conflict
-            }
-            Self::QueueFull { .. } | Self::ShareFull { .. } | Self::Stopping => ErrorKind::Busy,
+            Self::IllegalTransition { .. } | Self::Taken { .. } | Self::InUse { .. } => ErrorKind::Conflict,
+            Self::QueueFull(_) | Self::ShareFull(_) | Self::Stopping => ErrorKind::Busy,
             Self::Dataset(error) => error.kind().of_own_data(),
             Self::Versions(error) => error.kind().of_own_data(),
             Self::Store(error) => error.kind().of_own_data(),
@@ -158,29 +138,28 @@ impl HasErrorKind for JobError {
     }
 }
 
-impl From<DatasetError> for JobError {
-    fn from(error: DatasetError) -> Self {
-        Self::Dataset(Box::new(error))
+impl JobError {
+    fn invalid(field: &'static str, reason: impl Into<String>) -> Self {
+        let reason = reason.into();
+        Self::Invalid { field, reason }
+    }
+
+    fn taken(name: &DatasetName, why: impl Into<String>) -> Self {
+        let (name, why) = (name.clone(), why.into());
+        Self::Taken { name, why }
     }
 }
 
 /// No job has that id: it is not even an id.
 impl From<JobIdError> for JobError {
     fn from(JobIdError(id): JobIdError) -> Self {
-        Self::Unknown { id }
-    }
-}
-
-impl From<VersionError> for JobError {
-    fn from(error: VersionError) -> Self {
-        Self::Versions(Box::new(error))
+        Self::Unknown(id)
     }
 }
 
 fn list(names: &[String]) -> String {
     if names.is_empty() {
-        "none yet".to_owned()
-    } else {
-        names.join(", ")
+        return "none yet".to_owned();
     }
+    names.join(", ")
 }

@@ -13,6 +13,7 @@ pub mod models;
 pub mod objects;
 pub mod reports;
 mod restore;
+mod sqlite;
 mod wal;
 
 use std::error::Error as _;
@@ -35,7 +36,7 @@ pub use self::objects::Objects;
 pub use self::reports::{JobReport, LogRow, LossRow};
 pub use self::restore::restore;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files;
+use foreframe_core::files::{is_transient, write_atomically};
 
 /// The embedded database's file in the data directory.
 const DATABASE_FILE: &str = "foreframe.db";
@@ -49,6 +50,10 @@ const WRITE_PROBE: &str = "write-check";
 const PROBE_BYTES: usize = 16 << 10;
 /// The pause between two attempts to open the database.
 const OPEN_AGAIN_AFTER: Duration = Duration::from_secs(1);
+/// The maximum number of connections to the database.
+const MAX_CONNECTIONS: u32 = 8;
+/// How long a statement waits for a connection or, on SQLite, for another writer.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// The file in the data directory that says that API keys were created.
 const KEYS_MARKER: &str = "api-keys-created";
 
@@ -96,14 +101,8 @@ pub enum StoreError {
         source: Box<StoreError>,
     },
     /// `foreframe restore` did not finish.
-    #[error(
-        "the restore into {} did not finish; run foreframe restore again",
-        data_dir.display()
-    )]
-    Restoring {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
+    #[error("the restore into {} did not finish; run foreframe restore again", .0.display())]
+    Restoring(PathBuf),
     /// The tables could not be migrated to this version of the program.
     #[error("could not migrate the database's tables to this version: {0}")]
     Migrate(#[source] sqlx::migrate::MigrateError),
@@ -139,13 +138,8 @@ impl HasErrorKind for StoreError {
         }
         match self {
             Self::Url { .. } | Self::NoTls => ErrorKind::Usage,
-            Self::Damaged { .. } | Self::Restoring { .. } => ErrorKind::Unusable,
-            Self::Open { .. }
-            | Self::Away { .. }
-            | Self::Migrate(_)
-            | Self::Query(_)
-            | Self::Io { .. }
-            | Self::Object { .. } => ErrorKind::Internal,
+            Self::Damaged { .. } | Self::Restoring(_) => ErrorKind::Unusable,
+            _ => ErrorKind::Internal,
         }
     }
 }
@@ -156,18 +150,30 @@ impl StoreError {
     pub fn is_unavailable(&self) -> bool {
         match self {
             Self::Query(error) | Self::Open { source: error, .. } => database::is_unavailable(error),
-            Self::Io { source, .. } => files::is_transient(source),
+            Self::Io { source, .. } => is_transient(source),
             Self::Object { source, .. } => matches!(source, object_store::Error::Generic { .. }),
             Self::Away { .. } => true,
             Self::Migrate(error) => {
                 let cause = error.source().and_then(|cause| cause.downcast_ref::<sqlx::Error>());
                 cause.is_some_and(database::is_unavailable)
             }
-            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring { .. } => false,
+            Self::Url { .. } | Self::NoTls | Self::Damaged { .. } | Self::Restoring(_) => false,
         }
     }
 
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
+    fn url(flag: &'static str, url: &str, expected: &'static str) -> Self {
+        let scheme = url.split(':').next().unwrap_or_default().chars().take(16).collect();
+        Self::Url { flag, scheme, expected }
+    }
+
+    fn open(database: &'static str, source: sqlx::Error) -> Self {
+        match source {
+            sqlx::Error::Tls(_) if !cfg!(feature = "cloud") => Self::NoTls,
+            source => Self::Open { database, source },
+        }
+    }
+
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }
@@ -188,6 +194,14 @@ impl StoreConfig {
     /// Whether the database is another process, which can be away for a while.
     fn is_remote(&self) -> bool {
         self.database.as_ref().is_some_and(|url| url.starts_with("postgres"))
+    }
+
+    /// The file of SQLite's database; `None` with another database. Errors: `Open`.
+    fn database_file(&self) -> Result<Option<PathBuf>, StoreError> {
+        match &self.database {
+            None => Ok(Some(self.data_dir.join(DATABASE_FILE))),
+            Some(url) => sqlite::file_of(url),
+        }
     }
 
     /// Whether there is a store to open: one in the data directory, or one that is named.
@@ -227,13 +241,12 @@ impl Store {
                 Err(error @ StoreError::Open { .. }) if config.is_remote() && error.is_unavailable() => error,
                 opened => return opened,
             };
+            let waited_s = started.elapsed().as_secs();
             if started.elapsed() >= limit {
-                return Err(StoreError::Away {
-                    waited_s: started.elapsed().as_secs(),
-                    source: Box::new(error),
-                });
+                let source = Box::new(error);
+                return Err(StoreError::Away { waited_s, source });
             }
-            warn!(%error, waited_s = started.elapsed().as_secs(), limit_s = limit.as_secs(), "waiting for the database");
+            warn!(%error, waited_s, limit_s = limit.as_secs(), "waiting for the database");
             tokio::time::sleep(OPEN_AGAIN_AFTER.min(limit)).await;
         }
     }
@@ -242,13 +255,9 @@ impl Store {
         let data_dir = &config.data_dir;
         std::fs::create_dir_all(data_dir).map_err(StoreError::io("make", data_dir))?;
         if data_dir.join(backup::RESTORING).exists() {
-            let data_dir = data_dir.clone();
-            return Err(StoreError::Restoring { data_dir });
+            return Err(StoreError::Restoring(data_dir.clone()));
         }
-        let database = match &config.database {
-            Some(url) => Database::open(url, is_first).await?,
-            None => Database::open_file(&data_dir.join(DATABASE_FILE), is_first).await?,
-        };
+        let database = Database::open(config, is_first).await?;
         Ok(Self {
             database,
             objects: Objects::open(data_dir, config.objects.as_deref())?,
@@ -269,16 +278,9 @@ impl Store {
     }
 
     async fn write_nothing(&self) -> Result<(), StoreError> {
-        let probe = self.objects.data_dir().join(WRITE_PROBE);
-        let written = probe.clone();
-        let write = move || foreframe_core::files::write_atomically(&written, &[0; PROBE_BYTES]);
-        let written = tokio::task::spawn_blocking(write).await;
-        written
-            .unwrap_or_else(|panic| Err(std::io::Error::other(panic)))
-            .map_err(StoreError::io("write", &probe))?;
+        objects::write(&self.objects.data_dir().join(WRITE_PROBE), vec![0; PROBE_BYTES]).await?;
         let mut tx = self.database.begin().await?;
-        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
-            .await?;
+        tx.lock_numbers().await?;
         tx.commit().await
     }
 
@@ -305,7 +307,7 @@ impl Store {
             return Ok(());
         }
         let text = "API keys were created, so requests need one. To switch authentication off, delete this file and all keys.\n";
-        foreframe_core::files::write_atomically(&marker, text.as_bytes()).map_err(StoreError::io("write", &marker))
+        write_atomically(&marker, text.as_bytes()).map_err(StoreError::io("write", &marker))
     }
 
     /// The files.
@@ -322,7 +324,7 @@ impl Store {
 
     /// Checks that the database answers. Errors: `Query`.
     pub async fn ping(&self) -> Result<(), StoreError> {
-        self.database.fetch("SELECT 1", vec![]).await.map(drop)
+        self.now_s().await.map(drop)
     }
 }
 

@@ -67,17 +67,7 @@ pub enum VersionError {
     /// Its files could not be written.
     #[error(transparent)]
     Registry(#[from] RegistryError),
-    /// A file could not be read or written.
-    #[error("could not {action} {}: {source}", path.display())]
-    Io {
-        /// `read`, `write`, …
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
-    /// The store failed.
+    /// The store failed, or a file could not be read or written.
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The predictor has stopped.
@@ -97,8 +87,23 @@ impl HasErrorKind for VersionError {
             Self::Registry(error) => error.kind(),
             Self::Store(error) => error.kind(),
             Self::Serving(error) => error.kind(),
-            Self::Io { .. } => ErrorKind::Internal,
         }
+    }
+}
+
+impl VersionError {
+    fn unknown(model: &ModelName, version: u32, available: Vec<u32>) -> Self {
+        let model = model.to_string();
+        Self::Unknown {
+            model,
+            version,
+            available,
+        }
+    }
+
+    fn refused(model: &ModelName, version: u32, reason: String) -> Self {
+        let model = model.clone();
+        Self::Refused { model, version, reason }
     }
 }
 
@@ -221,29 +226,19 @@ impl Versions {
     /// Errors: `Unknown`, `Refused`, `Store`.
     pub async fn load(&self, model: &ModelName, version: u32) -> Result<Model, VersionError> {
         let dir = self.directory(model, version).await?;
-        let refused = |reason: String| VersionError::Refused {
-            model: model.clone(),
-            version,
-            reason,
-        };
-        let name = model.clone();
-        let is_shipped = self.shipped(model) == Some(version);
+        let refused = |reason| VersionError::refused(model, version, reason);
         // The name of a shipped model is that of its directory.
-        let load = move || {
-            if is_shipped {
-                registry::load_as(&dir, &name)
-            } else {
-                registry::load(&dir)
-            }
+        let name = (self.shipped(model) == Some(version)).then(|| model.clone());
+        let load = move || match name {
+            Some(name) => registry::load_as(&dir, &name),
+            None => registry::load(&dir),
         };
         let loaded = tokio::task::spawn_blocking(load).await;
         let loaded = loaded
             .map_err(|error| refused(error.to_string()))?
             .map_err(|error| refused(error_text::with_causes(&error)))?;
-        let Manifest {
-            name, version: found, ..
-        } = &*loaded.manifest;
-        if (name, *found) != (model, version) {
+        let (name, found) = (&loaded.manifest.name, loaded.manifest.version);
+        if (name, found) != (model, version) {
             return Err(refused(format!("its manifest is of version {found} of \"{name}\"")));
         }
         Ok(loaded)
@@ -253,11 +248,7 @@ impl Versions {
     pub async fn directory(&self, model: &ModelName, version: u32) -> Result<PathBuf, VersionError> {
         let available = self.of(model).await?;
         if !available.contains(&version) {
-            return Err(VersionError::Unknown {
-                model: model.to_string(),
-                version,
-                available,
-            });
+            return Err(VersionError::unknown(model, version, available));
         }
         if self.shipped(model) == Some(version) {
             return Ok(registry::find(&self.shipped_dir, model)?);
@@ -271,7 +262,7 @@ impl Versions {
     }
 
     /// Writes a trained model as its job's version, which becomes active if the model was not shipped and no version is. It is
-    /// published when the job's outcome is written. `None` if the lease is lost. Errors: `Registry`, `Io`, `Store`.
+    /// published when the job's outcome is written. `None` if the lease is lost. Errors: `Registry`, `Store`.
     pub async fn write(
         &self,
         lease: Lease,
@@ -300,21 +291,14 @@ impl Versions {
         }
     }
 
-    /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Io`, `Store`.
+    /// Copies a model's files into the directory of a version and checks them there. Errors: `Registry`, `Store`.
     async fn write_files(&self, model: &ModelName, version: u32, trained_dir: &Path) -> Result<(), VersionError> {
         let objects = self.store.objects();
         let dir = objects.data_dir().join(key(model, version));
-        let failed = |action, path: &Path| {
-            let path = path.to_owned();
-            move |source| VersionError::Io { action, path, source }
-        };
-        std::fs::create_dir_all(&dir).map_err(failed("make", &dir))?;
-        let (from, to) = (
-            trained_dir.join(registry::WEIGHTS_FILE),
-            dir.join(registry::WEIGHTS_FILE),
-        );
-        let weights = std::fs::read(&from).map_err(failed("read", &from))?;
-        write_atomically(&to, &weights).map_err(failed("write", &to))?;
+        std::fs::create_dir_all(&dir).map_err(StoreError::io("make", &dir))?;
+        let [from, to] = [trained_dir, &dir].map(|dir| dir.join(registry::WEIGHTS_FILE));
+        let weights = std::fs::read(&from).map_err(StoreError::io("read", &from))?;
+        write_atomically(&to, &weights).map_err(StoreError::io("write", &to))?;
         let manifest = Manifest {
             name: model.clone(),
             version,
@@ -356,31 +340,33 @@ impl Versions {
         by: &Author,
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
-        let (model_name, available) = (model.clone(), self.of(model).await?);
-        let serves = predictor
-            .model(model.as_str())
-            .is_ok_and(|manifest| manifest.version == version);
+        self.check_removable(model, version, &self.of(model).await?)?;
+        if serves(predictor, model, version) {
+            let model = model.clone();
+            return Err(VersionError::Active { model, version });
+        }
+        self.delete_published(model, version, by).await
+    }
+
+    /// Errors: `Unknown`, `Shipped`.
+    fn check_removable(&self, model: &ModelName, version: u32, available: &[u32]) -> Result<(), VersionError> {
         if !available.contains(&version) {
-            return Err(VersionError::Unknown {
-                model: model.to_string(),
-                version,
-                available,
-            });
+            return Err(VersionError::unknown(model, version, available.to_vec()));
         }
         if self.shipped(model) == Some(version) {
-            return Err(VersionError::Shipped {
-                model: model_name,
-                version,
-            });
+            let model = model.clone();
+            return Err(VersionError::Shipped { model, version });
         }
-        if serves || !self.store.delete_version(model, version, unix_s(), by).await? {
-            return Err(VersionError::Active {
-                model: model_name,
-                version,
-            });
-        }
-        self.store.objects().delete(&key(model, version)).await?;
         Ok(())
+    }
+
+    /// Deletes a version with its files. Errors: `Active`, `Store`.
+    async fn delete_published(&self, model: &ModelName, version: u32, by: &Author) -> Result<(), VersionError> {
+        if !self.store.delete_version(model, version, unix_s(), by).await? {
+            let model = model.clone();
+            return Err(VersionError::Active { model, version });
+        }
+        Ok(self.store.objects().delete(&key(model, version)).await?)
     }
 
     /// Loads versions that other servers activated. A refused version is logged and added to `refused`, so that it is not
@@ -392,10 +378,7 @@ impl Versions {
     ) -> Result<(), VersionError> {
         let _switching = self.switching.lock().await;
         for (model, version) in self.store.active_versions().await? {
-            let serves = predictor
-                .model(model.as_str())
-                .is_ok_and(|manifest| manifest.version == version);
-            if serves || refused.contains(&(model.clone(), version)) {
+            if serves(predictor, &model, version) || refused.contains(&(model.clone(), version)) {
                 continue;
             }
             match count_load(self.load_model(predictor, &model, version).await) {
@@ -418,14 +401,16 @@ impl Versions {
         let result = tokio::task::spawn_blocking(move || predictor.load(loaded)).await;
         match result.unwrap_or(Err(ServingError::Stopped)) {
             Ok(()) => Ok(()),
-            Err(ServingError::Stopped) => Err(VersionError::Serving(ServingError::Stopped)),
-            Err(error) => Err(VersionError::Refused {
-                model: model.clone(),
-                version,
-                reason: error_text::with_causes(&error),
-            }),
+            Err(error @ ServingError::Stopped) => Err(VersionError::Serving(error)),
+            Err(error) => Err(VersionError::refused(model, version, error_text::with_causes(&error))),
         }
     }
+}
+
+/// Whether the predictor serves that version.
+fn serves(predictor: &Predictor, model: &ModelName, version: u32) -> bool {
+    let serving = predictor.model(model.as_str());
+    serving.is_ok_and(|manifest| manifest.version == version)
 }
 
 fn key(model: &ModelName, version: u32) -> String {

@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 use self::augment::Augmentation;
 use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition, seal, state_entry};
-use self::checkpoint::{Checkpoint, RunFiles};
+use self::checkpoint::{HISTORY_FILE, MODEL_DIR, RunFiles, io_failed};
 pub use self::config::TrainConfig;
 use self::config::{CodecStart, WindowBudget};
 pub use self::error::TrainError;
@@ -89,29 +89,24 @@ pub fn run(
     let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
     // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
-    training
-        .start
-        .map(|start| start::parameters(&plan, start))
-        .transpose()?;
+    if let Some(start) = training.start {
+        start::parameters(&plan, start)?;
+    }
     let _lock = files.lock()?;
-    let model_dir = files.model_dir();
+    let model_dir = files.path(MODEL_DIR);
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
         let manifest = Box::new(registry::manifest::read(&model_dir)?);
         return Ok(TrainingOutcome::Finished { model_dir, manifest });
     }
-    let mut state = match Checkpoint::load_latest(&files, &plan.spec, &config.run, observer)? {
-        Some(checkpoint) => checkpoint.into_state(),
+    let interrupted = |stage, step| Ok(TrainingOutcome::Interrupted { stage, step });
+    let mut state = match files.load_latest(&plan.spec, &config.run, observer)? {
+        Some(state) => state,
         None => match initial_parameters(&plan, training, cancelled)? {
             Some(parameters) => TrainState::new(parameters, &config.run)?,
-            None => {
-                return Ok(TrainingOutcome::Interrupted {
-                    stage: TrainingStage::Pretrain,
-                    step: 0,
-                });
-            }
+            None => return interrupted(TrainingStage::Pretrain, 0),
         },
     };
-    for point in &state.history {
+    for point in &state.progress.history {
         observer.on_event(TrainingEvent::Restored {
             stage: point.stage,
             step: point.step,
@@ -120,36 +115,34 @@ pub fn run(
         });
     }
     observer.on_event(TrainingEvent::Started {
-        stage: state.stage,
-        step: state.step,
+        stage: state.progress.stage,
+        step: state.progress.step,
         windows: plan.train.len(),
     });
     let runner = StageRunner {
         files: &files,
-        run: &config.run,
+        config,
         cancelled,
     };
-    if state.stage == TrainingStage::Pretrain {
+    if state.progress.stage == TrainingStage::Pretrain {
         let codec = pretrain::CodecObjective::new(&plan, config)?;
         if runner.run(&codec, &mut state, observer)? == StageEnd::Interrupted {
-            return Ok(TrainingOutcome::Interrupted {
-                stage: TrainingStage::Pretrain,
-                step: state.step,
-            });
+            return interrupted(TrainingStage::Pretrain, state.progress.step);
         }
-        state.start_stage(TrainingStage::Sequence, &config.run)?;
+        state.start_sequence(&config.run)?;
         runner.save(&state, observer)?;
     }
     let objective = sequence::SequenceObjective::new(&plan, config);
     if runner.run(&objective, &mut state, observer)? == StageEnd::Interrupted {
-        return Ok(TrainingOutcome::Interrupted {
-            stage: TrainingStage::Sequence,
-            step: state.step,
-        });
+        return interrupted(TrainingStage::Sequence, state.progress.step);
     }
     state.restore_best()?;
     let manifest = plan.manifest(training, &state)?;
-    write_history(&files, &state)?;
+    let history = serde_json::to_vec(&state.progress.history);
+    let history =
+        history.map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
+    let history_file = files.path(HISTORY_FILE);
+    write_atomically(&history_file, &history).map_err(io_failed("write", &history_file))?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
     Ok(TrainingOutcome::Finished { model_dir, manifest })
 }
@@ -184,17 +177,6 @@ fn initial_parameters(
     Ok(Some(parameters))
 }
 
-fn write_history(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
-    let path = files.history();
-    let text = serde_json::to_vec(&state.history)
-        .map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
-    write_atomically(&path, &text).map_err(|source| TrainError::Io {
-        action: "write",
-        path,
-        source,
-    })
-}
-
 /// What is fixed before the first step: the windows and the model specification.
 struct TrainingPlan<'a> {
     source: FrameSource<'a>,
@@ -220,7 +202,7 @@ impl<'a> TrainingPlan<'a> {
             WindowBudget::Count(count) => {
                 splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
             }
-            WindowBudget::All(_) => available,
+            WindowBudget::All => available,
         };
         let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
         let validation = validation.into_iter().step_by(stride).collect();
@@ -263,7 +245,7 @@ impl<'a> TrainingPlan<'a> {
             command: training.command.to_owned(),
             training: settings,
             metrics: serde_json::json!({
-                "validation": { "mse": state.best_loss, "step": state.best_step }
+                "validation": { "mse": state.progress.best_loss, "step": state.progress.best_step }
             }),
             calibration: None,
             parameters: self.spec.parameter_count(),

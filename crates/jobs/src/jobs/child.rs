@@ -13,9 +13,9 @@ use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize};
 
 use super::executor::{JobExecutor, JobFailure, JobResult};
-use super::memory::JobMemory;
-use super::pipeline::Pipeline;
-use super::report::{JobReporter, ReportEvent};
+use super::pipeline::{JobResources, Pipeline};
+use super::progress::ReportEvent;
+use super::report::{JobReporter, ReportTarget};
 use super::retry_policy::RetryPolicy;
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};
@@ -29,7 +29,7 @@ const POLL_EVERY: Duration = Duration::from_millis(20);
 const CANCEL_GRACE: Duration = Duration::from_secs(8);
 
 /// How to start the child processes of jobs.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobProcess {
     /// This program.
     pub program: PathBuf,
@@ -37,25 +37,14 @@ pub struct JobProcess {
     pub store: StoreConfig,
     /// The directory of the shipped models.
     pub models_dir: PathBuf,
-    /// The directory that imports may read.
-    pub import_dir: Option<PathBuf>,
-    /// Disk space for frames that an import decompresses, in MiB.
-    pub import_disk_mib: u64,
-    /// How many threads a job uses.
-    pub threads: usize,
-    /// The memory of a job.
-    pub memory: JobMemory,
+    /// What a job can use.
+    pub resources: JobResources,
 }
 
 /// What the parent writes to the child's standard input, in one line.
 #[derive(Serialize, Deserialize)]
 struct JobOrder {
-    store: StoreConfig,
-    models_dir: PathBuf,
-    import_dir: Option<PathBuf>,
-    import_disk_mib: u64,
-    threads: usize,
-    memory: JobMemory,
+    process: JobProcess,
     lease: Lease,
     spec: JobSpec,
 }
@@ -132,17 +121,20 @@ impl ChildExecutor {
         cancelled: &AtomicBool,
     ) -> Result<Option<Result<JobResult, JobFailure>>, JobFailure> {
         let (Some(mut stdin), Some(stdout)) = (child.stdin.take(), child.stdout.take()) else {
-            return Err(JobFailure::Crashed(
-                "the job's process has no standard streams".to_owned(),
-            ));
+            let reason = "the job's process has no standard streams";
+            return Err(JobFailure::Crashed(reason.to_owned()));
         };
-        let failed = |error: &dyn std::error::Error| crashed("could not send its order to", error);
-        let mut order = serde_json::to_vec(&self.order(spec, report.lease())).map_err(|error| failed(&error))?;
-        order.push(b'\n');
+        let failed = |error: std::io::Error| crashed("could not send its order to", &error);
+        let order = JobOrder {
+            process: self.process.clone(),
+            lease: report.lease(),
+            spec: spec.clone(),
+        };
+        let order = json_line(&order).map_err(failed)?;
         match stdin.write_all(&order) {
             // The exit status of a child that ended before it read its order says why.
             Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => return Ok(None),
-            sent => sent.map_err(|error| failed(&error))?,
+            sent => sent.map_err(failed)?,
         }
         let report = report.clone();
         let reader = std::thread::spawn(move || {
@@ -160,19 +152,6 @@ impl ChildExecutor {
         reader
             .join()
             .map_err(|_| JobFailure::Failed("the reader of the job's report panicked".to_owned()))
-    }
-
-    fn order(&self, spec: &JobSpec, lease: Lease) -> JobOrder {
-        JobOrder {
-            store: self.process.store.clone(),
-            models_dir: self.process.models_dir.clone(),
-            import_dir: self.process.import_dir.clone(),
-            import_disk_mib: self.process.import_disk_mib,
-            threads: self.process.threads,
-            memory: self.process.memory,
-            lease,
-            spec: spec.clone(),
-        }
     }
 }
 
@@ -212,15 +191,12 @@ fn ended_without_result(status: ExitStatus) -> JobFailure {
 /// Errors: a sentence, if there is no order.
 pub fn run() -> Result<(), String> {
     let mut line = String::new();
-    let read = std::io::stdin()
-        .lock()
-        .read_line(&mut line)
-        .map_err(|error| error.to_string())?;
-    if read == 0 {
+    let read = std::io::stdin().lock().read_line(&mut line);
+    if read.map_err(|error| error.to_string())? == 0 {
         return Err("run-job is started by the server, which sends it the job".to_owned());
     }
     let order: JobOrder = serde_json::from_str(&line).map_err(|error| error.to_string())?;
-    limit(order.memory.limit_mib);
+    limit(order.process.resources.memory.limit_mib);
     let cancelled = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&cancelled);
     std::thread::spawn(move || {
@@ -228,7 +204,8 @@ pub fn run() -> Result<(), String> {
         let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         flag.store(true, Ordering::Release);
     });
-    let report = JobReporter::to_writer(order.lease, |event, out| write_line(out, &ChildMessage::Report(event)));
+    let target = ReportTarget::Stdout(|event, out| write_line(out, &ChildMessage::Report(event)));
+    let report = JobReporter::new(order.lease, target);
     let result = work(&order, &report, &cancelled).unwrap_or_else(|reason| Err(JobFailure::Crashed(reason)));
     write_line(&mut std::io::stdout(), &ChildMessage::Result(result)).map_err(|error| error.to_string())
 }
@@ -238,13 +215,19 @@ fn work(
     report: &JobReporter,
     cancelled: &AtomicBool,
 ) -> Result<Result<JobResult, JobFailure>, String> {
+    let JobProcess {
+        store,
+        models_dir,
+        resources,
+        ..
+    } = &order.process;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
         .build()
         .map_err(|error| error.to_string())?;
     let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(order.threads)
+        .num_threads(resources.threads)
         .thread_name(|index| format!("jobs-{index}"))
         .build()
         .map_err(|error| error.to_string())?;
@@ -253,26 +236,26 @@ fn work(
         report,
         cancelled,
     };
-    let store = match retry.run(async || Store::open_existing(&order.store).await) {
+    let store = match retry.run(async || Store::open_existing(store).await) {
         Ok(store) => store,
         Err(JobFailure::Failed(reason)) => return Err(reason),
         Err(failure) => return Ok(Err(failure)),
     };
-    let pipeline = runtime.block_on(async {
-        let versions = Versions::new(store.clone(), &order.models_dir);
-        Pipeline::new(store, versions, order.threads)
-            .with_memory(order.memory)
-            .with_import_dir(order.import_dir.clone())
-            .with_import_disk(order.import_disk_mib)
-    });
+    let _entered = runtime.enter();
+    let versions = Versions::new(store.clone(), models_dir);
+    let pipeline = Pipeline::new(store, versions, resources.clone());
     Ok(pool.install(|| pipeline.execute(&order.spec, report, cancelled)))
 }
 
 fn write_line(out: &mut dyn std::io::Write, message: &ChildMessage) -> std::io::Result<()> {
-    let mut line = serde_json::to_vec(message).map_err(std::io::Error::other)?;
-    line.push(b'\n');
-    out.write_all(&line)?;
+    out.write_all(&json_line(message)?)?;
     out.flush()
+}
+
+fn json_line(value: &impl Serialize) -> std::io::Result<Vec<u8>> {
+    let mut line = serde_json::to_vec(value)?;
+    line.push(b'\n');
+    Ok(line)
 }
 
 /// Limits this process's memory, and ends it with its parent. Only on Linux.
@@ -284,11 +267,8 @@ fn limit(memory_mib: u64) {
             tracing::warn!(%error, "a job's process can outlive the server");
         }
         let bytes = (memory_mib > 0).then_some(memory_mib << 20);
-        let data = Rlimit {
-            current: bytes,
-            maximum: bytes,
-        };
-        if let (Some(_), Err(error)) = (bytes, setrlimit(Resource::Data, data)) {
+        let (current, maximum) = (bytes, bytes);
+        if let (Some(_), Err(error)) = (bytes, setrlimit(Resource::Data, Rlimit { current, maximum })) {
             tracing::warn!(%error, "could not limit the memory of a job");
         }
     }

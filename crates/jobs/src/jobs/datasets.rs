@@ -8,8 +8,7 @@ use tracing::warn;
 use super::JobError;
 use crate::store::{Author, Objects, Store};
 use foreframe_core::types::DatasetName;
-use foreframe_data::dataset::import::{ImportConfig, ImportError, check_out};
-use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError, DatasetInfo};
+use foreframe_data::dataset::{self, DatasetInfo};
 
 /// The file that is written last: it marks a complete data set.
 pub(super) const LAST_FILE: &str = "info.json";
@@ -64,29 +63,13 @@ async fn is_current(objects: &Objects, name: &DatasetName) -> Result<bool, JobEr
     Ok(objects.is_same(&format!("{}/{}", key(name), dataset::METADATA)).await?)
 }
 
-/// Prepares the local directory of a data set that is to be collected. With a shared object store, a local data set that
-/// was deleted there, or was started with other arguments, is deleted. Errors: `Store`, `Dataset`.
-pub(super) async fn clear_stale(objects: &Objects, name: &DatasetName, config: &CollectConfig) -> Result<(), JobError> {
-    if !objects.are_shared() {
-        return Ok(());
-    }
-    if is_finished(objects, name).await? {
-        return fetch(objects, name).await.map(drop);
-    }
-    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
-    match CollectionStatus::of(config) {
-        Err(DatasetError::OutExists { .. }) if is_of_a_deleted_set => Ok(objects.delete(&key(name)).await?),
-        Err(DatasetError::OtherArguments { .. }) => Ok(objects.delete(&key(name)).await?),
-        // The collection reports everything else.
-        _ => Ok(()),
-    }
-}
-
-/// The same for a data set that is to be imported. Errors: `Store`, `Dataset`.
-pub(super) async fn clear_stale_import(
+/// Prepares the local directory of a data set that is to be made. With a shared object store, a local data set that `is_stale` is
+/// deleted; it is told whether the data set was deleted in the store. The work itself reports everything else. Errors: `Store`,
+/// `Dataset`.
+pub(super) async fn clear_stale(
     objects: &Objects,
     name: &DatasetName,
-    config: &ImportConfig,
+    is_stale: impl FnOnce(bool) -> bool,
 ) -> Result<(), JobError> {
     if !objects.are_shared() {
         return Ok(());
@@ -94,15 +77,11 @@ pub(super) async fn clear_stale_import(
     if is_finished(objects, name).await? {
         return fetch(objects, name).await.map(drop);
     }
-    let is_of_a_deleted_set = config.out.join(dataset::METADATA).is_file();
-    let is_of_another_import = config.out.join(dataset::IMPORT_ARGUMENTS).is_file();
-    match check_out(config) {
-        Err(ImportError::OutExists { .. }) if is_of_a_deleted_set || is_of_another_import => {
-            Ok(objects.delete(&key(name)).await?)
-        }
-        // The import reports everything else.
-        _ => Ok(()),
+    let was_deleted = objects.data_dir().join(key(name)).join(dataset::METADATA).is_file();
+    if is_stale(was_deleted) {
+        objects.delete(&key(name)).await?;
     }
+    Ok(())
 }
 
 /// Describes a finished data set without fetching it. Errors: `NotFound` with the existing names, `Store`, `Dataset`.
@@ -159,11 +138,9 @@ pub async fn delete(store: &Store, name: &DatasetName, by: &Author) -> Result<()
 
 /// Whether any part of the data set exists, locally or in the object store.
 async fn exists(objects: &Objects, name: &DatasetName) -> Result<bool, JobError> {
-    let is_local = objects.data_dir().join(key(name)).is_dir();
-    Ok(is_local
-        || objects
-            .directories("datasets")
-            .await?
-            .iter()
-            .any(|known| name == known.as_str()))
+    if objects.data_dir().join(key(name)).is_dir() {
+        return Ok(true);
+    }
+    let shared = objects.directories("datasets").await?;
+    Ok(shared.iter().any(|known| name == known.as_str()))
 }

@@ -32,9 +32,19 @@ pub struct JobResult {
     pub measured: Option<ModelMetrics>,
 }
 
+impl JobResult {
+    /// A result without a version or metrics.
+    pub(super) fn of(result: serde_json::Value) -> Self {
+        Self {
+            result,
+            ..Self::default()
+        }
+    }
+}
+
 /// Does the work of jobs.
 pub trait JobExecutor: Send + Sync + 'static {
-    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, `Occupied`, and the errors of reading
+    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, and the errors of reading
     /// data sets and models.
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 

@@ -87,25 +87,16 @@ impl JobFilter {
     pub(super) fn page(self) -> Result<JobPage, JobError> {
         let kinds = JobSpec::KINDS;
         if let Some(kind) = self.kind.as_deref().filter(|kind| !kinds.contains(kind)) {
-            return Err(JobError::Invalid {
-                field: "kind",
-                reason: format!(
-                    "there is no kind \"{}\"; there are: {}",
-                    kind.escape_default(),
-                    kinds.join(", ")
-                ),
-            });
+            let (kind, kinds) = (kind.escape_default(), kinds.join(", "));
+            let reason = format!("there is no kind \"{kind}\"; there are: {kinds}");
+            return Err(JobError::invalid("kind", reason));
         }
-        let before = self.before.map(|id| {
-            id.parse().map_err(|error: JobIdError| JobError::Invalid {
-                field: "before",
-                reason: error.to_string(),
-            })
-        });
+        let before = self.before.map(|id| id.parse()).transpose();
+        let before = before.map_err(|error: JobIdError| JobError::invalid("before", error.to_string()))?;
         Ok(JobPage {
             kind: self.kind,
             state: self.state.map(|state| state.name().to_owned()),
-            before: before.transpose()?,
+            before,
             limit: self.limit as i64,
         })
     }

@@ -51,13 +51,11 @@ impl JobMemory {
         if allowed == 0 || needed <= allowed {
             return Ok(());
         }
-        Err(JobError::Invalid {
-            field: "settings",
-            reason: format!(
-                "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mib); \
-                 use a smaller model or batch"
-            ),
-        })
+        let reason = format!(
+            "the training needs at least {needed} MiB of memory, and a job can use {allowed} MiB (setting job_memory_mib); \
+             use a smaller model or batch"
+        );
+        Err(JobError::invalid("settings", reason))
     }
 }
 

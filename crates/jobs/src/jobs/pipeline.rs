@@ -9,7 +9,8 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use futures_util::future::BoxFuture;
-use serde_json::json;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use self::training_report::TrainingReporter;
@@ -17,7 +18,7 @@ use super::checkpoints::{self, CheckpointSync};
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::report::JobReporter;
-use super::retry_policy::{RetryPolicy, retry_while_busy};
+use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
 use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
 use crate::store::{JobId, ModelMetrics, Store, StoreError};
@@ -26,65 +27,50 @@ use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
 use foreframe_core::registry::Model;
 use foreframe_core::types::{DatasetName, ModelName, Seed};
-use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
-use foreframe_data::dataset::{self, Dataset, DatasetError};
+use foreframe_data::dataset::{self, CollectionStatus, Dataset, DatasetError, DatasetInfo};
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError};
-use foreframe_train::training::{self, CHECKPOINT_FILE, TrainError, Training, TrainingEvent};
+use foreframe_train::training::{self, CHECKPOINT_FILE, Training, TrainingEvent};
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
+
+/// What a job can use.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobResources {
+    /// How many threads it uses.
+    pub threads: usize,
+    /// Its memory: trainings that need more are refused, and no more of a data set's frames are held.
+    pub memory: JobMemory,
+    /// The directory that imports may read.
+    pub import_dir: Option<PathBuf>,
+    /// Disk space for frames that an import decompresses, in MiB.
+    pub import_disk_mib: u64,
+}
 
 /// Runs jobs in this process.
 pub struct Pipeline {
     store: Store,
     versions: Versions,
-    threads: usize,
-    memory: JobMemory,
-    import_dir: Option<PathBuf>,
-    import_disk_mib: u64,
+    resources: JobResources,
     runtime: Handle,
 }
 
 impl Pipeline {
-    /// A pipeline that collects on `threads` threads. Needs a tokio runtime.
+    /// A pipeline for the jobs of a store. Needs a tokio runtime.
     #[must_use]
-    pub fn new(store: Store, versions: Versions, threads: usize) -> Self {
+    pub fn new(store: Store, versions: Versions, resources: JobResources) -> Self {
         Self {
             store,
             versions,
-            threads,
-            memory: JobMemory::default(),
-            import_dir: None,
-            import_disk_mib: DEFAULT_DISK_MIB,
+            resources,
             runtime: Handle::current(),
-        }
-    }
-
-    /// Refuses trainings that need more memory, and holds no more of a data set's frames.
-    #[must_use]
-    pub fn with_memory(self, memory: JobMemory) -> Self {
-        Self { memory, ..self }
-    }
-
-    /// Lets imports read recordings below this directory.
-    #[must_use]
-    pub fn with_import_dir(self, import_dir: Option<PathBuf>) -> Self {
-        Self { import_dir, ..self }
-    }
-
-    /// Refuses imports that decompress more frames than this, in MiB.
-    #[must_use]
-    pub fn with_import_disk(self, import_disk_mib: u64) -> Self {
-        Self {
-            import_disk_mib,
-            ..self
         }
     }
 }
 
 impl JobExecutor for Pipeline {
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
-        Box::pin(self.check_spec(spec.clone()))
+        Box::pin(self.check_spec(spec))
     }
 
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
@@ -102,17 +88,14 @@ impl JobExecutor for Pipeline {
 }
 
 impl Pipeline {
-    async fn check_spec(&self, spec: JobSpec) -> Result<(), JobError> {
+    async fn check_spec(&self, spec: &JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
-        let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.import_dir.clone());
-        let training = match &spec {
-            JobSpec::Train(spec) => Some(spec.clone()),
-            _ => None,
-        };
+        let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.resources.import_dir.clone());
+        let checked = spec.clone();
         // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
         let checked = tokio::task::spawn_blocking(move || {
-            spec.check(AvailableInputs {
+            checked.check(AvailableInputs {
                 data_dir: &data_dir,
                 import_dir: import_dir.as_deref(),
                 datasets: &datasets,
@@ -120,17 +103,9 @@ impl Pipeline {
             })
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
-        match training {
-            Some(spec) => self.check_memory(&spec).await,
-            None => Ok(()),
-        }
-    }
-
-    /// Refuses a training that certainly needs more memory than a job can use. Errors: `Invalid`, `Dataset`, `Store`.
-    async fn check_memory(&self, spec: &TrainSpec) -> Result<(), JobError> {
-        let config = spec.config()?;
-        let dataset = datasets::describe(self.store.objects(), &spec.dataset).await?;
-        self.memory.check(&config, &dataset)
+        let JobSpec::Train(spec) = spec else { return Ok(()) };
+        let (config, dataset) = (spec.config()?, datasets::describe(objects, &spec.dataset).await?);
+        self.resources.memory.check(&config, &dataset)
     }
 
     fn collect(
@@ -141,28 +116,22 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         let parent = self.store.objects().data_dir().join("datasets");
         let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
-        config.threads = self.threads;
+        config.threads = self.resources.threads;
         let retry = self.retry_policy(report, cancelled);
-        retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, &config).await)?;
-        let on_progress =
-            |progress: dataset::CollectProgress| report.progress(progress.done, progress.total, "simulating");
+        let is_stale = |was_deleted| match CollectionStatus::of(&config) {
+            Err(DatasetError::OutExists { .. }) => was_deleted,
+            Err(DatasetError::OtherArguments { .. }) => true,
+            _ => false,
+        };
+        retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, is_stale).await)?;
         // Whole shards are saved; a new attempt continues after them.
-        if let Ok(dataset::CollectionStatus::Unfinished { trials }) = dataset::CollectionStatus::of(&config) {
+        if let Ok(CollectionStatus::Unfinished { trials }) = CollectionStatus::of(&config) {
             report.checkpoint(trials);
         }
-        let collect = || dataset::collect(&config, &on_progress, cancelled);
-        let is_busy = |error: &DatasetError| matches!(error, DatasetError::Busy { .. });
+        let on_progress = |now: dataset::CollectProgress| report.progress(now.done, now.total, "simulating");
         // After an error it continues with the shards that are finished.
-        let info = retry.repeat(|| retry_while_busy(collect, is_busy, cancelled))?;
-        self.push_dataset(&spec.name, &retry)?;
-        Ok(JobResult {
-            result: json!({
-                "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
-                "content_hash": info.content_hash,
-            }),
-            published: None,
-            measured: None,
-        })
+        let info = retry.repeat_once_free(|| dataset::collect(&config, &on_progress, cancelled))?;
+        self.finish_dataset(&spec.name, &info, &retry).map(JobResult::of)
     }
 
     fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
@@ -176,7 +145,7 @@ impl Pipeline {
             config: &config,
             dataset: &dataset,
             run_dir: &self.store.objects().data_dir().join(&run),
-            command: &command(spec),
+            command: &request_line(&JobSpec::Train(spec.clone())),
             start: None,
         };
         let mut reporter = TrainingReporter {
@@ -192,10 +161,8 @@ impl Pipeline {
                 sync.record(pushed).into_iter().for_each(|line| report.line(line));
             }
         };
-        let mut train = || training::run(&training, &mut observer, cancelled);
-        let is_busy = |error: &TrainError| matches!(error, TrainError::Busy(_));
         // After an error it continues from the last checkpoint.
-        match retry.repeat(|| retry_while_busy(&mut train, is_busy, cancelled))? {
+        match retry.repeat_once_free(|| training::run(&training, &mut observer, cancelled))? {
             training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
             training::TrainingOutcome::Finished { model_dir, manifest } => {
                 let steps = (config.pretrain.steps + config.sequence.steps) as u64;
@@ -206,10 +173,10 @@ impl Pipeline {
                 let published = written.ok_or(JobFailure::Cancelled)?;
                 let version = published.version;
                 report.line(format!("published as version {version} of \"{}\"", spec.name));
+                let result = json!({"model": spec.name, "version": version, "metrics": manifest.metrics});
                 Ok(JobResult {
-                    result: json!({"model": spec.name, "version": version, "metrics": manifest.metrics}),
                     published: Some(published),
-                    measured: None,
+                    ..JobResult::of(result)
                 })
             }
         }
@@ -257,10 +224,8 @@ impl Pipeline {
         let out = self.store.objects().data_dir().join(&dir);
         retry.repeat(|| {
             // So may a write that failed.
-            remove_dir(&out).map_err(|source| EvaluationError::Io {
-                path: out.clone(),
-                source,
-            })?;
+            let path = out.clone();
+            remove_dir(&out).map_err(|source| EvaluationError::Io { path, source })?;
             evaluation::prepare(&out)?;
             evaluation::write(&out, &mut found, &figures)
         })?;
@@ -270,17 +235,15 @@ impl Pipeline {
             .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
             .collect();
         files.sort();
+        let (version, scores) = (loaded.manifest.version, found.headline());
         Ok(JobResult {
-            result: json!({
-                "model": spec.model, "version": loaded.manifest.version, "scores": found.headline(), "files": files,
-            }),
-            published: None,
             measured: Some(ModelMetrics {
                 model: spec.model.clone(),
-                version: loaded.manifest.version,
+                version,
                 weights_sha256: loaded.manifest.weights_sha256.clone(),
-                metrics: found.headline().to_string(),
+                metrics: scores.to_string(),
             }),
+            ..JobResult::of(json!({"model": spec.model, "version": version, "scores": scores, "files": files}))
         })
     }
 
@@ -293,13 +256,21 @@ impl Pipeline {
 
     fn dataset(&self, name: &DatasetName, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
         let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
-        Dataset::open_within(&fetched, self.memory.held_mib()).map_err(|error| failed(&error))
+        Dataset::open_within(&fetched, self.resources.memory.held_mib()).map_err(|error| failed(&error))
     }
 
-    /// Copies a finished data set to the object store, if there is a shared one.
-    fn push_dataset(&self, name: &DatasetName, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
+    /// Copies a finished data set to the object store, if there is a shared one, and returns the job's result.
+    fn finish_dataset(
+        &self,
+        name: &DatasetName,
+        info: &DatasetInfo,
+        retry: &RetryPolicy<'_>,
+    ) -> Result<Value, JobFailure> {
         let objects = self.store.objects();
-        retry.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)
+        retry.run(async || objects.push(&datasets::key(name), datasets::LAST_FILE).await)?;
+        Ok(json!({
+            "dataset": name, "episodes": info.episode_count, "frames": info.frame_count, "content_hash": info.content_hash,
+        }))
     }
 
     fn retry_policy<'a>(&'a self, report: &'a JobReporter, cancelled: &'a AtomicBool) -> RetryPolicy<'a> {
@@ -317,51 +288,11 @@ pub fn report_key(id: JobId) -> String {
     format!("reports/{id}")
 }
 
-/// The command that the manifest records.
-fn command(spec: &TrainSpec) -> String {
-    request_line(&JobSpec::Train(spec.clone()))
-}
-
+/// The request that made the job, as the command of manifests and reports.
 fn request_line(spec: &JobSpec) -> String {
     format!("POST /v1/jobs {}", serde_json::to_string(spec).unwrap_or_default())
 }
 
 fn failed(error: &dyn Error) -> JobFailure {
     JobFailure::Failed(error_text::with_causes(error))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Retries work that is busy `busy` times. Returns its result and the number of tries.
-    fn tried(busy: u32, cancelled: bool) -> (Result<(), bool>, u32) {
-        let mut tries = 0;
-        let work = || {
-            tries += 1;
-            if tries > busy { Ok(()) } else { Err(true) }
-        };
-        let done = retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
-        (done, tries)
-    }
-
-    #[test]
-    fn work_starts_once_the_directory_is_free_unless_cancelled() {
-        assert_eq!(tried(2, false), (Ok(()), 3));
-        assert_eq!(tried(2, true), (Err(true), 1));
-    }
-
-    #[test]
-    fn other_errors_are_told_at_once() {
-        let mut tries = 0;
-        let work = || -> Result<(), bool> {
-            tries += 1;
-            Err(false)
-        };
-        assert_eq!(
-            retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(false)),
-            Err(false)
-        );
-        assert_eq!(tries, 1);
-    }
 }

@@ -1,11 +1,12 @@
-//! Buffers the report of a running job between two writes to the store. Pure: the time is an argument, in seconds since
-//! 1970.
+//! Buffers the report of a running job between two writes to the store. The time is an argument, in seconds since 1970.
 
 use std::collections::VecDeque;
 
+use metrics::gauge;
 use serde::{Deserialize, Serialize};
 
 use crate::store::LossRow;
+use foreframe_core::metric_names;
 
 /// How many lines and points are buffered at most; the oldest are dropped first.
 const MAX_WAITING: usize = 1000;
@@ -45,6 +46,24 @@ pub(super) struct StoredProgress {
     pub losses: Losses,
 }
 
+/// A part of a job's report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum ReportEvent {
+    /// Units done, their total, and what the job is doing.
+    Progress(u64, u64, String),
+    /// A stage with units of another duration starts.
+    Stage,
+    /// The latest losses.
+    Losses(Losses),
+    /// A line for the log.
+    Line(String),
+    /// A point of the loss curves.
+    Point(LossRow),
+    /// Units that are saved.
+    Checkpoint(u64),
+}
+
 /// The part of a running job's report that is not yet written to the store.
 #[derive(Debug, Default)]
 pub(super) struct ReportBuffer {
@@ -68,18 +87,47 @@ impl ReportBuffer {
         }
     }
 
-    /// Sets the units done, their total, and what the job is doing.
-    pub(super) fn progress(&mut self, done: u64, total: u64, message: &str, now_s: f64) {
+    /// Adds an event.
+    pub(super) fn apply(&mut self, event: ReportEvent, now_s: f64) {
+        match event {
+            ReportEvent::Progress(done, total, message) => self.set_progress(done, total, message, now_s),
+            ReportEvent::Stage => self.measured_from = None,
+            ReportEvent::Losses(losses) => {
+                for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
+                    if let Some(loss) = loss {
+                        gauge!(metric_names::TRAINING_LOSS, "split" => split).set(loss);
+                    }
+                }
+                // A loss that is `None` keeps its last value.
+                let last = &mut self.stored.losses;
+                last.train = losses.train.or(last.train);
+                last.validation = losses.validation.or(last.validation);
+            }
+            ReportEvent::Line(line) => {
+                self.changes += 1;
+                push(&mut self.lines, (now_s, line));
+            }
+            ReportEvent::Point(point) => {
+                self.changes += 1;
+                push(&mut self.points, point);
+            }
+            ReportEvent::Checkpoint(units) => {
+                self.changes += u64::from(units > self.checkpoint);
+                self.checkpoint = self.checkpoint.max(units);
+            }
+        }
+    }
+
+    fn set_progress(&mut self, done: u64, total: u64, message: String, now_s: f64) {
+        let last = &self.stored.progress;
         // Without a total nothing is measured yet; fewer units than before belong to new work.
-        let restarts = total != self.stored.progress.total || done < self.stored.progress.done;
-        if total == 0 || restarts {
+        if total == 0 || total != last.total || done < last.done {
             self.measured_from = None;
         }
         let (from_s, before) = *self.measured_from.get_or_insert((now_s, done));
         let (gained, elapsed_s) = (done.saturating_sub(before) as f64, now_s - from_s);
         let rate = (gained > 0.0 && elapsed_s >= MIN_MEASURED_S).then(|| gained / elapsed_s);
-        let last = &self.stored.progress;
-        if (last.done, last.total, last.message.as_str()) != (done, total, message) {
+        if (last.done, last.total, &last.message) != (done, total, &message) {
             self.changes += 1;
         }
         self.stored.progress = JobProgress {
@@ -87,28 +135,8 @@ impl ReportBuffer {
             total,
             rate_per_s: rate,
             remaining_s: rate.map(|rate| total.saturating_sub(done) as f64 / rate),
-            message: message.to_owned(),
+            message,
         };
-    }
-
-    /// Restarts the rate measurement, because the units of a new stage take a different time.
-    pub(super) fn stage(&mut self) {
-        self.measured_from = None;
-    }
-
-    /// Sets the latest losses. A loss that is `None` keeps its last value.
-    pub(super) fn losses(&mut self, losses: Losses) {
-        let last = self.stored.losses;
-        self.stored.losses = Losses {
-            train: losses.train.or(last.train),
-            validation: losses.validation.or(last.validation),
-        };
-    }
-
-    /// Sets how many units are saved.
-    pub(super) fn checkpoint(&mut self, units: u64) {
-        self.changes += u64::from(units > self.checkpoint);
-        self.checkpoint = self.checkpoint.max(units);
     }
 
     /// A number that grows whenever the job reports something new.
@@ -119,18 +147,6 @@ impl ReportBuffer {
     /// How many units are saved, as far as this attempt knows.
     pub(super) fn saved(&self) -> u64 {
         self.checkpoint
-    }
-
-    /// Adds a line to the log.
-    pub(super) fn line(&mut self, line: String, now_s: f64) {
-        self.changes += 1;
-        push(&mut self.lines, (now_s, line));
-    }
-
-    /// Adds a point to the loss curves.
-    pub(super) fn point(&mut self, point: LossRow) {
-        self.changes += 1;
-        push(&mut self.points, point);
     }
 
     /// The progress to store.
@@ -145,15 +161,8 @@ impl ReportBuffer {
 
     /// Puts back what could not be written, before what was added since.
     pub(super) fn restore_unwritten(&mut self, lines: Vec<(f64, String)>, points: Vec<LossRow>) {
-        let later = (std::mem::take(&mut self.lines), std::mem::take(&mut self.points));
-        lines
-            .into_iter()
-            .chain(later.0)
-            .for_each(|line| push(&mut self.lines, line));
-        points
-            .into_iter()
-            .chain(later.1)
-            .for_each(|point| push(&mut self.points, point));
+        prepend(&mut self.lines, lines);
+        prepend(&mut self.points, points);
     }
 }
 
@@ -164,9 +173,28 @@ fn push<T>(waiting: &mut VecDeque<T>, item: T) {
     waiting.push_back(item);
 }
 
+fn prepend<T>(waiting: &mut VecDeque<T>, items: Vec<T>) {
+    let later = std::mem::replace(waiting, items.into());
+    later.into_iter().for_each(|item| push(waiting, item));
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl ReportBuffer {
+        fn progress(&mut self, done: u64, total: u64, message: &str, now_s: f64) {
+            self.apply(ReportEvent::Progress(done, total, message.to_owned()), now_s);
+        }
+
+        fn line(&mut self, line: &str, now_s: f64) {
+            self.apply(ReportEvent::Line(line.to_owned()), now_s);
+        }
+
+        fn checkpoint(&mut self, units: u64) {
+            self.apply(ReportEvent::Checkpoint(units), 0.0);
+        }
+    }
 
     #[test]
     fn rate_and_time_left_count_only_this_attempt() {
@@ -199,16 +227,16 @@ mod tests {
         buffer.checkpoint(1);
         assert_eq!(buffer.changes(), reported);
         buffer.progress(2, 9, "sequence", 3.0);
-        buffer.line("a line".to_owned(), 4.0);
+        buffer.line("a line", 4.0);
         assert_eq!(buffer.changes(), reported + 2);
     }
 
     #[test]
     fn unwritten_lines_come_before_later_ones() {
         let mut buffer = ReportBuffer::default();
-        buffer.line("one".to_owned(), 1.0);
+        buffer.line("one", 1.0);
         let (lines, points) = buffer.drain();
-        buffer.line("two".to_owned(), 2.0);
+        buffer.line("two", 2.0);
         buffer.restore_unwritten(lines, points);
         let (lines, _) = buffer.drain();
         assert_eq!(lines, [(1.0, "one".to_owned()), (2.0, "two".to_owned())]);
@@ -217,7 +245,7 @@ mod tests {
     #[test]
     fn the_buffer_is_bounded_while_the_store_is_unreachable() {
         let mut buffer = ReportBuffer::default();
-        (0..5000).for_each(|i| buffer.line(i.to_string(), 0.0));
+        (0..5000).for_each(|i| buffer.line(&i.to_string(), 0.0));
         let (lines, _) = buffer.drain();
         assert_eq!((lines.len(), lines[0].1.as_str()), (MAX_WAITING, "4000"));
     }

@@ -37,17 +37,13 @@ impl Jobs {
             ended: Notify::new(),
             stop: watch::Sender::new(false),
         });
-        let runner = if runs {
+        let mut runner = Arc::default();
+        if runs {
             let instance = Instance::claim(shared.store.objects().data_dir())?;
-            let pool = runner::pool(limits.threads)?;
-            Some(tokio::spawn(runner::run(Arc::clone(&shared), instance, pool)))
-        } else {
-            None
-        };
-        Ok(Self {
-            shared,
-            runner: Arc::new(Mutex::new(runner)),
-        })
+            let run = runner::run(Arc::clone(&shared), instance, runner::pool(limits.threads)?);
+            runner = Arc::new(Mutex::new(Some(tokio::spawn(run))));
+        }
+        Ok(Self { shared, runner })
     }
 
     /// Enqueues a job without an API key. Errors: as [`Self::submit_as`].
@@ -60,7 +56,7 @@ impl Jobs {
     /// `Store`.
     pub async fn submit_as(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
-        if *shared.stop.borrow() {
+        if shared.is_stopping() {
             return Err(JobError::Stopping);
         }
         if let Some(key) = &key {
@@ -93,14 +89,12 @@ impl Jobs {
 
     fn refused(&self, enqueued: &EnqueueResult, spec: &JobSpec) -> JobError {
         match (enqueued, spec.made_dataset()) {
-            (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull { limit: *limit },
-            (EnqueueResult::Taken, Some(name)) => JobError::Taken {
-                name: name.clone(),
-                why: "is the output of another job that has not ended",
-            },
-            _ => JobError::QueueFull {
-                limit: self.shared.limits.queued,
-            },
+            (EnqueueResult::ShareFull(limit), _) => JobError::ShareFull(*limit),
+            (EnqueueResult::Taken, Some(name)) => JobError::taken(
+                name,
+                "is the output of another job that has not ended; choose another name",
+            ),
+            _ => JobError::QueueFull(self.shared.limits.queued),
         }
     }
 
@@ -165,7 +159,7 @@ impl Jobs {
     /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
     /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
     pub async fn resume(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
-        if *self.shared.stop.borrow() {
+        if self.shared.is_stopping() {
             return Err(JobError::Stopping);
         }
         let row = self.row(id).await?;
@@ -207,7 +201,7 @@ impl Jobs {
 
     async fn row(&self, id: JobId) -> Result<JobRow, JobError> {
         let found = self.shared.store.job(id).await?;
-        found.ok_or_else(|| JobError::Unknown { id: id.to_string() })
+        found.ok_or_else(|| JobError::Unknown(id.to_string()))
     }
 }
 
@@ -219,10 +213,8 @@ fn check_key(key: &str) -> Result<(), JobError> {
     if (1..=MAX_KEY_LENGTH).contains(&key.len()) && key.bytes().all(|byte| byte.is_ascii_graphic()) {
         return Ok(());
     }
-    Err(JobError::Invalid {
-        field: "Idempotency-Key",
-        reason: format!("a key is 1 to {MAX_KEY_LENGTH} visible ASCII characters"),
-    })
+    let reason = format!("a key is 1 to {MAX_KEY_LENGTH} visible ASCII characters");
+    Err(JobError::invalid("Idempotency-Key", reason))
 }
 
 /// The job of an idempotency key. Errors: `Invalid` if its spec is a different one.
@@ -231,18 +223,13 @@ fn same(row: &JobRow, spec: &JobSpec) -> Result<Job, JobError> {
     if job.spec == *spec {
         return Ok(job);
     }
-    Err(JobError::Invalid {
-        field: "Idempotency-Key",
-        reason: format!(
-            "it was used for a different job, {}; use a new key for a new job",
-            job.id
-        ),
-    })
+    let reason = format!(
+        "it was used for a different job, {}; use a new key for a new job",
+        job.id
+    );
+    Err(JobError::invalid("Idempotency-Key", reason))
 }
 
 fn json(value: &impl serde::Serialize) -> Result<String, JobError> {
-    serde_json::to_string(value).map_err(|error| JobError::Invalid {
-        field: "settings",
-        reason: error.to_string(),
-    })
+    serde_json::to_string(value).map_err(|error| JobError::invalid("settings", error.to_string()))
 }

@@ -2,40 +2,17 @@
 //! parent process.
 
 use std::io::Write;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use metrics::gauge;
-use serde::{Deserialize, Serialize};
-
-use super::progress::ReportBuffer;
+use super::progress::{ReportBuffer, ReportEvent};
 use super::{Losses, unix_s};
 use crate::store::{JobId, Lease, LossRow};
-use foreframe_core::metric_names;
 
-/// A part of a job's report.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum ReportEvent {
-    /// Units done, their total, and what the job is doing.
-    Progress(u64, u64, String),
-    /// A stage with units of another duration starts.
-    Stage,
-    /// The latest losses.
-    Losses(Losses),
-    /// A line for the log.
-    Line(String),
-    /// A point of the loss curves.
-    Point(LossRow),
-    /// Units that are saved.
-    Checkpoint(u64),
-}
-
-type WriteEvent = fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>;
-
+/// Where the events of a report go: into a buffer, or each one to standard output.
 #[derive(Clone)]
-enum ReportTarget {
+pub(super) enum ReportTarget {
     Buffer(Arc<Mutex<ReportBuffer>>),
-    Stdout(WriteEvent),
+    Stdout(fn(ReportEvent, &mut dyn Write) -> std::io::Result<()>),
 }
 
 /// Receives the report of a running job.
@@ -46,49 +23,21 @@ pub struct JobReporter {
 }
 
 impl JobReporter {
-    /// A reporter into a buffer.
-    pub(super) fn to_buffer(lease: Lease, buffer: ReportBuffer) -> Self {
-        let target = ReportTarget::Buffer(Arc::new(Mutex::new(buffer)));
+    pub(super) fn new(lease: Lease, target: ReportTarget) -> Self {
         Self { target, lease }
-    }
-
-    /// A reporter that writes each event to standard output.
-    pub(super) fn to_writer(lease: Lease, write: WriteEvent) -> Self {
-        let target = ReportTarget::Stdout(write);
-        Self { target, lease }
-    }
-
-    /// The buffer, if the report goes to one.
-    pub(super) fn buffer(&self) -> Option<MutexGuard<'_, ReportBuffer>> {
-        match &self.target {
-            ReportTarget::Buffer(buffer) => Some(buffer.lock().unwrap_or_else(PoisonError::into_inner)),
-            ReportTarget::Stdout(_) => None,
-        }
     }
 
     /// Adds an event to the report.
     pub(super) fn apply(&self, event: ReportEvent) {
-        let Some(mut buffer) = self.buffer() else {
-            if let ReportTarget::Stdout(write) = &self.target {
+        match &self.target {
+            ReportTarget::Buffer(buffer) => {
+                let mut buffer = buffer.lock().unwrap_or_else(PoisonError::into_inner);
+                buffer.apply(event, unix_s());
+            }
+            ReportTarget::Stdout(write) => {
                 // The parent has ended if this fails, and this process with it.
                 let _ = write(event, &mut std::io::stdout().lock());
             }
-            return;
-        };
-        match event {
-            ReportEvent::Progress(done, total, message) => buffer.progress(done, total, &message, unix_s()),
-            ReportEvent::Stage => buffer.stage(),
-            ReportEvent::Losses(losses) => {
-                for (split, loss) in [("train", losses.train), ("validation", losses.validation)] {
-                    if let Some(loss) = loss {
-                        gauge!(metric_names::TRAINING_LOSS, "split" => split).set(loss);
-                    }
-                }
-                buffer.losses(losses);
-            }
-            ReportEvent::Line(line) => buffer.line(line, unix_s()),
-            ReportEvent::Point(point) => buffer.point(point),
-            ReportEvent::Checkpoint(units) => buffer.checkpoint(units),
         }
     }
 
@@ -114,9 +63,9 @@ impl JobReporter {
         self.apply(ReportEvent::Stage);
     }
 
-    /// Sets the latest losses.
-    pub fn losses(&self, losses: Losses) {
-        self.apply(ReportEvent::Losses(losses));
+    /// Sets the latest losses. A loss that is `None` keeps its last value.
+    pub fn losses(&self, train: Option<f64>, validation: Option<f64>) {
+        self.apply(ReportEvent::Losses(Losses { train, validation }));
     }
 
     /// Adds a line to the job's log.

@@ -37,6 +37,15 @@ impl RetryPolicy<'_> {
         self.repeat(|| self.runtime.block_on(work()))
     }
 
+    /// The same for work that blocks in a directory that another process can have locked: waits for that, too.
+    pub(super) fn repeat_once_free<T, E: HasErrorKind>(
+        &self,
+        mut work: impl FnMut() -> Result<T, E>,
+    ) -> Result<T, JobFailure> {
+        let is_busy = |error: &E| error.kind() == ErrorKind::Busy;
+        self.repeat(|| retry_while_busy(&mut work, is_busy, self.cancelled))
+    }
+
     /// The same for work that blocks.
     pub(super) fn repeat<T, E: HasErrorKind>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
         let (began, mut is_told) = (Instant::now(), false);
@@ -66,7 +75,7 @@ impl RetryPolicy<'_> {
 }
 
 /// Repeats the work while another process has locked the directory, at most for `BUSY_TIMEOUT` or until cancelled.
-pub(super) fn retry_while_busy<T, E>(
+fn retry_while_busy<T, E>(
     mut work: impl FnMut() -> Result<T, E>,
     is_busy: impl Fn(&E) -> bool,
     cancelled: &AtomicBool,
@@ -85,6 +94,7 @@ pub(super) fn retry_while_busy<T, E>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::jobs::report::ReportTarget;
     use crate::store::{JobId, Lease, StoreError};
 
     fn away() -> StoreError {
@@ -104,7 +114,7 @@ mod tests {
         };
         let retry = RetryPolicy {
             runtime: runtime.handle(),
-            report: &JobReporter::to_writer(lease, |_, _| Ok(())),
+            report: &JobReporter::new(lease, ReportTarget::Stdout(|_, _| Ok(()))),
             cancelled: &AtomicBool::new(cancelled),
         };
         let (mut tries, mut other) = (0, other);
@@ -129,5 +139,36 @@ mod tests {
     fn a_job_does_not_wait_after_other_errors() {
         let (done, tries) = tried(0, Some(StoreError::NoTls), false);
         assert!(matches!(done, Err(JobFailure::Failed(_))) && tries == 1);
+    }
+
+    /// Retries work that is busy `busy` times. Returns its result and the number of tries.
+    fn tried_busy(busy: u32, cancelled: bool) -> (Result<(), bool>, u32) {
+        let mut tries = 0;
+        let work = || {
+            tries += 1;
+            if tries > busy { Ok(()) } else { Err(true) }
+        };
+        let done = retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(cancelled));
+        (done, tries)
+    }
+
+    #[test]
+    fn work_starts_once_the_directory_is_free_unless_cancelled() {
+        assert_eq!(tried_busy(2, false), (Ok(()), 3));
+        assert_eq!(tried_busy(2, true), (Err(true), 1));
+    }
+
+    #[test]
+    fn other_errors_are_told_at_once() {
+        let mut tries = 0;
+        let work = || -> Result<(), bool> {
+            tries += 1;
+            Err(false)
+        };
+        assert_eq!(
+            retry_while_busy(work, |is_busy| *is_busy, &AtomicBool::new(false)),
+            Err(false)
+        );
+        assert_eq!(tries, 1);
     }
 }

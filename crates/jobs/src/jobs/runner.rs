@@ -1,19 +1,19 @@
 //! Claims jobs one after another. Runs each on its own threads, renews its lease, writes its reports, and records its
 //! outcome.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use metrics::counter;
 use rayon::ThreadPool;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::executor::{JobFailure, JobResult};
 use super::instance::Instance;
 use super::progress::{ReportBuffer, StoredProgress};
-use super::report::JobReporter;
+use super::report::{JobReporter, ReportTarget};
 use super::shared::SharedJobs;
 use super::{Job, JobError, JobSpec, JobState, JobTransition, priority};
 use crate::store::{JobId, JobOutcome, JobReport, JobRow, Lease, StoreError};
@@ -38,52 +38,39 @@ pub(super) fn pool(threads: usize) -> Result<ThreadPool, JobError> {
 
 pub(super) async fn run(shared: Arc<SharedJobs>, instance: Instance, pool: ThreadPool) {
     let pool = Arc::new(pool);
-    let mut stop = shared.stop.subscribe();
     // This process holds the lock of the id, so all leases under the id are of an earlier process that has ended.
     if let Err(error) = shared.store.release_leases(&instance.id).await {
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
-    while !*stop.borrow() {
-        match shared
-            .store
-            .claim(&instance.id, shared.limits.lease.as_secs_f64())
-            .await
-        {
-            Ok(Some((row, lease))) => Box::pin(JobRun::new(&shared, &row, lease).run(&row, &pool, stop.clone())).await,
-            Ok(None) => pause(&shared, &mut stop).await,
-            Err(error) => {
-                warn!(%error, "could not claim a job");
-                pause(&shared, &mut stop).await;
+    let lease_s = shared.limits.lease.as_secs_f64();
+    while !shared.is_stopping() {
+        match shared.store.claim(&instance.id, lease_s).await {
+            Ok(Some((row, lease))) => {
+                Box::pin(JobRun::new(&shared, row, lease).run(&pool)).await;
+                continue;
             }
+            Ok(None) => {}
+            Err(error) => warn!(%error, "could not claim a job"),
+        }
+        tokio::select! {
+            () = shared.wake.notified() => {}
+            () = tokio::time::sleep(POLL_EVERY) => {}
+            () = shared.stop_requested() => {}
         }
     }
-}
-
-async fn pause(shared: &SharedJobs, stop: &mut watch::Receiver<bool>) {
-    tokio::select! {
-        () = shared.wake.notified() => {}
-        () = tokio::time::sleep(POLL_EVERY) => {}
-        () = stop_requested(stop) => {}
-    }
-}
-
-async fn stop_requested(stop: &mut watch::Receiver<bool>) {
-    // The sender lives as long as the jobs' handle does.
-    let _ = stop.wait_for(|stop| *stop).await;
 }
 
 /// One attempt of a job.
 struct JobRun<'a> {
     shared: &'a SharedJobs,
+    /// The job when this attempt started.
+    row: JobRow,
     report: JobReporter,
+    buffer: Arc<Mutex<ReportBuffer>>,
     cancelled: Arc<AtomicBool>,
     /// Whether the job was cancelled by request.
     cancel_requested: bool,
     lease_lost: bool,
-    /// How many attempts before this one ended abnormally without progress.
-    stalled_attempts: i64,
-    /// The units that were saved when this attempt started.
-    claimed_checkpoint: i64,
     /// When the time limit is reached.
     deadline: Option<Instant>,
     /// The latest number of changes of the report, and when it was first seen.
@@ -95,38 +82,47 @@ struct JobRun<'a> {
 /// Stops the work when its supervision ends, for whatever reason.
 impl Drop for JobRun<'_> {
     fn drop(&mut self) {
-        self.cancelled.store(true, Ordering::Release);
+        self.stop_work();
     }
 }
 
 impl<'a> JobRun<'a> {
-    fn new(shared: &'a SharedJobs, row: &JobRow, lease: Lease) -> Self {
+    fn new(shared: &'a SharedJobs, row: JobRow, lease: Lease) -> Self {
         let stored: StoredProgress = serde_json::from_str(&row.progress).unwrap_or_default();
+        let buffer = Arc::new(Mutex::new(ReportBuffer::new(stored)));
         Self {
             shared,
-            report: JobReporter::to_buffer(lease, ReportBuffer::new(stored)),
-            stalled_attempts: row.stalled_attempts,
-            claimed_checkpoint: row.checkpoint,
-            deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
-            latest_change: (0, Instant::now()),
-            has_stalled: false,
+            report: JobReporter::new(lease, ReportTarget::Buffer(Arc::clone(&buffer))),
+            buffer,
             cancelled: Arc::new(AtomicBool::new(false)),
             cancel_requested: row.cancelling,
             lease_lost: false,
+            deadline: shared.limits.time_limit.map(|limit| Instant::now() + limit),
+            latest_change: (0, Instant::now()),
+            has_stalled: false,
+            row,
         }
     }
 
-    async fn run(mut self, row: &JobRow, pool: &Arc<ThreadPool>, stop: watch::Receiver<bool>) {
-        let (id, stopping) = (self.report.id(), stop.clone());
-        info!(job.id = %id, job.attempt = row.token, "job started");
-        self.report.line(match row.token {
+    fn buffer(&self) -> MutexGuard<'_, ReportBuffer> {
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn stop_work(&self) {
+        self.cancelled.store(true, Ordering::Release);
+    }
+
+    async fn run(mut self, pool: &Arc<ThreadPool>) {
+        let id = self.row.id;
+        info!(job.id = %id, job.attempt = self.row.token, "job started");
+        self.report.line(match self.row.token {
             1 => "started".to_owned(),
             attempt => format!("attempt {attempt}: resuming from the last checkpoint"),
         });
-        let result = match Job::of(row) {
+        let mut result = match Job::of(&self.row) {
             Ok(_) if self.cancel_requested => Err(JobFailure::Cancelled),
-            Ok(_) if self.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
-            Ok(job) => self.supervise(job.spec, pool, stop).await,
+            Ok(_) if self.row.stalled_attempts >= self.max_attempts() => Err(self.give_up("its process was killed")),
+            Ok(job) => self.supervise(job.spec, pool).await,
             Err(error) => Err(JobFailure::Failed(error.to_string())),
         };
         if result == Err(JobFailure::Cancelled) && !self.cancel_requested {
@@ -137,35 +133,37 @@ impl<'a> JobRun<'a> {
             warn!(job.id = %id, "the job's lease was lost; another worker continues it");
             return;
         }
-        let is_stopping = *stopping.borrow();
-        let result = match result {
-            Err(JobFailure::Cancelled) if !self.cancel_requested && self.is_over_time() && !is_stopping => {
-                let limit_s = self.shared.limits.time_limit.unwrap_or_default().as_secs();
-                Err(JobFailure::Failed(format!(
-                    "the attempt reached the time limit of {limit_s} s (setting job_time_limit_s); a resumed job continues \
-                     from its last checkpoint"
-                )))
-            }
-            Err(JobFailure::Cancelled) if !self.cancel_requested && self.has_stalled && !is_stopping => {
-                let limit_s = self.shared.limits.stall_limit.unwrap_or_default().as_secs();
-                self.check_attempts(Err(JobFailure::Crashed(format!(
-                    "the job reported no progress for {limit_s} s (setting job_stall_limit_s)"
-                ))))
-            }
-            result => self.check_attempts(result),
-        };
-        Box::pin(self.end(&row.kind, result)).await;
+        let was_stopped_here =
+            result == Err(JobFailure::Cancelled) && !self.cancel_requested && !self.shared.is_stopping();
+        if was_stopped_here && let Some(failure) = self.reached_limit() {
+            result = Err(failure);
+        }
+        Box::pin(self.end(self.check_attempts(result))).await;
+    }
+
+    /// The limit for which the work was stopped.
+    fn reached_limit(&self) -> Option<JobFailure> {
+        let seconds = |limit: Option<Duration>| limit.unwrap_or_default().as_secs();
+        if self.is_over_time() {
+            return Some(JobFailure::Failed(format!(
+                "the attempt reached the time limit of {} s (setting job_time_limit_s); a resumed job continues from its last \
+                 checkpoint",
+                seconds(self.shared.limits.time_limit)
+            )));
+        }
+        self.has_stalled.then(|| {
+            let limit_s = seconds(self.shared.limits.stall_limit);
+            JobFailure::Crashed(format!(
+                "the job reported no progress for {limit_s} s (setting job_stall_limit_s)"
+            ))
+        })
     }
 
     /// Runs the work on its own thread, and writes its report until the work returns.
-    async fn supervise(
-        &mut self,
-        spec: JobSpec,
-        pool: &Arc<ThreadPool>,
-        mut stop: watch::Receiver<bool>,
-    ) -> Result<JobResult, JobFailure> {
+    async fn supervise(&mut self, spec: JobSpec, pool: &Arc<ThreadPool>) -> Result<JobResult, JobFailure> {
+        let shared = self.shared;
         let (sender, mut result) = oneshot::channel();
-        let (execute, pool) = (Arc::clone(&self.shared.execute), Arc::clone(pool));
+        let (execute, pool) = (Arc::clone(&shared.execute), Arc::clone(pool));
         let (report, cancelled) = (self.report.clone(), Arc::clone(&self.cancelled));
         let thread = std::thread::Builder::new().name("jobs".to_owned()).spawn(move || {
             priority::lower();
@@ -176,7 +174,7 @@ impl<'a> JobRun<'a> {
         if let Err(error) = thread {
             return Err(JobFailure::Failed(format!("could not start a thread: {error}")));
         }
-        let mut ticks = tokio::time::interval(WRITE_EVERY.min(self.shared.limits.lease / 3));
+        let mut ticks = tokio::time::interval(WRITE_EVERY.min(shared.limits.lease / 3));
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut is_stopping = false;
         loop {
@@ -185,18 +183,17 @@ impl<'a> JobRun<'a> {
                     let panicked = || JobFailure::Failed("the job panicked; the server's log says why".to_owned());
                     return result.unwrap_or_else(|_| Err(panicked()));
                 }
-                () = stop_requested(&mut stop), if !is_stopping => {
+                () = shared.stop_requested(), if !is_stopping => {
                     is_stopping = true;
-                    self.cancelled.store(true, Ordering::Release);
+                    self.stop_work();
                     // If the process ends before the work has stopped, that is no failure of the job.
-                    if let Err(error) = self.shared.store.excuse_attempt(self.report.lease()).await {
+                    if let Err(error) = shared.store.excuse_attempt(self.report.lease()).await {
                         warn!(%error, "could not mark an attempt as stopped");
                     }
                 }
                 _ = ticks.tick() => {
                     self.renew().await;
-                    self.check_deadline();
-                    self.check_stall();
+                    self.check_limits();
                 }
             }
         }
@@ -212,28 +209,23 @@ impl<'a> JobRun<'a> {
             Ok(None) => self.lease_lost = true,
             Err(error) => {
                 warn!(job.id = %self.report.id(), %error, "could not renew a job's lease");
-                if let Some(mut buffer) = self.report.buffer() {
-                    buffer.restore_unwritten(lines, losses);
-                }
+                self.buffer().restore_unwritten(lines, losses);
             }
         }
         if self.cancel_requested || self.lease_lost {
-            self.cancelled.store(true, Ordering::Release);
+            self.stop_work();
         }
     }
 
     fn take_report(&self) -> JobReport {
-        let max_lines = self.shared.limits.log_lines as i64;
-        let Some(mut buffer) = self.report.buffer() else {
-            return JobReport::default();
-        };
+        let mut buffer = self.buffer();
         let (lines, losses) = buffer.drain();
         JobReport {
             // Two structs of numbers and strings always serialize.
             progress: serde_json::to_string(buffer.stored()).unwrap_or_default(),
             lines,
             losses,
-            max_lines,
+            max_lines: self.shared.limits.log_lines as i64,
             checkpoint: buffer.saved() as i64,
         }
     }
@@ -251,34 +243,25 @@ impl<'a> JobRun<'a> {
 
     /// Turns a crash into a failure if too many attempts in a row made no progress.
     fn check_attempts(&self, result: Result<JobResult, JobFailure>) -> Result<JobResult, JobFailure> {
-        let Err(JobFailure::Crashed(reason)) = &result else {
-            return result;
-        };
-        let saved = self.report.buffer().map_or(0, |buffer| buffer.saved() as i64);
-        let is_stalled = saved <= self.claimed_checkpoint;
-        if is_stalled && self.stalled_attempts + 1 >= self.max_attempts() {
-            return Err(self.give_up(reason));
-        }
-        result
-    }
-
-    /// Stops the work when the time limit is reached.
-    fn check_deadline(&self) {
-        if self.is_over_time() {
-            self.cancelled.store(true, Ordering::Release);
+        let is_stalled = self.buffer().saved() as i64 <= self.row.checkpoint;
+        match result {
+            Err(JobFailure::Crashed(reason)) if is_stalled && self.row.stalled_attempts + 1 >= self.max_attempts() => {
+                Err(self.give_up(&reason))
+            }
+            result => result,
         }
     }
 
-    /// Stops the work when it has reported no progress for too long.
-    fn check_stall(&mut self) {
-        let changes = self.report.buffer().map_or(0, |buffer| buffer.changes());
+    /// Stops the work when the time limit is reached, or when it has reported no progress for too long.
+    fn check_limits(&mut self) {
+        let changes = self.buffer().changes();
         if changes != self.latest_change.0 {
             self.latest_change = (changes, Instant::now());
         }
         let limit = self.shared.limits.stall_limit;
-        if limit.is_some_and(|limit| self.latest_change.1.elapsed() >= limit) {
-            self.has_stalled = true;
-            self.cancelled.store(true, Ordering::Release);
+        self.has_stalled |= limit.is_some_and(|limit| self.latest_change.1.elapsed() >= limit);
+        if self.has_stalled || self.is_over_time() {
+            self.stop_work();
         }
     }
 
@@ -286,65 +269,61 @@ impl<'a> JobRun<'a> {
         self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
     }
 
-    async fn end(&self, kind: &str, result: Result<JobResult, JobFailure>) {
-        let id = self.report.id();
-        let crash = match &result {
-            Err(JobFailure::Crashed(reason)) => Some(reason.clone()),
-            _ => None,
-        };
-        let (event, error, outcome) = match result {
-            Ok(outcome) => (JobTransition::Succeed, None, Some(outcome)),
-            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) if self.cancel_requested => {
-                (JobTransition::Cancel, None, None)
-            }
-            Err(JobFailure::Cancelled | JobFailure::Crashed(_)) => (JobTransition::Release, None, None),
-            Err(JobFailure::Failed(reason)) => (JobTransition::Fail, Some(reason), None),
+    async fn end(&self, result: Result<JobResult, JobFailure>) {
+        let id = self.row.id;
+        let event = match &result {
+            Ok(_) => JobTransition::Succeed,
+            Err(JobFailure::Failed(_)) => JobTransition::Fail,
+            Err(_) if self.cancel_requested => JobTransition::Cancel,
+            Err(_) => JobTransition::Release,
         };
         // All of these transitions are legal for a running job.
         let state = JobState::Running.after(event).unwrap_or(JobState::Failed);
         let outcome_name = if state.is_final() { state.name() } else { "released" };
-        counter!(metric_names::JOBS_ENDED, "kind" => kind.to_owned(), "outcome" => outcome_name).increment(1);
-        match &error {
-            None => info!(job.id = %id, job.outcome = ?event, "job ended"),
-            Some(reason) => warn!(job.id = %id, reason, "job failed"),
+        counter!(metric_names::JOBS_ENDED, "kind" => self.row.kind.clone(), "outcome" => outcome_name).increment(1);
+        if let Err(JobFailure::Failed(reason)) = &result {
+            warn!(job.id = %id, reason, "job failed");
+        } else {
+            info!(job.id = %id, job.outcome = ?event, "job ended");
         }
-        if let Some(reason) = &crash {
+        if let Err(JobFailure::Crashed(reason)) = &result {
             warn!(job.id = %id, reason, "an attempt of a job crashed");
         }
-        self.report.line(match &error {
-            None if state == JobState::Queued && crash.is_some() => {
-                format!("the attempt crashed: {}", crash.as_deref().unwrap_or_default())
-            }
-            None if state == JobState::Queued => "stopped with the server; the next attempt resumes it".to_owned(),
-            None => state.name().to_owned(),
-            Some(reason) => format!("failed: {reason}"),
+        self.report.line(match &result {
+            Err(JobFailure::Failed(reason)) => format!("failed: {reason}"),
+            Err(JobFailure::Crashed(reason)) if state == JobState::Queued => format!("the attempt crashed: {reason}"),
+            _ if state == JobState::Queued => "stopped with the server; the next attempt resumes it".to_owned(),
+            _ => state.name().to_owned(),
         });
-        let outcome = JobOutcome {
+        let mut outcome = JobOutcome {
             state: state.name(),
-            error,
-            outcome: outcome.as_ref().map(|outcome| outcome.result.to_string()),
             // Set when it is written, by the database's clock.
             ended_s: state.is_final().then_some(0.0),
-            published: outcome.as_ref().and_then(|outcome| outcome.published.clone()),
-            measured: outcome.and_then(|outcome| outcome.measured),
-            crashed: crash.is_some(),
+            crashed: matches!(result, Err(JobFailure::Crashed(_))),
+            ..JobOutcome::default()
         };
+        match result {
+            Ok(done) => {
+                outcome.outcome = Some(done.result.to_string());
+                (outcome.published, outcome.measured) = (done.published, done.measured);
+            }
+            Err(JobFailure::Failed(reason)) => outcome.error = Some(reason),
+            Err(_) => {}
+        }
         self.write_outcome(id, outcome).await;
         self.shared.ended.notify_one();
     }
 
     /// Writes the outcome. While the database is away, tries until it is back: nothing else can be claimed meanwhile.
     async fn write_outcome(&self, id: JobId, outcome: JobOutcome) {
-        let (report, stop) = (self.take_report(), self.shared.stop.subscribe());
-        let mut attempt = 0;
-        loop {
-            attempt += 1;
+        let report = self.take_report();
+        for attempt in 1.. {
             match self.try_to_end(outcome.clone(), report.clone()).await {
                 Ok(true) => return self.shared.forget_oldest().await,
                 Ok(false) => return warn!(job.id = %id, "the job's lease was lost before its outcome was written"),
                 Err(error) => warn!(job.id = %id, %error, attempt, "could not write a job's outcome"),
             }
-            if *stop.borrow() && attempt >= END_ATTEMPTS {
+            if self.shared.is_stopping() && attempt >= END_ATTEMPTS {
                 return;
             }
             tokio::time::sleep(POLL_EVERY).await;

@@ -42,6 +42,17 @@ pub(super) struct SharedJobs {
 }
 
 impl SharedJobs {
+    /// Whether this process is stopping.
+    pub(super) fn is_stopping(&self) -> bool {
+        *self.stop.borrow()
+    }
+
+    /// Completes when this process is stopping.
+    pub(super) async fn stop_requested(&self) {
+        // The sender lives as long as this does.
+        let _ = self.stop.subscribe().wait_for(|stop| *stop).await;
+    }
+
     /// Deletes the oldest ended jobs with their files.
     pub(super) async fn forget_oldest(&self) {
         let forgotten = match self.store.forget_ended(self.limits.ended as i64).await {

@@ -15,7 +15,7 @@ use super::JobError;
 use foreframe_core::error_text;
 use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
-use foreframe_sim::Scenario;
+use foreframe_sim::{Scenario, SimError};
 use foreframe_train::evaluation::EvaluateConfig;
 use foreframe_train::training::{TrainConfig, TrainError};
 
@@ -185,7 +185,7 @@ impl JobSpec {
     }
 
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
-    /// `Taken`, `Occupied`, `Dataset`.
+    /// `Taken`, `Dataset`.
     pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         match self {
             Self::Collect(spec) => spec.check(available),
@@ -199,18 +199,14 @@ impl JobSpec {
 impl EvaluateSpec {
     fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         check_dataset(&self.dataset, available.datasets)?;
-        check_model("model", &self.model, available.models)?;
-        if let Some(twin) = &self.twin {
-            check_model("twin", twin, available.models)?;
+        for (field, model) in [("model", Some(&self.model)), ("twin", self.twin.as_ref())] {
+            model.map_or(Ok(()), |model| {
+                check_known((field, "model"), model, available.models.keys())
+            })?;
         }
-        let versions = available.models.get(&self.model).map_or(&[][..], Vec::as_slice);
-        if let Some(version) = self.version.filter(|version| !versions.contains(version)) {
-            return Err(JobError::NotFound {
-                field: "version",
-                kind: "version",
-                name: version.to_string(),
-                available: versions.iter().map(u32::to_string).collect(),
-            });
+        let versions = available.models.get(&self.model).into_iter().flatten();
+        if let Some(version) = &self.version {
+            check_known(("version", "version"), version, versions)?;
         }
         check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
         check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
@@ -220,13 +216,11 @@ impl EvaluateSpec {
 impl CollectSpec {
     fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         if !(1..=MAX_TRIALS).contains(&self.trials) {
-            return Err(JobError::Invalid {
-                field: "trials",
-                reason: format!(
-                    "{} is out of range; 1 to {MAX_TRIALS} trials can be collected",
-                    self.trials
-                ),
-            });
+            let reason = format!(
+                "{} is out of range; 1 to {MAX_TRIALS} trials can be collected",
+                self.trials
+            );
+            return Err(JobError::invalid("trials", reason));
         }
         let config = self.config(&available.data_dir.join("datasets"))?;
         let is_there = available.datasets.contains(&self.name);
@@ -236,39 +230,32 @@ impl CollectSpec {
         }
         match CollectionStatus::of(&config) {
             Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
-            Ok(_) => Err(JobError::Taken {
-                name: self.name.clone(),
-                why: "exists",
-            }),
-            Err(DatasetError::OutExists { .. }) => {
-                Err(self.occupied("cannot be written because other files are in its directory; move them".to_owned()))
+            Ok(_) => Err(JobError::taken(&self.name, "exists; choose another name")),
+            Err(DatasetError::OutExists { .. }) => Err(JobError::taken(
+                &self.name,
+                "cannot be written because other files are in its directory; move them, or choose another name",
+            )),
+            Err(DatasetError::OtherArguments { differences, .. }) => {
+                let why = format!(
+                    "was started with other arguments ({differences}); use those to continue it, or choose another name"
+                );
+                Err(JobError::taken(&self.name, why))
             }
-            Err(DatasetError::OtherArguments { differences, .. }) => Err(self.occupied(format!(
-                "was started with other arguments ({differences}); use those to continue it"
-            ))),
             Err(error) => Err(error.into()),
         }
     }
 
-    fn occupied(&self, why: String) -> JobError {
-        let name = self.name.clone();
-        JobError::Occupied { name, why }
-    }
-
     /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
     pub(super) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
-        let out = datasets.join(&self.name);
-        Ok(CollectConfig::new(self.scenario()?, self.trials, Seed(self.seed), &out))
-    }
-
-    /// The scenario. Errors: `Invalid`, which names the scenarios.
-    fn scenario(&self) -> Result<Scenario, JobError> {
-        self.scenario
-            .parse()
-            .map_err(|error: <Scenario as std::str::FromStr>::Err| JobError::Invalid {
-                field: "scenario",
-                reason: error.to_string(),
-            })
+        let scenario = self.scenario.parse();
+        let scenario: Scenario =
+            scenario.map_err(|error: SimError| JobError::invalid("scenario", error.to_string()))?;
+        Ok(CollectConfig::new(
+            scenario,
+            self.trials,
+            Seed(self.seed),
+            &datasets.join(&self.name),
+        ))
     }
 }
 
@@ -280,22 +267,14 @@ impl TrainSpec {
 
     /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
     pub(super) fn config(&self) -> Result<TrainConfig, JobError> {
-        let settings = |reason: String| JobError::Invalid {
-            field: "settings",
-            reason,
-        };
         let text = toml::to_string(&self.settings).map_err(|error| {
-            settings(format!(
-                "{error}; a setting is a number, a string, true or false, not null"
-            ))
+            let reason = format!("{error}; a setting is a number, a string, true or false, not null");
+            JobError::invalid("settings", reason)
         })?;
         let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
         let config = layered.map_err(|error| match error {
-            TrainError::UnknownPreset { .. } => JobError::Invalid {
-                field: "preset",
-                reason: error.to_string(),
-            },
-            other => settings(error_text::with_causes(&other)),
+            TrainError::UnknownPreset { .. } => JobError::invalid("preset", error.to_string()),
+            other => JobError::invalid("settings", error_text::with_causes(&other)),
         })?;
         Ok(TrainConfig {
             name: self.name.clone(),
@@ -329,30 +308,23 @@ fn twin<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>,
 }
 
 fn check_dataset(name: &DatasetName, available: &[DatasetName]) -> Result<(), JobError> {
-    if available.contains(name) {
-        return Ok(());
-    }
-    Err(JobError::NotFound {
-        field: "dataset",
-        kind: "data set",
-        name: name.to_string(),
-        available: available.iter().map(DatasetName::to_string).collect(),
-    })
+    check_known(("dataset", "data set"), name, available.iter())
 }
 
-fn check_model(
-    field: &'static str,
-    name: &ModelName,
-    available: &BTreeMap<ModelName, Vec<u32>>,
+/// Errors: `NotFound` if a field names what is not available.
+fn check_known<'a, N: PartialEq + ToString + 'a>(
+    (field, kind): (&'static str, &'static str),
+    name: &N,
+    available: impl Iterator<Item = &'a N> + Clone,
 ) -> Result<(), JobError> {
-    if available.contains_key(name) {
+    if available.clone().any(|known| known == name) {
         return Ok(());
     }
     Err(JobError::NotFound {
         field,
-        kind: "model",
+        kind,
         name: name.to_string(),
-        available: available.keys().map(ModelName::to_string).collect(),
+        available: available.map(N::to_string).collect(),
     })
 }
 
@@ -360,14 +332,9 @@ fn check_range(field: &'static str, value: usize, range: RangeInclusive<usize>) 
     if range.contains(&value) {
         return Ok(());
     }
-    Err(JobError::Invalid {
-        field,
-        reason: format!(
-            "{value} is out of range; it must be {} to {}",
-            range.start(),
-            range.end()
-        ),
-    })
+    let (least, most) = range.into_inner();
+    let reason = format!("{value} is out of range; it must be {least} to {most}");
+    Err(JobError::invalid(field, reason))
 }
 
 #[cfg(test)]

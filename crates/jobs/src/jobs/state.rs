@@ -83,15 +83,23 @@ impl JobState {
 }
 
 impl JobTransition {
+    /// What it does to a job, and the states in which it is legal, for error messages.
+    fn texts(self) -> [&'static str; 2] {
+        match self {
+            Self::Start => ["start", "queued"],
+            Self::Succeed => ["succeed", "running"],
+            Self::Fail => ["fail", "running"],
+            Self::Cancel => ["be cancelled", "queued or running"],
+            Self::Release => ["be released", "running"],
+            Self::Resume => ["be resumed", "failed or cancelled"],
+        }
+    }
+
     /// The states in which it is legal, for error messages.
     #[must_use]
     pub fn allowed_states(self) -> &'static str {
-        match self {
-            Self::Start => "queued",
-            Self::Succeed | Self::Fail | Self::Release => "running",
-            Self::Cancel => "queued or running",
-            Self::Resume => "failed or cancelled",
-        }
+        let [_, states] = self.texts();
+        states
     }
 }
 
@@ -114,14 +122,8 @@ impl fmt::Display for JobState {
 
 impl fmt::Display for JobTransition {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Self::Start => "start",
-            Self::Succeed => "succeed",
-            Self::Fail => "fail",
-            Self::Cancel => "be cancelled",
-            Self::Release => "be released",
-            Self::Resume => "be resumed",
-        })
+        let [event, _] = self.texts();
+        f.pad(event)
     }
 }
 

@@ -1,8 +1,9 @@
 //! The audit trail: who changed what and when.
 
+use serde::Deserialize;
 use tracing::info;
 
-use super::database::{DatabaseRow, DatabaseValue, Tx};
+use super::database::{Tx, Values, read_all, values};
 use super::{Store, StoreError, unix_s};
 use foreframe_core::types::DatasetName;
 
@@ -10,7 +11,7 @@ use foreframe_core::types::DatasetName;
 const MAX_ROWS: i64 = 100_000;
 
 /// A change of state.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct AuditRow {
     /// Its number, from 1.
     pub number: i64,
@@ -87,19 +88,14 @@ impl Change {
     pub(super) async fn commit(self, mut tx: Tx) -> Result<(), StoreError> {
         let Self { who, action, target } = self;
         // Locked until the commit, so that the numbers are in the order of the commits.
-        tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'audit'", vec![])
-            .await?;
+        let sql = "UPDATE counters SET value = value + 1 WHERE name = 'audit'";
+        tx.execute(sql, values![]).await?;
         let sql = "INSERT INTO audit (number, time_s, who, action, target) \
              SELECT value, $1, $2, $3, $4 FROM counters WHERE name = 'audit'";
-        let values = vec![
-            unix_s().into(),
-            who.as_str().into(),
-            action.into(),
-            target.as_str().into(),
-        ];
-        tx.execute(sql, values).await?;
+        tx.execute(sql, values![unix_s(), who.as_str(), action, target.as_str()])
+            .await?;
         let sql = "DELETE FROM audit WHERE number <= (SELECT value FROM counters WHERE name = 'audit') - $1";
-        tx.execute(sql, vec![MAX_ROWS.into()]).await?;
+        tx.execute(sql, values![MAX_ROWS]).await?;
         tx.commit().await?;
         info!(
             audit.who = who,
@@ -116,7 +112,7 @@ impl Store {
     pub(super) async fn execute_recorded(
         &self,
         sql: &'static str,
-        values: Vec<DatabaseValue>,
+        values: Values,
         change: Change,
     ) -> Result<bool, StoreError> {
         let mut tx = self.database.begin().await?;
@@ -143,17 +139,6 @@ impl Store {
     pub async fn audit(&self, before: Option<i64>, limit: i64) -> Result<Vec<AuditRow>, StoreError> {
         let sql = "SELECT audit.*, api_keys.name AS name FROM audit LEFT JOIN api_keys ON api_keys.id = audit.who \
              WHERE CAST($1 AS BIGINT) IS NULL OR number < $1 ORDER BY number DESC LIMIT $2";
-        let rows = self.database.fetch(sql, vec![before.into(), limit.into()]).await?;
-        let row = |row: &DatabaseRow| {
-            Ok(AuditRow {
-                number: row.get("number")?,
-                time_s: row.get("time_s")?,
-                who: row.get("who")?,
-                name: row.get("name")?,
-                action: row.get("action")?,
-                target: row.get("target")?,
-            })
-        };
-        rows.iter().map(row).collect()
+        read_all(self.database.fetch(sql, values![before, limit]).await?)
     }
 }

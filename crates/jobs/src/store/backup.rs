@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{self, Read as _, Write as _};
+use std::io;
 use std::path::{Component, Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -27,18 +27,14 @@ const ROUNDS: usize = 5;
 /// How often the files are listed until two lists are equal.
 const LISTS: usize = 100;
 const LIST_AGAIN_AFTER: Duration = Duration::from_millis(50);
-const BUFFER_BYTES: usize = 1 << 20;
 
 /// Why a backup could not be written or restored.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum BackupError {
     /// The directory holds files.
-    #[error("{} is not empty; name a new directory", path.display())]
-    NotEmpty {
-        /// The directory.
-        path: PathBuf,
-    },
+    #[error("{} is not empty; name a new directory", .0.display())]
+    NotEmpty(PathBuf),
     /// The backup would contain itself.
     #[error("{} is in the data directory {}; name a directory outside of it", path.display(), data_dir.display())]
     Inside {
@@ -56,37 +52,18 @@ pub enum BackupError {
         reason: String,
     },
     /// A file of the backup is not as it was written.
-    #[error("{} is damaged or missing; restore another backup", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-    },
+    #[error("{} is damaged or missing; restore another backup", .0.display())]
+    Damaged(PathBuf),
     /// The backup holds SQLite's database, but the settings name PostgreSQL.
     #[error("the backup holds an SQLite database, but database_url names PostgreSQL; restore it without database_url")]
     OtherDatabase,
-    /// Another process restores into the directory.
-    #[error("another restore into {} is running; wait for its end", data_dir.display())]
-    Restoring {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
-    /// Files were deleted each time while they were copied.
-    #[error("files in {} are being deleted all the time; try again later", data_dir.display())]
-    Unstable {
-        /// The data directory.
-        data_dir: PathBuf,
-    },
-    /// A file could not be read or written.
-    #[error("could not {action} {}: {source}", path.display())]
-    Io {
-        /// `read`, `write`, …
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The database could not be copied.
+    /// Another process restores into this data directory.
+    #[error("another restore into {} is running; wait for its end", .0.display())]
+    Restoring(PathBuf),
+    /// Files of this data directory were deleted each time while they were copied.
+    #[error("files in {} are being deleted all the time; try again later", .0.display())]
+    Unstable(PathBuf),
+    /// The database could not be copied, or a file could not be read or written.
     #[error(transparent)]
     Store(#[from] StoreError),
 }
@@ -96,19 +73,19 @@ impl HasErrorKind for BackupError {
         match self {
             Self::NoBackup { .. } => ErrorKind::NotFound,
             Self::Inside { .. } | Self::OtherDatabase => ErrorKind::Usage,
-            Self::NotEmpty { .. } | Self::Restoring { .. } => ErrorKind::Conflict,
-            Self::Damaged { .. } => ErrorKind::Unusable,
-            Self::Unstable { .. } => ErrorKind::Busy,
+            Self::NotEmpty(_) | Self::Restoring(_) => ErrorKind::Conflict,
+            Self::Damaged(_) => ErrorKind::Unusable,
+            Self::Unstable(_) => ErrorKind::Busy,
+            Self::Store(StoreError::Io { .. }) => ErrorKind::Internal,
             Self::Store(error) => error.kind().of_own_data(),
-            Self::Io { .. } => ErrorKind::Internal,
         }
     }
 }
 
 impl BackupError {
     pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self + use<> {
-        let path = path.to_owned();
-        move |source| Self::Io { action, path, source }
+        let failed = StoreError::io(action, path);
+        move |source| Self::Store(failed(source))
     }
 }
 
@@ -157,7 +134,7 @@ impl Store {
             return Err(BackupError::Inside { path, data_dir });
         }
         if !is_empty_but(to, |_| false)? {
-            return Err(BackupError::NotEmpty { path: to.to_owned() });
+            return Err(BackupError::NotEmpty(to.to_owned()));
         }
         let mut copied = Copied::default();
         for _ in 0..ROUNDS {
@@ -169,16 +146,24 @@ impl Store {
             if !files.is_subset(&listed_files(data_dir)?) {
                 continue;
             }
-            let mut index = copied.into_index(has_database);
+            let mut files = copied.into_files();
             if has_database {
-                sync(&database)?;
-                let file = hash(&database)?;
-                index.files.insert(DATABASE_FILE.to_owned(), file);
+                let synced = File::open(&database).and_then(|file| file.sync_all());
+                let hashed = synced.and_then(|()| hash(&database));
+                let file = hashed.map_err(BackupError::io("read", &database))?;
+                files.insert(DATABASE_FILE.to_owned(), file);
             }
+            let index = BackupIndex {
+                format: FORMAT,
+                program: env!("CARGO_PKG_VERSION").to_owned(),
+                created_unix_s: unix_s(),
+                has_database,
+                files,
+            };
             write_index(to, &index)?;
             return Ok(index);
         }
-        Err(unstable(data_dir))
+        Err(BackupError::Unstable(data_dir.to_owned()))
     }
 }
 
@@ -189,11 +174,9 @@ struct Copied(BTreeMap<PathBuf, (SystemTime, BackupFile)>);
 impl Copied {
     /// Copies what is new or has changed, and deletes what has disappeared.
     fn update(&mut self, from: &Path, to: &Path, files: &BTreeSet<PathBuf>) -> Result<(), BackupError> {
-        let gone: Vec<PathBuf> = self.0.keys().filter(|file| !files.contains(*file)).cloned().collect();
-        for file in gone {
-            let path = to.join(&file);
+        for (file, _) in self.0.extract_if(.., |file, _| !files.contains(file)) {
+            let path = to.join(file);
             std::fs::remove_file(&path).map_err(BackupError::io("delete", &path))?;
-            self.0.remove(&file);
         }
         for file in files {
             let source = from.join(file);
@@ -213,19 +196,10 @@ impl Copied {
         Ok(())
     }
 
-    fn into_index(self, has_database: bool) -> BackupIndex {
-        let name = |file: &Path| file.to_string_lossy().replace('\\', "/");
-        BackupIndex {
-            format: FORMAT,
-            program: env!("CARGO_PKG_VERSION").to_owned(),
-            created_unix_s: unix_s(),
-            has_database,
-            files: self
-                .0
-                .iter()
-                .map(|(file, (_, copied))| (name(file), copied.clone()))
-                .collect(),
-        }
+    /// The files by their names in the backup.
+    fn into_files(self) -> BTreeMap<String, BackupFile> {
+        let named = |(file, (_, copied)): (PathBuf, _)| (file.to_string_lossy().replace('\\', "/"), copied);
+        self.0.into_iter().map(named).collect()
     }
 }
 
@@ -241,7 +215,7 @@ async fn settled_files(data_dir: &Path) -> Result<BTreeSet<PathBuf>, BackupError
         before = now;
         tokio::time::sleep(LIST_AGAIN_AFTER).await;
     }
-    Err(unstable(data_dir))
+    Err(BackupError::Unstable(data_dir.to_owned()))
 }
 
 /// The files that belong to a backup, by their path below the data directory.
@@ -255,13 +229,7 @@ fn listed_files(data_dir: &Path) -> Result<BTreeSet<PathBuf>, BackupError> {
             return Ok(files.filter(|file| is_kept(file)).collect());
         }
     }
-    Err(unstable(data_dir))
-}
-
-fn unstable(data_dir: &Path) -> BackupError {
-    BackupError::Unstable {
-        data_dir: data_dir.to_owned(),
-    }
+    Err(BackupError::Unstable(data_dir.to_owned()))
 }
 
 /// Not the database, which is copied by itself, and not what belongs to a process.
@@ -281,13 +249,9 @@ pub(super) fn inside(dir: &Path, name: &str) -> Option<PathBuf> {
 
 /// Whether a directory holds nothing but what may be ignored.
 pub(super) fn is_empty_but(dir: &Path, is_ignored: impl Fn(&PathBuf) -> bool) -> Result<bool, BackupError> {
-    for entry in std::fs::read_dir(dir).map_err(BackupError::io("read", dir))? {
-        let path = entry.map_err(BackupError::io("read", dir))?.path();
-        if !is_ignored(&path) {
-            return Ok(false);
-        }
-    }
-    Ok(true)
+    let entries = std::fs::read_dir(dir).and_then(Iterator::collect::<io::Result<Vec<_>>>);
+    let entries = entries.map_err(BackupError::io("read", dir))?;
+    Ok(entries.iter().all(|entry| is_ignored(&entry.path())))
 }
 
 /// Copies a file, with its directory, and reports what was copied.
@@ -295,37 +259,16 @@ pub(super) fn copy(from: &Path, to: &Path) -> io::Result<BackupFile> {
     let mut source = File::open(from)?;
     std::fs::create_dir_all(to.parent().unwrap_or(to))?;
     let mut target = File::create(to)?;
-    let copied = hash_while(&mut source, |bytes| target.write_all(bytes))?;
+    io::copy(&mut source, &mut target)?;
     target.sync_all()?;
-    Ok(copied)
+    hash(to)
 }
 
-fn hash(path: &Path) -> Result<BackupFile, BackupError> {
-    let hashed = File::open(path).and_then(|mut file| hash_while(&mut file, |_| Ok(())));
-    hashed.map_err(BackupError::io("read", path))
-}
-
-fn hash_while(source: &mut File, mut take: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<BackupFile> {
-    let (mut digest, mut bytes, mut buffer) = (Sha256::new(), 0, vec![0; BUFFER_BYTES]);
-    loop {
-        let count = source.read(&mut buffer)?;
-        let read = buffer.get(..count).unwrap_or_default();
-        if read.is_empty() {
-            break;
-        }
-        digest.update(read);
-        take(read)?;
-        bytes += count as u64;
-    }
-    Ok(BackupFile {
-        bytes,
-        sha256: hex(&digest.finalize()),
-    })
-}
-
-fn sync(path: &Path) -> Result<(), BackupError> {
-    let synced = File::open(path).and_then(|file| file.sync_all());
-    synced.map_err(BackupError::io("write", path))
+fn hash(path: &Path) -> io::Result<BackupFile> {
+    let mut digest = Sha256::new();
+    let bytes = io::copy(&mut File::open(path)?, &mut digest)?;
+    let sha256 = hex(&digest.finalize());
+    Ok(BackupFile { bytes, sha256 })
 }
 
 fn write_index(to: &Path, index: &BackupIndex) -> Result<(), BackupError> {

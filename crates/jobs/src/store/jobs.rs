@@ -3,8 +3,10 @@
 //! A lease expires unless it is renewed. Each claim increments the row's fencing token, and every write names the token of
 //! its claim. So a worker whose lease expired cannot write any more.
 
+use serde::{Deserialize, Deserializer};
+
 use super::audit::Author;
-use super::database::{DatabaseRow, DatabaseValue, Tx};
+use super::database::{DatabaseRow, Tx, read_all, values};
 use super::job_id::JobId;
 use super::lease::Lease;
 use super::models::{PublishedVersion, version_id};
@@ -12,9 +14,10 @@ use super::reports::{JobReport, write_report};
 use super::{ModelMetrics, Store, StoreError};
 
 /// The row of a job. Structured values are JSON.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct JobRow {
     /// The job's id.
+    #[serde(rename = "number", deserialize_with = "job_id")]
     pub id: JobId,
     /// `collect`, `train`, …
     pub kind: String,
@@ -29,6 +32,7 @@ pub struct JobRow {
     /// Why it failed.
     pub error: Option<String>,
     /// Whether it is running and was asked to stop.
+    #[serde(deserialize_with = "flag")]
     pub cancelling: bool,
     /// When it was enqueued, in seconds since 1970.
     pub queued_s: f64,
@@ -46,26 +50,12 @@ pub struct JobRow {
     pub submitter: String,
 }
 
-impl JobRow {
-    fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
-        Ok(Self {
-            id: id_of(row)?,
-            kind: row.get("kind")?,
-            state: row.get("state")?,
-            spec: row.get("spec")?,
-            progress: row.get("progress")?,
-            outcome: row.get("outcome")?,
-            error: row.get("error")?,
-            cancelling: row.get::<i64>("cancelling")? != 0,
-            queued_s: row.get("queued_s")?,
-            started_s: row.get("started_s")?,
-            ended_s: row.get("ended_s")?,
-            token: row.get("token")?,
-            checkpoint: row.get("checkpoint")?,
-            stalled_attempts: row.get("stalled_attempts")?,
-            submitter: row.get("submitter")?,
-        })
-    }
+fn job_id<'de, D: Deserializer<'de>>(deserializer: D) -> Result<JobId, D::Error> {
+    i64::deserialize(deserializer).map(JobId::new)
+}
+
+fn flag<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
+    Ok(i64::deserialize(deserializer)? != 0)
 }
 
 /// A job to enqueue.
@@ -101,7 +91,7 @@ pub enum EnqueueResult {
 }
 
 /// How an attempt of a job ended.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct JobOutcome {
     /// The state that follows.
     pub state: &'static str,
@@ -120,7 +110,7 @@ pub struct JobOutcome {
 }
 
 /// How many jobs of a kind are in a state.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct JobCount {
     /// `collect`, `train`, …
     pub kind: String,
@@ -147,30 +137,21 @@ fn id_of(row: &DatabaseRow) -> Result<JobId, StoreError> {
     row.get("number").map(JobId::new)
 }
 
-/// Takes the lock for enqueueing.
-async fn lock(tx: &mut Tx) -> Result<(), StoreError> {
-    let sql = "UPDATE counters SET value = value WHERE name = 'job'";
-    tx.execute(sql, vec![]).await.map(drop)
-}
-
 /// Checks that the queue and the submitter's share of it have room, and that no queued or running job has the same output.
 async fn check_capacity(
     tx: &mut Tx,
-    makes: Option<&str>,
+    makes: Option<String>,
     submitter: &str,
     max_queued: i64,
     now_s: f64,
 ) -> Result<Option<EnqueueResult>, StoreError> {
     // In SQL nothing equals NULL, so a job without an exclusive output never conflicts.
     let sql = "SELECT number FROM jobs WHERE makes = $1 AND state IN ('queued', 'running')";
-    if !tx.fetch(sql, vec![makes.into()]).await?.is_empty() {
+    if tx.first(sql, values![makes]).await?.is_some() {
         return Ok(Some(EnqueueResult::Taken));
     }
-    let queued = tx
-        .fetch("SELECT number FROM jobs WHERE state = 'queued'", vec![])
-        .await?
-        .len();
-    if queued as i64 >= max_queued {
+    let sql = "SELECT number FROM jobs WHERE state = 'queued'";
+    if tx.fetch(sql, values![]).await?.len() as i64 >= max_queued {
         return Ok(Some(EnqueueResult::Full));
     }
     if submitter.is_empty() {
@@ -178,48 +159,38 @@ async fn check_capacity(
     }
     let sql = "SELECT COUNT(*) AS keys, (SELECT COUNT(*) FROM jobs WHERE submitter = $1 AND state = 'queued') AS queued \
          FROM api_keys WHERE revoked_s IS NULL AND scope <> 'predict' AND (expires_s IS NULL OR expires_s > $2)";
-    let rows = tx.fetch(sql, vec![submitter.into(), now_s.into()]).await?;
-    let Some(row) = rows.first() else { return Ok(None) };
+    let Some(row) = tx.first(sql, values![submitter, now_s]).await? else {
+        return Ok(None);
+    };
     let (keys, queued): (i64, i64) = (row.get("keys")?, row.get("queued")?);
     // Equal shares of all keys that can submit jobs, rounded up.
     let share = (max_queued + keys - 1) / keys.max(1);
     Ok((queued >= share.max(1)).then_some(EnqueueResult::ShareFull(share.max(1))))
 }
 
-fn first_job(rows: &[DatabaseRow]) -> Result<Option<JobRow>, StoreError> {
-    rows.first().map(JobRow::of).transpose()
-}
-
 impl Store {
     /// Enqueues a job unless the queue is full. `now_s`: see [`Store::now_s`]. Errors: `Query`.
     pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<EnqueueResult, StoreError> {
         let mut tx = self.database.begin().await?;
-        lock(&mut tx).await?;
+        tx.lock_numbers().await?;
         if let Some(key) = &new.idempotency_key {
             let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
-            if let Some(row) = first_job(&tx.fetch(sql, vec![key.as_str().into()]).await?)? {
-                return Ok(EnqueueResult::Same(row));
+            if let Some(row) = tx.first(sql, values![key.as_str()]).await? {
+                return row.read().map(EnqueueResult::Same);
             }
         }
-        let output = new.exclusive_output.as_deref();
+        let output = new.exclusive_output.clone();
         if let Some(refused) = check_capacity(&mut tx, output, &new.submitter, max_queued, now_s).await? {
             return Ok(refused);
         }
-        tx.execute("UPDATE counters SET value = value + 1 WHERE name = 'job'", vec![])
-            .await?;
+        let sql = "UPDATE counters SET value = value + 1 WHERE name = 'job'";
+        tx.execute(sql, values![]).await?;
         let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s, submitter) \
              SELECT value, $1, $2, 'queued', $3, $4, $5, $6, $7 FROM counters WHERE name = 'job' RETURNING *";
-        let values: Vec<DatabaseValue> = vec![
-            new.kind.into(),
-            new.exclusive_output.into(),
-            new.spec.into(),
-            new.progress.into(),
-            new.idempotency_key.into(),
-            now_s.into(),
-            new.submitter.into(),
-        ];
-        let row = first_job(&tx.fetch(sql, values).await?)?;
-        let row = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?;
+        let (output, key) = (new.exclusive_output, new.idempotency_key);
+        let values = values![new.kind, output, new.spec, new.progress, key, now_s, new.submitter];
+        let row = tx.first(sql, values).await?;
+        let row: JobRow = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?.read()?;
         let change = Author::of_key(&row.submitter).change("job.create", row.id);
         change.commit(tx).await?;
         Ok(EnqueueResult::New(row))
@@ -229,19 +200,19 @@ impl Store {
     pub async fn requeue(&self, id: JobId, max_queued: i64, by: &Author) -> Result<Option<EnqueueResult>, StoreError> {
         let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;
-        lock(&mut tx).await?;
+        tx.lock_numbers().await?;
         let sql = "SELECT makes, submitter FROM jobs WHERE number = $1 AND state IN ('failed', 'cancelled')";
-        let rows = tx.fetch(sql, vec![id.into()]).await?;
-        let Some(row) = rows.first() else { return Ok(None) };
-        let (makes, submitter): (Option<String>, String) = (row.get("makes")?, row.get("submitter")?);
-        if let Some(refused) = check_capacity(&mut tx, makes.as_deref(), &submitter, max_queued, now_s).await? {
+        let Some(row) = tx.first(sql, values![id]).await? else {
+            return Ok(None);
+        };
+        let submitter: String = row.get("submitter")?;
+        if let Some(refused) = check_capacity(&mut tx, row.get("makes")?, &submitter, max_queued, now_s).await? {
             return Ok(Some(refused));
         }
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
              stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
-        let row = first_job(&tx.fetch(sql, vec![id.into()]).await?)?;
-        let change = by.change("job.resume", id);
-        change.commit(tx).await?;
+        let row = tx.first(sql, values![id]).await?.map(DatabaseRow::read).transpose()?;
+        by.change("job.resume", id).commit(tx).await?;
         Ok(row.map(EnqueueResult::New))
     }
 
@@ -251,20 +222,20 @@ impl Store {
         let sql = "DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND number IN (SELECT number \
              FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') ORDER BY ended_s DESC, number DESC \
              LIMIT 1000000 OFFSET $1) RETURNING number";
-        let rows = self.database.fetch(sql, vec![keep.into()]).await?;
+        let rows = self.database.fetch(sql, values![keep]).await?;
         rows.iter().map(id_of).collect()
     }
 
     /// One job. Errors: `Query`.
     pub async fn job(&self, id: JobId) -> Result<Option<JobRow>, StoreError> {
         let sql = "SELECT * FROM jobs WHERE number = $1";
-        first_job(&self.database.fetch(sql, vec![id.into()]).await?)
+        self.database.read_first(sql, values![id]).await
     }
 
     /// The job that was enqueued with that idempotency key. Errors: `Query`.
     pub async fn job_of_key(&self, key: &str) -> Result<Option<JobRow>, StoreError> {
         let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
-        first_job(&self.database.fetch(sql, vec![key.into()]).await?)
+        self.database.read_first(sql, values![key]).await
     }
 
     /// Jobs, the newest first. Errors: `Query`.
@@ -272,28 +243,14 @@ impl Store {
         let sql = "SELECT * FROM jobs WHERE (CAST($1 AS TEXT) IS NULL OR kind = $1) \
              AND (CAST($2 AS TEXT) IS NULL OR state = $2) AND (CAST($3 AS BIGINT) IS NULL OR number < $3) \
              ORDER BY number DESC LIMIT $4";
-        let values = vec![
-            page.kind.into(),
-            page.state.into(),
-            page.before.map(JobId::number).into(),
-            page.limit.into(),
-        ];
-        let rows = self.database.fetch(sql, values).await?;
-        rows.iter().map(JobRow::of).collect()
+        let values = values![page.kind, page.state, page.before.map(JobId::number), page.limit];
+        read_all(self.database.fetch(sql, values).await?)
     }
 
     /// The number of jobs of each kind and state, without zeros. Errors: `Query`.
     pub async fn count_jobs(&self) -> Result<Vec<JobCount>, StoreError> {
         let sql = "SELECT kind, state, COUNT(*) AS jobs FROM jobs GROUP BY kind, state";
-        let rows = self.database.fetch(sql, vec![]).await?;
-        let count = |row: &DatabaseRow| {
-            Ok(JobCount {
-                kind: row.get("kind")?,
-                state: row.get("state")?,
-                jobs: row.get("jobs")?,
-            })
-        };
-        rows.iter().map(count).collect()
+        read_all(self.database.fetch(sql, values![]).await?)
     }
 
     /// Claims a job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest
@@ -312,29 +269,26 @@ impl Store {
              AND other.state = 'running' AND other.lease_until_s >= $1), \
              (SELECT COALESCE(MAX(other.claimed_s), 0) FROM jobs AS other WHERE other.submitter = jobs.submitter), \
              number LIMIT 1";
-        let rows = tx.fetch_free(sql, vec![now_s.into()]).await?;
-        let Some(row) = rows.first() else { return Ok(None) };
-        let id = id_of(row)?;
+        let Some(row) = tx.first_free(sql, values![now_s]).await? else {
+            return Ok(None);
+        };
         let sql = "UPDATE jobs SET state = 'running', owner = $2, lease_until_s = $3, token = token + 1, \
              claimed_checkpoint = checkpoint, stalled_attempts = CASE \
              WHEN state = 'queued' OR claimed_checkpoint < 0 THEN stalled_attempts WHEN checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + 1 END, \
              started_s = COALESCE(started_s, $4), claimed_s = $4 WHERE number = $1 RETURNING *";
-        let values = vec![id.into(), owner.into(), until_s.into(), now_s.into()];
-        let row = first_job(&tx.fetch(sql, values).await?)?;
+        let row = tx.first(sql, values![id_of(&row)?, owner, until_s, now_s]).await?;
+        let row = row.map(DatabaseRow::read::<JobRow>).transpose()?;
         tx.commit().await?;
         Ok(row.map(|row| {
-            let lease = Lease {
-                job: row.id,
-                token: row.token,
-            };
-            (row, lease)
+            let (job, token) = (row.id, row.token);
+            (row, Lease { job, token })
         }))
     }
 
     /// Expires all leases of an owner. The caller must know that the owner has ended. Errors: `Query`.
     pub async fn release_leases(&self, owner: &str) -> Result<u64, StoreError> {
         let sql = "UPDATE jobs SET lease_until_s = 0 WHERE state = 'running' AND owner = $1";
-        self.database.execute(sql, vec![owner.into()]).await
+        self.database.execute(sql, values![owner]).await
     }
 
     /// Renews a lease and writes the report. Returns whether the job was asked to stop; if the lease is lost, writes nothing
@@ -350,15 +304,11 @@ impl Store {
         let sql = "UPDATE jobs SET lease_until_s = $3, progress = $4, \
              checkpoint = CASE WHEN $5 > checkpoint THEN $5 ELSE checkpoint END \
              WHERE number = $1 AND token = $2 AND state = 'running' RETURNING cancelling";
-        let values = vec![
-            lease.job.into(),
-            lease.token.into(),
-            until_s.into(),
-            report.progress.as_str().into(),
-            report.checkpoint.into(),
-        ];
-        let rows = tx.fetch(sql, values).await?;
-        let Some(row) = rows.first() else { return Ok(None) };
+        let progress = report.progress.as_str();
+        let values = values![lease.job, lease.token, until_s, progress, report.checkpoint];
+        let Some(row) = tx.first(sql, values).await? else {
+            return Ok(None);
+        };
         let cancelling = row.get::<i64>("cancelling")? != 0;
         write_report(&mut tx, lease.job, report).await?;
         tx.commit().await?;
@@ -368,8 +318,10 @@ impl Store {
     /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
     pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
         let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";
-        let values = vec![lease.job.into(), lease.token.into()];
-        self.database.execute(sql, values).await.map(drop)
+        self.database
+            .execute(sql, values![lease.job, lease.token])
+            .await
+            .map(drop)
     }
 
     /// Writes the outcome of an attempt. If the lease is lost, writes nothing and returns false. Errors: `Query`.
@@ -381,36 +333,33 @@ impl Store {
              stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
              WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
              owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running' RETURNING submitter";
-        let values = vec![
-            lease.job.into(),
-            lease.token.into(),
-            outcome.state.into(),
-            outcome.error.into(),
-            outcome.outcome.into(),
-            outcome.ended_s.into(),
-            report.progress.as_str().into(),
-            report.checkpoint.into(),
-            i64::from(outcome.crashed).into(),
+        let values = values![
+            lease.job,
+            lease.token,
+            outcome.state,
+            outcome.error,
+            outcome.outcome,
+            outcome.ended_s,
+            report.progress.as_str(),
+            report.checkpoint,
+            i64::from(outcome.crashed)
         ];
-        let rows = tx.fetch(sql, values).await?;
-        let Some(row) = rows.first() else {
+        let Some(row) = tx.first(sql, values).await? else {
             return Ok(false);
         };
-        let mut change = None;
-        if let Some(published) = &outcome.published {
-            let now_s = outcome.ended_s.unwrap_or_default();
-            super::models::write_published(&mut tx, published, now_s).await?;
-            let by = Author::of_key(&row.get::<String>("submitter")?);
-            change = Some(by.change("version.publish", version_id(&published.model, published.version)));
-        }
+        let now_s = outcome.ended_s.unwrap_or_default();
         if let Some(measured) = outcome.measured {
-            super::models::write_metrics(&mut tx, measured, outcome.ended_s.unwrap_or_default()).await?;
+            super::models::write_metrics(&mut tx, measured, now_s).await?;
         }
         write_report(&mut tx, lease.job, report).await?;
-        match change {
-            Some(change) => change.commit(tx).await?,
-            None => tx.commit().await?,
-        }
+        let Some(published) = outcome.published else {
+            tx.commit().await?;
+            return Ok(true);
+        };
+        super::models::write_published(&mut tx, &published, now_s).await?;
+        let by = Author::of_key(&row.get::<String>("submitter")?);
+        let change = by.change("version.publish", version_id(&published.model, published.version));
+        change.commit(tx).await?;
         Ok(true)
     }
 
@@ -418,17 +367,17 @@ impl Store {
     pub async fn cancel_queued(&self, id: JobId, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET state = 'cancelled', ended_s = $2 WHERE number = $1 AND state = 'queued'";
         let change = by.change("job.cancel", id);
-        self.execute_recorded(sql, vec![id.into(), now_s.into()], change).await
+        self.execute_recorded(sql, values![id, now_s], change).await
     }
 
     /// Asks a running job to stop, if it was not asked before. Returns whether it is running. Errors: `Query`.
     pub async fn ask_to_cancel(&self, id: JobId, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE jobs SET cancelling = 1 WHERE number = $1 AND state = 'running' AND cancelling = 0";
         let change = by.change("job.cancel", id);
-        if self.execute_recorded(sql, vec![id.into()], change).await? {
+        if self.execute_recorded(sql, values![id], change).await? {
             return Ok(true);
         }
-        let sql = "SELECT 1 FROM jobs WHERE number = $1 AND state = 'running'";
-        Ok(!self.database.fetch(sql, vec![id.into()]).await?.is_empty())
+        let sql = "SELECT number FROM jobs WHERE number = $1 AND state = 'running'";
+        Ok(self.database.first(sql, values![id]).await?.is_some())
     }
 }

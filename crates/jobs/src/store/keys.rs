@@ -3,12 +3,15 @@
 use std::fmt;
 use std::str::FromStr;
 
+use serde::Deserialize;
+
 use super::audit::Author;
-use super::database::DatabaseRow;
+use super::database::{read_all, values};
 use super::{Store, StoreError};
 
 /// What a key allows. Each scope includes those before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum KeyScope {
     /// Predictions, sessions, streams and environments; reading the models.
     Predict,
@@ -50,7 +53,7 @@ impl FromStr for KeyScope {
 }
 
 /// The row of an API key.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct KeyRow {
     /// Its public part.
     pub id: String,
@@ -71,22 +74,6 @@ pub struct KeyRow {
 }
 
 impl KeyRow {
-    fn of(row: &DatabaseRow) -> Result<Self, StoreError> {
-        let scope: String = row.get("scope")?;
-        Ok(Self {
-            id: row.get("id")?,
-            name: row.get("name")?,
-            hash: row.get("hash")?,
-            created_s: row.get("created_s")?,
-            revoked_s: row.get("revoked_s")?,
-            scope: scope
-                .parse()
-                .map_err(|error: String| StoreError::Query(sqlx::Error::Decode(error.into())))?,
-            expires_s: row.get("expires_s")?,
-            requests_per_s: row.get("requests_per_s")?,
-        })
-    }
-
     /// Whether requests with it are accepted at that time.
     #[must_use]
     pub fn is_valid(&self, now_s: f64) -> bool {
@@ -95,35 +82,21 @@ impl KeyRow {
 }
 
 impl Store {
-    /// Adds a key that allows everything. Errors: `Query`, also if the id exists.
-    pub async fn create_key(&self, id: &str, name: &str, hash: &str, created_s: f64) -> Result<(), StoreError> {
-        let key = KeyRow {
-            id: id.to_owned(),
-            name: name.to_owned(),
-            hash: hash.to_owned(),
-            created_s,
-            revoked_s: None,
-            scope: KeyScope::Admin,
-            expires_s: None,
-            requests_per_s: None,
-        };
-        self.add_key(key, &Author::CommandLine).await
-    }
-
     /// Adds a key. Errors: `Query`, also if the id exists.
     pub async fn add_key(&self, key: KeyRow, by: &Author) -> Result<(), StoreError> {
         self.mark_keys_created()?;
         let sql = "INSERT INTO api_keys (id, name, hash, created_s, scope, expires_s, requests_per_s) \
              VALUES ($1, $2, $3, $4, $5, $6, $7)";
         let change = by.change("key.create", key.id.as_str());
-        let values = vec![
-            key.id.into(),
-            key.name.into(),
-            key.hash.into(),
-            key.created_s.into(),
-            key.scope.name().into(),
-            key.expires_s.into(),
-            key.requests_per_s.into(),
+        let (scope, expires_s) = (key.scope.name(), key.expires_s);
+        let values = values![
+            key.id,
+            key.name,
+            key.hash,
+            key.created_s,
+            scope,
+            expires_s,
+            key.requests_per_s
         ];
         self.execute_recorded(sql, values, change).await.map(drop)
     }
@@ -131,25 +104,18 @@ impl Store {
     /// All keys, also revoked ones, the oldest first. Errors: `Query`.
     pub async fn list_keys(&self) -> Result<Vec<KeyRow>, StoreError> {
         let sql = "SELECT * FROM api_keys ORDER BY created_s, id";
-        let rows = self.database.fetch(sql, vec![]).await?;
+        let rows = self.database.fetch(sql, values![]).await?;
         // Also of keys that another machine or an older program created.
         if !rows.is_empty() {
             self.mark_keys_created()?;
         }
-        rows.iter().map(KeyRow::of).collect()
-    }
-
-    /// A key, revoked or not. Errors: `Query`.
-    pub async fn find_key(&self, id: &str) -> Result<Option<KeyRow>, StoreError> {
-        let sql = "SELECT * FROM api_keys WHERE id = $1";
-        let rows = self.database.fetch(sql, vec![id.into()]).await?;
-        rows.first().map(KeyRow::of).transpose()
+        read_all(rows)
     }
 
     /// Revokes a key. Returns false if there is no such key or it was already revoked. Errors: `Query`.
     pub async fn revoke_key(&self, id: &str, now_s: f64, by: &Author) -> Result<bool, StoreError> {
         let sql = "UPDATE api_keys SET revoked_s = $2 WHERE id = $1 AND revoked_s IS NULL";
-        self.execute_recorded(sql, vec![id.into(), now_s.into()], by.change("key.revoke", id))
-            .await
+        let change = by.change("key.revoke", id);
+        self.execute_recorded(sql, values![id, now_s], change).await
     }
 }

@@ -3,13 +3,14 @@
 use serde::{Deserialize, Serialize};
 
 use super::audit::Author;
-use super::database::{DatabaseRow, Tx};
+use super::database::{DatabaseRow, Tx, read_all, values};
+use super::job_id::JobId;
 use super::lease::Lease;
 use super::{Store, StoreError};
 use foreframe_core::types::ModelName;
 
 /// A published version.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct VersionRow {
     /// The model's name.
     pub model: ModelName,
@@ -43,14 +44,8 @@ pub struct ModelMetrics {
     pub metrics: String,
 }
 
-fn version_of(row: &DatabaseRow) -> Result<u32, StoreError> {
-    let version: i64 = row.get("version")?;
-    u32::try_from(version).map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
-}
-
-fn model_of(row: &DatabaseRow) -> Result<ModelName, StoreError> {
-    let name = ModelName::try_from(row.get::<String>("model")?);
-    name.map_err(|error| StoreError::Query(sqlx::Error::Decode(error.into())))
+fn version_of(row: &DatabaseRow) -> Result<(ModelName, u32), StoreError> {
+    Ok((row.get("model")?, row.get("version")?))
 }
 
 impl Store {
@@ -66,35 +61,22 @@ impl Store {
         // Held until the commit, so that two jobs never reserve one number.
         let sql = "UPDATE counters SET value = value WHERE name = 'job' \
              AND EXISTS (SELECT 1 FROM jobs WHERE number = $1 AND token = $2 AND state = 'running')";
-        if tx.execute(sql, vec![lease.job.into(), lease.token.into()]).await? == 0 {
+        if tx.execute(sql, values![lease.job, lease.token]).await? == 0 {
             return Ok(None);
         }
         let sql = "SELECT version FROM model_versions WHERE job = $1";
-        if let Some(row) = tx.fetch(sql, vec![lease.job.into()]).await?.first() {
-            return version_of(row).map(Some);
+        if let Some(row) = tx.first(sql, values![lease.job]).await? {
+            return row.get("version").map(Some);
         }
-        let sql = "INSERT INTO model_versions (model, version, job) \
-             SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1, $3 \
-             FROM model_versions WHERE model = $1 RETURNING version";
-        let values = vec![model.into(), shipped.into(), lease.job.into()];
-        let rows = tx.fetch(sql, values).await?;
-        tx.commit().await?;
-        rows.first().map(version_of).transpose()
+        insert_next_version(tx, model, shipped, Some(lease.job)).await.map(Some)
     }
 
     /// The next version of a name, above `shipped`, for a model that no job trained. Errors: `Query`.
     pub async fn reserve_next_version(&self, model: &ModelName, shipped: u32) -> Result<u32, StoreError> {
         let mut tx = self.database.begin().await?;
         // The row is locked until the commit, so that a number is never given twice.
-        tx.execute("UPDATE counters SET value = value WHERE name = 'job'", vec![])
-            .await?;
-        let sql = "INSERT INTO model_versions (model, version) \
-             SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1 \
-             FROM model_versions WHERE model = $1 RETURNING version";
-        let rows = tx.fetch(sql, vec![model.into(), shipped.into()]).await?;
-        tx.commit().await?;
-        rows.first()
-            .map_or(Err(StoreError::Query(sqlx::Error::RowNotFound)), version_of)
+        tx.lock_numbers().await?;
+        insert_next_version(tx, model, shipped, None).await
     }
 
     /// Records that the files of a reserved version are there. Errors: `Query`.
@@ -106,7 +88,7 @@ impl Store {
         by: &Author,
     ) -> Result<(), StoreError> {
         let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
-        let values = vec![model.into(), version.into(), now_s.into()];
+        let values = values![model, version, now_s];
         let change = by.change("version.publish", version_id(model, version));
         self.execute_recorded(sql, values, change).await.map(drop)
     }
@@ -114,49 +96,32 @@ impl Store {
     /// Forgets which version of a model was chosen to serve. Errors: `Query`.
     pub async fn clear_active(&self, model: &ModelName) -> Result<(), StoreError> {
         let sql = "DELETE FROM active_versions WHERE model = $1";
-        self.database.execute(sql, vec![model.into()]).await.map(drop)
+        self.database.execute(sql, values![model]).await.map(drop)
     }
 
     /// All published versions that are not deleted, by name and number. Errors: `Query`.
     pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
         let sql = "SELECT model, version, published_s FROM model_versions \
              WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
-        let rows = self.database.fetch(sql, vec![]).await?;
-        let version = |row: &DatabaseRow| {
-            Ok(VersionRow {
-                model: model_of(row)?,
-                version: version_of(row)?,
-                published_s: row.get("published_s")?,
-            })
-        };
-        rows.iter().map(version).collect()
+        read_all(self.database.fetch(sql, values![]).await?)
     }
 
     /// All versions that were deleted, by name and number. Errors: `Query`.
     pub async fn deleted_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
         let sql = "SELECT model, version FROM model_versions WHERE deleted_s IS NOT NULL ORDER BY model, version";
-        let rows = self.database.fetch(sql, vec![]).await?;
-        rows.iter().map(|row| Ok((model_of(row)?, version_of(row)?))).collect()
+        let rows = self.database.fetch(sql, values![]).await?;
+        rows.iter().map(version_of).collect()
     }
 
     /// The active version of each model that has one. Errors: `Query`.
     pub async fn active_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
-        let rows = self.database.fetch("SELECT * FROM active_versions", vec![]).await?;
-        rows.iter().map(|row| Ok((model_of(row)?, version_of(row)?))).collect()
+        let rows = self.database.fetch("SELECT * FROM active_versions", values![]).await?;
+        rows.iter().map(version_of).collect()
     }
 
     /// The latest metrics of all versions that were evaluated. Errors: `Query`.
     pub async fn model_metrics(&self) -> Result<Vec<ModelMetrics>, StoreError> {
-        let rows = self.database.fetch("SELECT * FROM model_metrics", vec![]).await?;
-        let metrics = |row: &DatabaseRow| {
-            Ok(ModelMetrics {
-                model: model_of(row)?,
-                version: version_of(row)?,
-                weights_sha256: row.get("weights_sha256")?,
-                metrics: row.get("metrics")?,
-            })
-        };
-        rows.iter().map(metrics).collect()
+        read_all(self.database.fetch("SELECT * FROM model_metrics", values![]).await?)
     }
 
     /// Makes a version active, if it is not. Errors: `Query`.
@@ -164,7 +129,7 @@ impl Store {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) \
              ON CONFLICT (model) DO UPDATE SET version = excluded.version, since_s = excluded.since_s \
              WHERE active_versions.version <> excluded.version";
-        let values = vec![model.into(), version.into(), now_s.into()];
+        let values = values![model, version, now_s];
         let change = by.change("version.activate", version_id(model, version));
         self.execute_recorded(sql, values, change).await.map(drop)
     }
@@ -180,10 +145,25 @@ impl Store {
         let sql = "UPDATE model_versions SET deleted_s = $3 WHERE model = $1 AND version = $2 \
              AND published_s IS NOT NULL AND deleted_s IS NULL \
              AND NOT EXISTS (SELECT 1 FROM active_versions WHERE model = $1 AND version = $2)";
-        let values = vec![model.into(), version.into(), now_s.into()];
+        let values = values![model, version, now_s];
         let change = by.change("version.delete", version_id(model, version));
         self.execute_recorded(sql, values, change).await
     }
+}
+
+/// Adds the next version of a model, above `shipped`, and commits the transaction, which holds the lock of the numbers.
+async fn insert_next_version(
+    mut tx: Tx,
+    model: &ModelName,
+    shipped: u32,
+    job: Option<JobId>,
+) -> Result<u32, StoreError> {
+    let sql = "INSERT INTO model_versions (model, version, job) \
+         SELECT $1, CASE WHEN COALESCE(MAX(version), 0) < $2 THEN $2 ELSE COALESCE(MAX(version), 0) END + 1, $3 \
+         FROM model_versions WHERE model = $1 RETURNING version";
+    let row = tx.first(sql, values![model, shipped, job.map(JobId::number)]).await?;
+    tx.commit().await?;
+    row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?.get("version")
 }
 
 /// A version in the audit trail.
@@ -193,11 +173,11 @@ pub(super) fn version_id(model: &ModelName, version: u32) -> String {
 
 pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, now_s: f64) -> Result<(), StoreError> {
     let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
-    let values = || vec![(&published.model).into(), published.version.into(), now_s.into()];
-    tx.execute(sql, values()).await?;
+    let values = values![&published.model, published.version, now_s];
+    tx.execute(sql, values.clone()).await?;
     if published.activates {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
-        tx.execute(sql, values()).await?;
+        tx.execute(sql, values).await?;
     }
     Ok(())
 }
@@ -207,12 +187,13 @@ pub(super) async fn write_metrics(tx: &mut Tx, measured: ModelMetrics, now_s: f6
     let sql = "INSERT INTO model_metrics (model, version, weights_sha256, metrics, measured_s) \
          VALUES ($1, $2, $3, $4, $5) ON CONFLICT (model, version) DO UPDATE SET \
          weights_sha256 = excluded.weights_sha256, metrics = excluded.metrics, measured_s = excluded.measured_s";
-    let values = vec![
-        (&measured.model).into(),
-        measured.version.into(),
-        measured.weights_sha256.into(),
-        measured.metrics.into(),
-        now_s.into(),
-    ];
-    tx.execute(sql, values).await.map(drop)
+    let ModelMetrics {
+        model,
+        version,
+        weights_sha256,
+        metrics,
+    } = measured;
+    tx.execute(sql, values![&model, version, weights_sha256, metrics, now_s])
+        .await
+        .map(drop)
 }

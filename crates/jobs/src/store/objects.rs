@@ -2,6 +2,7 @@
 //! directory. With a shared object store, directories are pushed to it and pulled from it under the same keys.
 
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -32,11 +33,7 @@ impl Objects {
             None => None,
             Some(url) if url.starts_with("s3://") => Some(bucket(url)?),
             Some(url) if url.contains("://") => {
-                return Err(StoreError::Url {
-                    flag: "objects",
-                    scheme: url.split("://").next().unwrap_or_default().chars().take(16).collect(),
-                    expected: "a directory or s3://BUCKET/PREFIX",
-                });
+                return Err(StoreError::url("objects", url, "a directory or s3://BUCKET/PREFIX"));
             }
             Some(dir) => Some(directory(Path::new(dir))?),
         };
@@ -116,11 +113,11 @@ impl Objects {
         if !found.iter().any(is_last) {
             return Ok(false);
         }
-        on_disk("list", &self.data_dir.join(dir), |dir| {
+        let clean = |dir: &Path| {
             remove_stale_partials(dir);
             Ok(())
-        })
-        .await?;
+        };
+        on_disk("list", &self.data_dir.join(dir), clean).await?;
         found.sort_by_key(is_last);
         for object in found {
             let path = self.data_dir.join(object.location.as_ref());
@@ -148,24 +145,17 @@ impl Objects {
             let path = self.data_dir.join(path);
             return none_if_missing(tokio::fs::read(&path).await).map_err(StoreError::io("read", &path));
         };
-        let key = Key::from(path);
-        match shared.head(&key).await {
-            Ok(object) => read(shared, &object).await.map(Some),
-            Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(error) => Err(failed("read", &key)(error)),
+        match head(shared, path, "read").await? {
+            Some(object) => read(shared, &object).await.map(Some),
+            None => Ok(None),
         }
     }
 
     /// Whether a file is in the object store. Errors: `Object`.
     pub async fn has(&self, path: &str) -> Result<bool, StoreError> {
-        let Some(shared) = &self.shared else {
-            return Ok(self.data_dir.join(path).is_file());
-        };
-        let key = Key::from(path);
-        match shared.head(&key).await {
-            Ok(_) => Ok(true),
-            Err(object_store::Error::NotFound { .. }) => Ok(false),
-            Err(error) => Err(failed("look for", &key)(error)),
+        match &self.shared {
+            Some(shared) => Ok(head(shared, path, "look for").await?.is_some()),
+            None => Ok(self.data_dir.join(path).is_file()),
         }
     }
 
@@ -196,10 +186,9 @@ impl Objects {
         let left = self.directories(parent).await?;
         for name in names {
             let dir = format!("{parent}/{name}");
+            on_disk("delete", &self.data_dir.join(&dir), remove_dir).await?;
             if left.contains(name) {
                 self.delete(&dir).await?;
-            } else {
-                on_disk("delete", &self.data_dir.join(&dir), remove_dir).await?;
             }
         }
         Ok(())
@@ -212,6 +201,20 @@ impl Objects {
         let prefix = Key::from(dir);
         let listed = shared.list(Some(&prefix)).try_collect();
         listed.await.map_err(failed("list", &prefix))
+    }
+}
+
+/// Describes the object of a path; `None` if it does not exist.
+async fn head(
+    shared: &Arc<dyn ObjectStore>,
+    path: &str,
+    action: &'static str,
+) -> Result<Option<ObjectMeta>, StoreError> {
+    let key = Key::from(path);
+    match shared.head(&key).await {
+        Ok(object) => Ok(Some(object)),
+        Err(object_store::Error::NotFound { .. }) => Ok(None),
+        Err(error) => Err(failed(action, &key)(error)),
     }
 }
 
@@ -231,7 +234,8 @@ async fn read(shared: &Arc<dyn ObjectStore>, object: &ObjectMeta) -> Result<Vec<
     }))
 }
 
-async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
+/// Writes a file, with its directory.
+pub(super) async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
     let written = on_disk("write", path, move |path| {
         std::fs::create_dir_all(path.parent().unwrap_or(path))?;
         write_atomically(path, &bytes)
@@ -240,7 +244,7 @@ async fn write(path: &Path, bytes: Vec<u8>) -> Result<(), StoreError> {
 }
 
 /// Does file work on a blocking thread.
-async fn on_disk<T: Send + 'static>(
+pub(super) async fn on_disk<T: Send + 'static>(
     action: &'static str,
     path: &Path,
     work: impl FnOnce(&Path) -> io::Result<T> + Send + 'static,
@@ -251,29 +255,20 @@ async fn on_disk<T: Send + 'static>(
         .map_err(StoreError::io(action, path))
 }
 
-fn failed(action: &'static str, key: &Key) -> impl FnOnce(object_store::Error) -> StoreError {
+fn failed(action: &'static str, key: &dyn Display) -> impl FnOnce(object_store::Error) -> StoreError + use<> {
     let key = key.to_string();
     move |source| StoreError::Object { action, key, source }
 }
 
 fn directory(dir: &Path) -> Result<Arc<dyn ObjectStore>, StoreError> {
     std::fs::create_dir_all(dir).map_err(StoreError::io("make", dir))?;
-    let store = LocalFileSystem::new_with_prefix(dir).map_err(|source| StoreError::Object {
-        action: "open",
-        key: dir.display().to_string(),
-        source,
-    })?;
+    let store = LocalFileSystem::new_with_prefix(dir).map_err(failed("open", &dir.display()))?;
     Ok(Arc::new(store.with_fsync(true).with_automatic_cleanup(true)))
 }
 
 /// Credentials, region and endpoint come from the environment, as for every S3 client.
 #[cfg(feature = "cloud")]
 fn bucket(url: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
-    let failed = |source| StoreError::Object {
-        action: "open",
-        key: url.to_owned(),
-        source,
-    };
     // A job waits for longer than that itself; a request gets 503.
     let retry = object_store::RetryConfig {
         max_retries: 5,
@@ -285,15 +280,12 @@ fn bucket(url: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
         .with_retry(retry)
         .build();
     let prefix = url.splitn(4, '/').nth(3).unwrap_or_default();
-    let prefixed = object_store::prefix::PrefixStore::new(bucket.map_err(failed)?, prefix);
+    let prefixed = object_store::prefix::PrefixStore::new(bucket.map_err(failed("open", &url))?, prefix);
     Ok(Arc::new(prefixed))
 }
 
 #[cfg(not(feature = "cloud"))]
-fn bucket(_: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
-    Err(StoreError::Url {
-        flag: "objects",
-        scheme: "s3".to_owned(),
-        expected: "a directory; this program was built without S3, which needs --features cloud",
-    })
+fn bucket(url: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
+    let expected = "a directory; this program was built without S3, which needs --features cloud";
+    Err(StoreError::url("objects", url, expected))
 }

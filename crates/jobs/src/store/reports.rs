@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::database::{DatabaseRow, Tx};
+use super::database::{Tx, read_all, values};
 use super::job_id::JobId;
 use super::{Store, StoreError};
 
@@ -20,7 +20,7 @@ pub struct LossRow {
 }
 
 /// A line of a job's log.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct LogRow {
     /// The line's number in its job, from 1.
     pub seq: i64,
@@ -49,31 +49,13 @@ impl Store {
     /// The lines of a job's log after line number `after`, the oldest first. Errors: `Query`.
     pub async fn job_log(&self, id: JobId, after: i64, limit: i64) -> Result<Vec<LogRow>, StoreError> {
         let sql = "SELECT * FROM job_logs WHERE job = $1 AND seq > $2 ORDER BY seq LIMIT $3";
-        let values = vec![id.into(), after.into(), limit.into()];
-        let rows = self.database.fetch(sql, values).await?;
-        let line = |row: &DatabaseRow| {
-            Ok(LogRow {
-                seq: row.get("seq")?,
-                time_s: row.get("time_s")?,
-                line: row.get("line")?,
-            })
-        };
-        rows.iter().map(line).collect()
+        read_all(self.database.fetch(sql, values![id, after, limit]).await?)
     }
 
     /// The points of a job's loss curves, in the order of the training. Errors: `Query`.
     pub async fn job_losses(&self, id: JobId) -> Result<Vec<LossRow>, StoreError> {
         let sql = "SELECT * FROM job_losses WHERE job = $1 ORDER BY stage, step";
-        let rows = self.database.fetch(sql, vec![id.into()]).await?;
-        let point = |row: &DatabaseRow| {
-            Ok(LossRow {
-                stage: row.get("stage")?,
-                step: row.get("step")?,
-                train: row.get("train")?,
-                validation: row.get("validation")?,
-            })
-        };
-        rows.iter().map(point).collect()
+        read_all(self.database.fetch(sql, values![id]).await?)
     }
 }
 
@@ -82,21 +64,15 @@ pub(super) async fn write_report(tx: &mut Tx, id: JobId, report: JobReport) -> R
     for (time_s, line) in report.lines {
         let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
              SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";
-        tx.execute(sql, vec![id.into(), time_s.into(), line.into()]).await?;
+        tx.execute(sql, values![id, time_s, line]).await?;
         let sql = "DELETE FROM job_logs WHERE job = $1 AND \
              seq <= (SELECT MAX(seq) FROM job_logs WHERE job = $1) - $2";
-        tx.execute(sql, vec![id.into(), report.max_lines.into()]).await?;
+        tx.execute(sql, values![id, report.max_lines]).await?;
     }
     for point in report.losses {
         let sql = "INSERT INTO job_losses (job, stage, step, train, validation) VALUES ($1, $2, $3, $4, $5) \
              ON CONFLICT (job, stage, step) DO UPDATE SET train = excluded.train, validation = excluded.validation";
-        let values = vec![
-            id.into(),
-            point.stage.into(),
-            point.step.into(),
-            point.train.into(),
-            point.validation.into(),
-        ];
+        let values = values![id, point.stage, point.step, point.train, point.validation];
         tx.execute(sql, values).await?;
     }
     Ok(())

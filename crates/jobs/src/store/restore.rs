@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::backup::{BackupError, BackupIndex, RESTORING, copy, inside, is_empty_but, no_backup, read_index};
-use super::database::Database;
 use super::{DATABASE_FILE, StoreConfig};
 use foreframe_core::files::{is_partial_of, none_if_missing, open_lock, remove_partials, try_lock, write_atomically};
 
@@ -20,10 +19,7 @@ const RESTORE_LOCK: &str = "restore.lock";
 pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupError> {
     let index = read_index(from)?;
     let data_dir = &config.data_dir;
-    let database = match &config.database {
-        None => Some(data_dir.join(DATABASE_FILE)),
-        Some(url) => Database::file_of(url)?,
-    };
+    let database = config.database_file()?;
     if index.has_database && database.is_none() {
         return Err(BackupError::OtherDatabase);
     }
@@ -38,7 +34,7 @@ pub fn restore(from: &Path, config: &StoreConfig) -> Result<BackupIndex, BackupE
         let (source, to) = places.ok_or_else(|| no_backup(from, "names a file outside of it"))?;
         let found = none_if_missing(copy(&source, &to)).map_err(BackupError::io("copy", &source))?;
         if found.as_ref() != Some(expected) {
-            return Err(BackupError::Damaged { path: source });
+            return Err(BackupError::Damaged(source));
         }
     }
     remove_partials(data_dir);
@@ -68,9 +64,7 @@ impl RestoreLock {
         let file = open_lock(&path).map_err(BackupError::io("open", &path))?;
         match try_lock(&file) {
             Ok(()) => Ok(Self { path, _file: file }),
-            Err(TryLockError::WouldBlock) => Err(BackupError::Restoring {
-                data_dir: data_dir.to_owned(),
-            }),
+            Err(TryLockError::WouldBlock) => Err(BackupError::Restoring(data_dir.to_owned())),
             Err(TryLockError::Error(source)) => Err(BackupError::io("lock", &path)(source)),
         }
     }
@@ -87,7 +81,7 @@ impl Drop for RestoreLock {
 /// Returns the marker. Errors: `NotEmpty`, `Io`.
 fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) -> Result<PathBuf, BackupError> {
     let marker = data_dir.join(RESTORING);
-    let is_taken = |path: &Path| BackupError::NotEmpty { path: path.to_owned() };
+    let is_taken = |path: &Path| BackupError::NotEmpty(path.to_owned());
     let is_begun = marker.exists();
     let text = none_if_missing(std::fs::read(&marker)).map_err(BackupError::io("read", &marker))?;
     // An empty marker: no file was copied yet. An older version's marker holds a sentence: its files are not known, and those
@@ -113,11 +107,7 @@ fn begin_restore(data_dir: &Path, database: Option<&Path>, index: &BackupIndex) 
     let stale: Vec<PathBuf> = unfinished.files.iter().filter_map(path_of).collect();
     let now = UnfinishedRestore {
         database: database.map(Path::to_owned),
-        files: unfinished
-            .files
-            .union(&index.files.keys().cloned().collect())
-            .cloned()
-            .collect(),
+        files: unfinished.files.iter().chain(index.files.keys()).cloned().collect(),
     };
     let text = serde_json::to_vec(&now).map_err(io::Error::other);
     let written = text.and_then(|text| write_atomically(&marker, &text));

@@ -10,7 +10,7 @@ use foreframe_core::types::ModelName;
 
 impl Versions {
     /// Publishes the model in a directory as the next version of a name, and returns the version. If it becomes the active
-    /// version, a running server of the same store serves it within seconds. Errors: `Registry`, `Io`, `Store`.
+    /// version, a running server of the same store serves it within seconds. Errors: `Registry`, `Store`.
     pub async fn publish(&self, model: &ModelName, trained_dir: &Path, activates: bool) -> Result<u32, VersionError> {
         registry::load(trained_dir)?;
         let shipped = self.shipped(model).unwrap_or(0);
@@ -38,11 +38,6 @@ impl Versions {
     /// active, if there is one. Returns the deleted versions. Errors: `Unknown`, `Active`, `Shipped`, `Store`.
     pub async fn remove(&self, model: &ModelName, version: Option<u32>) -> Result<Vec<u32>, VersionError> {
         let (known, shipped) = (self.of(model).await?, self.shipped(model));
-        let doomed: Vec<u32> = match version {
-            Some(version) => vec![version],
-            None => known.iter().copied().filter(|&known| shipped != Some(known)).collect(),
-        };
-        let of_model = |version| (model.clone(), version);
         if known.is_empty() {
             return Err(RegistryError::Unknown {
                 name: model.clone(),
@@ -51,22 +46,11 @@ impl Versions {
             }
             .into());
         }
-        for &version in &doomed {
-            let (model, version) = of_model(version);
-            if !known.contains(&version) {
-                return Err(VersionError::Unknown {
-                    model: model.to_string(),
-                    version,
-                    available: known,
-                });
-            }
-            if shipped == Some(version) {
-                return Err(VersionError::Shipped { model, version });
-            }
-        }
-        if let (true, Some(version)) = (doomed.is_empty(), shipped) {
-            let (model, version) = of_model(version);
-            return Err(VersionError::Shipped { model, version });
+        let published = known.iter().copied().filter(|&known| shipped != Some(known));
+        let doomed: Vec<u32> = version.map_or_else(|| published.collect(), |version| vec![version]);
+        // Without a published version, the shipped one is refused.
+        for &version in if doomed.is_empty() { &known } else { &doomed } {
+            self.check_removable(model, version, &known)?;
         }
         let by = Author::CommandLine;
         if version.is_none() {
@@ -76,11 +60,7 @@ impl Versions {
             }
         }
         for &version in &doomed {
-            if !self.store.delete_version(model, version, unix_s(), &by).await? {
-                let (model, version) = of_model(version);
-                return Err(VersionError::Active { model, version });
-            }
-            self.store.objects().delete(&key(model, version)).await?;
+            self.delete_published(model, version, &by).await?;
         }
         Ok(doomed)
     }

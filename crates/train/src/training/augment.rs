@@ -4,9 +4,9 @@
 use rand::Rng;
 
 use super::TrainError;
-use super::config::{DataConfig, Mirror, MirrorWord};
+use super::config::{DataConfig, Mirror};
 use foreframe_core::frame::warp::sample;
-use foreframe_core::types::{Channel, Seed};
+use foreframe_core::types::Seed;
 use foreframe_data::dataset::background::{Background, MAX_CHANGED_SHARE};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 
@@ -55,14 +55,9 @@ impl FramePart {
         let place = |index: usize, length: usize, at: f32| {
             at * (1.0 - self.side) * length as f32 + (index as f32 + 0.5) * self.side
         };
-        let grid: Vec<[f32; 2]> = (0..values.len())
-            .map(|index| {
-                [
-                    place(index % width, width, self.across),
-                    place(index / width, height, self.down),
-                ]
-            })
-            .collect();
+        let across = |index| place(index % width, width, self.across);
+        let down = |index| place(index / width, height, self.down);
+        let grid: Vec<[f32; 2]> = (0..values.len()).map(|index| [across(index), down(index)]).collect();
         values.copy_from_slice(&sample(values, width, height, &grid).0);
     }
 }
@@ -128,8 +123,8 @@ impl Augmentation {
         }
         Ok(Self {
             mirror: match &config.mirror {
-                Mirror::Word(MirrorWord::Off) => Mirroring::Nothing,
-                Mirror::Word(MirrorWord::Movers) => Mirroring::Movers(standing_background(dataset, frames)?),
+                Mirror::Off => Mirroring::Nothing,
+                Mirror::Movers => Mirroring::Movers(standing_background(dataset, frames)?),
                 Mirror::Channels(names) => Mirroring::Frames(signed_channels(names, info)?),
             },
             reverse: config.reverse,
@@ -144,11 +139,8 @@ impl Augmentation {
         if self.mirror == Mirroring::Nothing && !self.reverse && self.brightness == 0.0 && self.crop == 0.0 {
             return WindowChange::NONE;
         }
-        let mut rng = self
-            .seed
-            .derive("step", step as u64)
-            .derive("window", position as u64)
-            .rng();
+        let seed = self.seed.derive("step", step as u64).derive("window", position as u64);
+        let mut rng = seed.rng();
         let is_mirrored = rng.random::<bool>();
         WindowChange {
             is_frame_mirrored: is_mirrored && matches!(self.mirror, Mirroring::Frames(_)),
@@ -207,29 +199,22 @@ fn standing_background(dataset: &Dataset, frames: &[usize]) -> Result<Vec<u8>, T
 
 fn signed_channels(names: &[String], info: &DatasetInfo) -> Result<[Vec<usize>; 2], TrainError> {
     let kinds = [&info.action_channels, &info.state_channels];
-    let known = || -> Vec<&str> {
-        kinds
-            .iter()
-            .flat_map(|kind| kind.iter())
-            .map(|channel| channel.name.as_str())
-            .collect()
-    };
-    if let Some(name) = names.iter().find(|name| !known().contains(&name.as_str())) {
+    let known: Vec<&str> = kinds
+        .into_iter()
+        .flatten()
+        .map(|channel| channel.name.as_str())
+        .collect();
+    if let Some(name) = names.iter().find(|name| !known.contains(&name.as_str())) {
         return Err(TrainError::Config(format!(
             "data.mirror names {name:?}, which is no channel of this data set; there are: {}",
-            known().join(", ")
+            known.join(", ")
         )));
     }
-    let positions = |channels: &[Channel]| {
-        let is_named = |channel: &Channel| names.contains(&channel.name);
-        channels
-            .iter()
-            .enumerate()
-            .filter(|(_, channel)| is_named(channel))
-            .map(|(index, _)| index)
+    Ok(kinds.map(|channels| {
+        (0..channels.len())
+            .filter(|&at| names.contains(&channels[at].name))
             .collect()
-    };
-    Ok(kinds.map(|channels| positions(channels)))
+    }))
 }
 
 #[cfg(test)]

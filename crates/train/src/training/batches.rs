@@ -137,77 +137,49 @@ impl<'a> FrameSource<'a> {
         let inputs = |frames: &[(usize, WindowChange)]| self.preprocessed(self.preprocess, frames);
         let targets = |frames: &[(usize, WindowChange)]| self.preprocessed(self.target, frames);
         let (past, future) = (span(0, context), span(context, horizon));
+        // An action acts from its frame to the next one, so the action of the last input leads to the first target. Models with
+        // windows that are played backwards take no actions.
+        let (acting, last) = (span(context - 1, horizon), span(context - 1, 1));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
+        let future_inputs = with_future.then(|| inputs(&future)).transpose()?;
         Ok(WindowBatch {
             inputs: batched(inputs(&past)?, context)?,
             input_targets: batched(targets(&past)?, context)?,
-            future: with_future
-                .then(|| inputs(&future))
-                .transpose()?
-                .map(|f| batched(f, horizon))
-                .transpose()?,
+            future: future_inputs.map(|frames| batched(frames, horizon)).transpose()?,
             targets: batched(targets(&future)?, horizon)?,
-            condition: self.condition(windows, shape)?,
-            future_states: self.future_states(windows, shape)?,
+            condition: ConditioningTensors {
+                actions: self.channels(ACTION, &acting, &[windows.len(), horizon])?,
+                state: self.channels(STATE, &last, &[windows.len()])?,
+            },
+            future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
         })
     }
 
-    fn future_states(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<Option<Tensor>, TrainError> {
-        let states = self.dataset.info().state_channels.len();
-        if states == 0 {
+    /// The actions or states of frames as they are in the changed windows, `[B, channels]` or `[B, horizon, channels]`; `None`
+    /// where the data set has none.
+    fn channels(
+        &self,
+        kind: usize,
+        frames: &[(usize, WindowChange)],
+        shape: &[usize],
+    ) -> Result<Option<Tensor>, TrainError> {
+        let mut values = Vec::new();
+        for &(frame, change) in frames {
+            let from = values.len();
+            values.extend_from_slice(if kind == ACTION {
+                self.dataset.action(frame)
+            } else {
+                self.dataset.state(frame)
+            });
+            if change.is_frame_mirrored {
+                self.augmentation.turn_signs(kind, &mut values[from..]);
+            }
+        }
+        if values.is_empty() {
             return Ok(None);
         }
-        let mut values = Vec::with_capacity(windows.len() * shape.horizon * states);
-        for drawn in windows {
-            for place in shape.context..shape.frames() {
-                self.push(&mut values, STATE, (drawn.frame(place, shape), drawn.change));
-            }
-        }
-        let shape = (windows.len(), shape.horizon, states);
+        let shape = [shape, &[values.len() / frames.len()]].concat();
         Ok(Some(Tensor::from_vec(values, shape, &Device::Cpu)?))
-    }
-
-    /// Appends a frame's action or state as it is in the changed window.
-    fn push(&self, values: &mut Vec<f32>, kind: usize, (frame, change): (usize, WindowChange)) {
-        let from = values.len();
-        values.extend_from_slice(if kind == ACTION {
-            self.dataset.action(frame)
-        } else {
-            self.dataset.state(frame)
-        });
-        if change.is_frame_mirrored {
-            self.augmentation.turn_signs(kind, &mut values[from..]);
-        }
-    }
-
-    fn condition(&self, windows: &[DrawnWindow<'_>], shape: WindowShape) -> Result<ConditioningTensors, TrainError> {
-        let (actions, states) = (
-            self.dataset.info().action_channels.len(),
-            self.dataset.info().state_channels.len(),
-        );
-        let (mut future, mut present) = (Vec::new(), Vec::new());
-        for drawn in windows {
-            // An action acts from its frame to the next one, so the action of the last input leads to the first target. Models
-            // with windows that are played backwards take no actions.
-            let last = drawn.window.first_frame + shape.context - 1;
-            for frame in last..last + shape.horizon {
-                self.push(&mut future, ACTION, (frame, drawn.change));
-            }
-            self.push(
-                &mut present,
-                STATE,
-                (drawn.frame(shape.context - 1, shape), drawn.change),
-            );
-        }
-        let tensor = |values: Vec<f32>, shape: &[usize]| Tensor::from_vec(values, shape, &Device::Cpu);
-        Ok(ConditioningTensors {
-            actions: (actions > 0)
-                .then(|| tensor(future, &[windows.len(), shape.horizon, actions]))
-                .transpose()?,
-            state: (states > 0)
-                .then(|| tensor(present, &[windows.len(), states]))
-                .transpose()?,
-        })
     }
 }
 

@@ -1,6 +1,7 @@
 //! A run's directory: its configuration, and its last checkpoint in one safetensors file that is replaced atomically.
 
 use std::collections::{BTreeMap, HashMap};
+use std::error::Error;
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -12,7 +13,7 @@ use super::TrainError;
 use super::config::{RunConfig, TrainConfig};
 use super::observer::{Observer, TrainingEvent, TrainingStage};
 use super::optimizer::Optimizer;
-use super::state::{HistoryPoint, TrainState};
+use super::state::{TrainProgress, TrainState};
 use foreframe_core::files::{
     is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, try_lock, write_atomically,
 };
@@ -27,6 +28,12 @@ const HASH_LENGTH: usize = 64;
 /// Key of the training state in the file's metadata: the file's SHA-256, a space, and the state as JSON. The hash is computed
 /// with zeros in its own place. Both are in one entry, because the order of entries is random.
 const META_KEY: &str = "foreframe.training";
+/// Name of the file with the configuration.
+const CONFIG_FILE: &str = "config.toml";
+/// Name of the file with the loss curves.
+pub(super) const HISTORY_FILE: &str = "history.json";
+/// Name of the folder with the published model.
+pub(super) const MODEL_DIR: &str = "model";
 /// Name of the file with the hash of the training data.
 const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
@@ -49,25 +56,23 @@ impl RunFiles {
             config_text: config.to_toml()?,
             content_hash: content_hash.to_owned(),
         };
-        if files.config().is_file() && files.data().is_file() {
+        let (config, data) = (files.path(CONFIG_FILE), files.path(DATA_FILE));
+        if config.is_file() && data.is_file() {
             for (path, expected, what) in [
-                (files.config(), &files.config_text, "configuration"),
-                (files.data(), &files.content_hash, "data set"),
+                (&config, &files.config_text, "configuration"),
+                (&data, &files.content_hash, "data set"),
             ] {
-                let found = fs::read_to_string(&path).map_err(io_failed("read", &path))?;
+                let found = fs::read_to_string(path).map_err(io_failed("read", path))?;
                 if found.lines().any(|line| line == "[fit]") {
                     return Err(TrainError::RenamedSettings(run_dir.to_owned()));
                 }
                 if found != *expected {
-                    return Err(TrainError::OtherRun {
-                        run_dir: run_dir.to_owned(),
-                        what,
-                    });
+                    let run_dir = run_dir.to_owned();
+                    return Err(TrainError::OtherRun { run_dir, what });
                 }
             }
             return Ok(files);
         }
-        let (config, data) = (files.config(), files.data());
         let is_left_by_a_killed_start =
             |path: &Path| path == data || is_partial_of(&data, path) || is_partial_of(&config, path);
         let is_occupied = fs::read_dir(run_dir).is_ok_and(|mut entries| {
@@ -81,7 +86,7 @@ impl RunFiles {
 
     /// Creates the directory of a new run, if needed, and locks it until the returned file is dropped. Errors: `Busy`, `Io`.
     pub(super) fn lock(&self) -> Result<File, TrainError> {
-        let (config, data) = (self.config(), self.data());
+        let (config, data) = (self.path(CONFIG_FILE), self.path(DATA_FILE));
         if !config.is_file() {
             fs::create_dir_all(&self.run_dir).map_err(io_failed("create", &self.run_dir))?;
             write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
@@ -103,51 +108,23 @@ impl RunFiles {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
 
-    fn config(&self) -> PathBuf {
-        self.run_dir.join("config.toml")
-    }
-
-    fn data(&self) -> PathBuf {
-        self.run_dir.join(DATA_FILE)
-    }
-
-    /// The directory of the published model.
-    pub(super) fn model_dir(&self) -> PathBuf {
-        self.run_dir.join("model")
-    }
-
-    /// The file of the loss curves.
-    pub(super) fn history(&self) -> PathBuf {
-        self.run_dir.join("history.json")
-    }
-
-    fn checkpoint(&self) -> PathBuf {
-        self.run_dir.join(CHECKPOINT_FILE)
-    }
-
-    fn previous_checkpoint(&self) -> PathBuf {
-        self.run_dir.join(PREVIOUS_FILE)
+    /// The path of a file or folder of the run.
+    pub(super) fn path(&self, name: &str) -> PathBuf {
+        self.run_dir.join(name)
     }
 }
 
-fn io_failed(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> TrainError {
+pub(super) fn io_failed(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> TrainError + use<> {
     let path = path.to_owned();
-    move |source| TrainError::Io {
-        action,
-        path: path.clone(),
-        source,
-    }
+    move |source| TrainError::Io { action, path, source }
 }
 
 /// The training state without the tensors.
 #[derive(Serialize, Deserialize)]
 struct CheckpointMeta {
     fingerprint: String,
-    stage: TrainingStage,
-    step: usize,
-    best_step: usize,
-    best_loss: Option<f64>,
-    history: Vec<HistoryPoint>,
+    #[serde(flatten)]
+    progress: TrainProgress,
 }
 
 /// How far a training is. A later position is greater.
@@ -219,59 +196,51 @@ fn state_text(entry: &str) -> Option<&str> {
     entry.get(HASH_LENGTH + 1..)
 }
 
-/// A training state that was read from disk.
-pub(super) struct Checkpoint {
-    state: TrainState,
-}
-
-impl Checkpoint {
+impl RunFiles {
     /// Replaces the run's checkpoint with this state. Errors: `Io`, `Checkpoint`.
-    pub(super) fn save(files: &RunFiles, state: &TrainState) -> Result<(), TrainError> {
-        let path = files.checkpoint();
+    pub(super) fn save(&self, state: &TrainState) -> Result<(), TrainError> {
+        let path = self.path(CHECKPOINT_FILE);
+        let failed = |error: &dyn Error| unusable(&path, error.to_string());
         let meta = CheckpointMeta {
-            fingerprint: files.fingerprint().clone(),
-            stage: state.stage,
-            step: state.step,
-            best_step: state.best_step,
-            best_loss: state.best_loss,
-            history: state.history.clone(),
+            fingerprint: self.fingerprint(),
+            progress: state.progress.clone(),
         };
-        let failed = |reason: String| TrainError::Checkpoint {
-            path: path.clone(),
-            reason,
-        };
-        let text = serde_json::to_string(&meta).map_err(|error| failed(error.to_string()))?;
-        let prefixed = |prefix: &'static str, tensors: BTreeMap<String, Tensor>| {
-            tensors
-                .into_iter()
-                .map(move |(name, tensor)| (format!("{prefix}{name}"), tensor))
-        };
-        let tensors: BTreeMap<String, Tensor> = prefixed(PARAMETERS, state.parameters.snapshot()?)
-            .chain(prefixed(BEST, state.best.clone()))
-            .chain(prefixed(OPTIMIZER, state.optimizer.export()?))
+        let text = serde_json::to_string(&meta).map_err(|error| failed(&error))?;
+        let groups = [
+            (PARAMETERS, state.parameters.snapshot()?),
+            (BEST, state.best.clone()),
+            (OPTIMIZER, state.optimizer.export()?),
+        ];
+        let tensors: BTreeMap<String, Tensor> = groups
+            .into_iter()
+            .flat_map(|(prefix, tensors)| {
+                tensors
+                    .into_iter()
+                    .map(move |(name, tensor)| (format!("{prefix}{name}"), tensor))
+            })
             .collect();
         let metadata = HashMap::from([state_entry(&text)]);
-        let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(error.to_string()))?;
-        let previous = files.previous_checkpoint();
+        let bytes = safetensors::serialize(&tensors, Some(metadata)).map_err(|error| failed(&error))?;
         // If the process is killed between the two, the previous one is the latest.
-        none_if_missing(fs::rename(&path, &previous)).map_err(io_failed("rename", &path))?;
+        none_if_missing(fs::rename(&path, self.path(PREVIOUS_FILE))).map_err(io_failed("rename", &path))?;
         write_atomically(&path, &seal(bytes)).map_err(io_failed("write", &path))
     }
 
-    /// The run's last intact checkpoint, if it has one. Reports damaged ones to the observer.
+    /// The state in the run's last intact checkpoint, if it has one. Reports damaged ones to the observer.
     /// Errors: `Checkpoint` if it is of another run, `Io`.
     pub(super) fn load_latest(
-        files: &RunFiles,
+        &self,
         spec: &ModelSpec,
         run: &RunConfig,
         observer: &mut dyn Observer,
-    ) -> Result<Option<Self>, TrainError> {
-        for (path, is_previous) in [(files.checkpoint(), false), (files.previous_checkpoint(), true)] {
+    ) -> Result<Option<TrainState>, TrainError> {
+        for (path, is_previous) in [(self.path(CHECKPOINT_FILE), false), (self.path(PREVIOUS_FILE), true)] {
             let Some(bytes) = none_if_missing(fs::read(&path)).map_err(io_failed("read", &path))? else {
                 continue;
             };
             if is_intact(&bytes) {
-                return Self::load(files, &path, &bytes, spec, run).map(Some);
+                let state = self.load(&bytes, spec, run);
+                return state.map(Some).map_err(|reason| unusable(&path, reason));
             }
             observer.on_event(TrainingEvent::CheckpointDamaged { is_previous });
             // The next save must not replace the intact one by it.
@@ -280,58 +249,40 @@ impl Checkpoint {
         Ok(None)
     }
 
-    /// The state in an intact checkpoint. Errors: `Checkpoint` if it is of another run.
-    fn load(
-        files: &RunFiles,
-        path: &Path,
-        bytes: &[u8],
-        spec: &ModelSpec,
-        run: &RunConfig,
-    ) -> Result<Self, TrainError> {
-        let failed = |reason: String| TrainError::Checkpoint {
-            path: path.to_owned(),
-            reason,
-        };
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| failed(error.to_string()))?;
+    /// The state in an intact checkpoint. Errors: a sentence, for example if it is of another run.
+    fn load(&self, bytes: &[u8], spec: &ModelSpec, run: &RunConfig) -> Result<TrainState, String> {
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
         let text = header
             .metadata()
             .as_ref()
             .and_then(|metadata| state_text(metadata.get(META_KEY)?))
-            .ok_or_else(|| failed("it contains no training state".to_owned()))?;
-        let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| failed(error.to_string()))?;
-        if meta.fingerprint != files.fingerprint() {
-            return Err(failed("it belongs to another run".to_owned()));
+            .ok_or("it contains no training state")?;
+        let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if meta.fingerprint != self.fingerprint() {
+            return Err("it belongs to another run".to_owned());
         }
-        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?;
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu).map_err(|error| error.to_string())?;
         let group = |prefix: &str| -> BTreeMap<String, Tensor> {
             tensors
                 .iter()
                 .filter_map(|(name, tensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone())))
                 .collect()
         };
-        let wrong_weights = |error: foreframe_core::nn::NnError| failed(error.to_string());
-        let parameters = Parameters::from_tensors(spec, group(PARAMETERS)).map_err(wrong_weights)?;
-        let optimizer =
-            Optimizer::import(run.optimizer(), &group(OPTIMIZER), &parameters).map_err(|e| failed(e.to_string()))?;
-        let state = TrainState {
-            stage: meta.stage,
-            step: meta.step,
+        let weights = |prefix| Parameters::from_tensors(spec, group(prefix)).map_err(|error| error.to_string());
+        let parameters = weights(PARAMETERS)?;
+        let optimizer = Optimizer::import(run.optimizer(), &group(OPTIMIZER), &parameters);
+        Ok(TrainState {
+            progress: meta.progress,
+            optimizer: optimizer.map_err(|error| error.to_string())?,
+            best: weights(BEST)?.snapshot().map_err(|error| error.to_string())?,
             parameters,
-            optimizer,
-            best: Parameters::from_tensors(spec, group(BEST))
-                .map_err(wrong_weights)?
-                .snapshot()?,
-            best_step: meta.best_step,
-            best_loss: meta.best_loss,
-            history: meta.history,
-        };
-        Ok(Self { state })
+        })
     }
+}
 
-    /// The training state.
-    pub(super) fn into_state(self) -> TrainState {
-        self.state
-    }
+fn unusable(path: &Path, reason: String) -> TrainError {
+    let path = path.to_owned();
+    TrainError::Checkpoint { path, reason }
 }
 
 #[cfg(test)]

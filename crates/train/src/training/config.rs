@@ -5,6 +5,7 @@ mod checks;
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
+use super::observer::TrainingStage;
 use super::optimizer::{OptimizerConfig, UpdateRule};
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::nn::loss::Loss;
@@ -114,48 +115,27 @@ pub struct DataConfig {
 
 /// A number of windows, or all windows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum WindowBudget {
-    /// This number of windows.
-    Count(usize),
-    /// All windows.
-    All(All),
-}
-
-/// The word `all`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum All {
+pub enum WindowBudget {
     /// `"all"`
     All,
+    /// This number of windows.
+    #[serde(untagged)]
+    Count(usize),
 }
 
-/// What is mirrored left to right in half of the training windows: nothing (`"off"`), what moves in front of a standing
-/// camera (`"movers"`), or whole frames (a list of the channels of actions and states whose sign changes in a mirror, as in
-/// `["steering"]`; it may be empty).
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum Mirror {
-    /// `"off"` or `"movers"`.
-    Word(MirrorWord),
-    /// Whole frames, with the sign of these channels changed.
-    Channels(Vec<String>),
-}
-
-/// A word for what is mirrored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+/// What is mirrored left to right in half of the training windows.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum MirrorWord {
-    /// `"off"`
+pub enum Mirror {
+    /// `"off"`: nothing.
+    #[default]
     Off,
-    /// `"movers"`
+    /// `"movers"`: what moves in front of a standing camera.
     Movers,
-}
-
-impl Default for Mirror {
-    fn default() -> Self {
-        Self::Word(MirrorWord::Off)
-    }
+    /// Whole frames, with the sign of these channels of actions and states changed, as in `["steering"]`; it may be empty.
+    #[serde(untagged)]
+    Channels(Vec<String>),
 }
 
 /// Settings of pre-training (stage 1).
@@ -303,6 +283,14 @@ impl TrainConfig {
     /// The configuration as TOML text. Errors: `Config`.
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string_pretty(self).map_err(|error| TrainError::Config(error.to_string()))
+    }
+
+    /// The number of updates of a stage, and its highest learning rate.
+    pub(super) fn stage(&self, stage: TrainingStage) -> (usize, f64) {
+        match stage {
+            TrainingStage::Pretrain => (self.pretrain.steps, self.pretrain.learning_rate),
+            TrainingStage::Sequence => (self.sequence.steps, self.sequence.learning_rate),
+        }
     }
 
     /// Context and horizon of a window.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::observer::TrainingStage;
 use super::optimizer::OptimizerError;
+use crate::settings::SettingsError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
@@ -176,5 +177,11 @@ impl HasErrorKind for TrainError {
 impl From<candle_core::Error> for TrainError {
     fn from(error: candle_core::Error) -> Self {
         Self::Network(error.into())
+    }
+}
+
+impl From<SettingsError> for TrainError {
+    fn from(error: SettingsError) -> Self {
+        Self::Config(error.to_string())
     }
 }

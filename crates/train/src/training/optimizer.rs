@@ -9,10 +9,9 @@ mod muon;
 
 pub use gradients::Gradients;
 
-use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Tensor};
+use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::nn::Parameters;
@@ -24,6 +23,12 @@ use foreframe_core::vectorized::vectorized;
 const FIRST: &str = "adam.first.";
 const SECOND: &str = "adam.second.";
 const STEP: &str = "adam.step";
+
+/// Adam's decay of the first and of the second moment.
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
+/// Added to the square root of the second moment.
+const EPSILON: f64 = 1e-8;
 
 /// Why an update failed. Parameters and moments are unchanged, except where the tensor library failed.
 #[derive(Debug, thiserror::Error)]
@@ -75,17 +80,11 @@ pub enum UpdateRule {
     Muon,
 }
 
-/// The optimizer's constants.
+/// The optimizer's settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OptimizerConfig {
     /// How weights are updated.
     pub rule: UpdateRule,
-    /// Decay of the first moment.
-    pub beta1: f64,
-    /// Decay of the second moment.
-    pub beta2: f64,
-    /// Added to the square root of the second moment.
-    pub epsilon: f64,
     /// Gradients with a larger norm are scaled down to this norm; infinite for no clipping.
     pub clip_norm: f64,
 }
@@ -94,9 +93,6 @@ impl Default for OptimizerConfig {
     fn default() -> Self {
         Self {
             rule: UpdateRule::Adam,
-            beta1: 0.9,
-            beta2: 0.999,
-            epsilon: 1e-8,
             clip_norm: 1.0,
         }
     }
@@ -146,25 +142,14 @@ impl Optimizer {
         let norm = gradients.norm()?;
         self.step += 1;
         let steps = i32::try_from(self.step).unwrap_or(i32::MAX);
-        let OptimizerConfig {
-            rule,
-            beta1,
-            beta2,
-            epsilon,
-            clip_norm,
-        } = self.config;
-        let second_correction = 1.0 - beta2.powi(steps);
+        let OptimizerConfig { rule, clip_norm } = self.config;
+        let second_correction = 1.0 - BETA2.powi(steps);
+        let scale = if norm > clip_norm { clip_norm / norm } else { 1.0 };
         let adam = AdamStep {
-            scale: if norm > clip_norm {
-                (clip_norm / norm) as f32
-            } else {
-                1.0
-            },
-            beta1: beta1 as f32,
-            beta2: beta2 as f32,
+            scale: scale as f32,
             // θ −= lr · (m / b1) / (√(v / b2) + ε), with √b2 moved out of the square root.
-            rate: (learning_rate * second_correction.sqrt() / (1.0 - beta1.powi(steps))) as f32,
-            epsilon: (epsilon * second_correction.sqrt()) as f32,
+            rate: (learning_rate * second_correction.sqrt() / (1.0 - BETA1.powi(steps))) as f32,
+            epsilon: (EPSILON * second_correction.sqrt()) as f32,
         };
         for (name, var) in parameters.iter() {
             let Some(gradient) = gradients.get(name) else {
@@ -179,13 +164,9 @@ impl Optimizer {
                 muon::update(var, gradient, adam.scale, &mut moments.first, learning_rate)?;
                 continue;
             }
-            with_values(gradient, |gradient| {
-                var.inplace_op1(&AdamUpdate {
-                    rule: adam,
-                    gradient,
-                    moments: RefCell::new(moments),
-                })
-            })??;
+            let mut values = with_values(var, <[f32]>::to_vec)?;
+            with_values(gradient, |gradient| adam.apply(&mut values, gradient, moments))?;
+            var.set(&Tensor::from_vec(values, var.shape(), &Device::Cpu)?)?;
         }
         Ok(norm)
     }
@@ -250,47 +231,26 @@ impl Optimizer {
 #[derive(Clone, Copy)]
 struct AdamStep {
     scale: f32,
-    beta1: f32,
-    beta2: f32,
     rate: f32,
     epsilon: f32,
 }
 
 impl AdamStep {
-    #[inline(always)]
-    fn apply(self, parameters: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32]) {
-        let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
-        for (((parameter, &gradient), m), v) in values {
-            let gradient = gradient * self.scale;
-            *m = self.beta1 * *m + (1.0 - self.beta1) * gradient;
-            *v = self.beta2 * *v + (1.0 - self.beta2) * gradient * gradient;
-            *parameter -= self.rate * *m / (v.sqrt() + self.epsilon);
-        }
-    }
-}
-
-/// Updates one tensor in place, in one pass over memory. candle's own operations would need a dozen passes.
-struct AdamUpdate<'a> {
-    rule: AdamStep,
-    gradient: &'a [f32],
-    moments: RefCell<&'a mut Moments>,
-}
-
-impl InplaceOp1 for AdamUpdate<'_> {
-    fn name(&self) -> &'static str {
-        "adam"
-    }
-
-    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
-        let (CpuStorage::F32(values), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
-            candle_core::bail!("adam needs contiguous f32 parameters");
-        };
-        let mut moments = self.moments.borrow_mut();
-        let Moments { first, second, .. } = &mut **moments;
+    /// Updates the values of one tensor in one pass. candle's own operations would need a dozen passes.
+    fn apply(self, parameters: &mut [f32], gradient: &[f32], moments: &mut Moments) {
+        let Moments { first, second, .. } = moments;
+        let (beta1, beta2) = (BETA1 as f32, BETA2 as f32);
         vectorized(
             #[inline(always)]
-            || self.rule.apply(&mut values[from..to], self.gradient, first, second),
+            || {
+                let values = parameters.iter_mut().zip(gradient).zip(first).zip(second);
+                for (((parameter, &gradient), m), v) in values {
+                    let gradient = gradient * self.scale;
+                    *m = beta1 * *m + (1.0 - beta1) * gradient;
+                    *v = beta2 * *v + (1.0 - beta2) * gradient * gradient;
+                    *parameter -= self.rate * *m / (v.sqrt() + self.epsilon);
+                }
+            },
         );
-        Ok(())
     }
 }

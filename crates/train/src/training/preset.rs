@@ -2,7 +2,7 @@
 
 use super::config::TrainConfig;
 use super::{START_KEY, TrainError};
-use crate::settings::{LayeredSettings, SettingsError, SettingsLayer};
+use crate::settings::{LayeredSettings, SettingsLayer};
 use foreframe_core::registry::Manifest;
 
 /// Name and text of each preset.
@@ -37,7 +37,7 @@ impl TrainConfig {
         let text = text.map(|text| SettingsLayer::toml("settings", text)).into_iter();
         let settings = settings.iter().map(|setting| SettingsLayer::assignment(setting));
         let layers: Result<Vec<_>, _> = text.chain(settings).collect();
-        Self::from_layers(preset, layers.map_err(|error| config_error(&error))?)
+        Self::from_layers(preset, layers?)
     }
 
     /// A preset under layers of settings, later ones over earlier ones, checked.
@@ -51,7 +51,7 @@ impl TrainConfig {
                 known: Self::preset_names(),
             })?;
         let origin = format!("preset {preset}");
-        let written = SettingsLayer::toml(&origin, text).map_err(|error| config_error(&error))?;
+        let written = SettingsLayer::toml(&origin, text)?;
         Self::over(written, origin, layers)
     }
 
@@ -93,12 +93,10 @@ fn extract(
 ) -> Result<TrainConfig, TrainError> {
     let layers: Vec<SettingsLayer> = layers.into_iter().collect();
     for layer in std::iter::once(&defaults).chain(&layers) {
-        layer
-            .refuse_renamed("fit", "sequence")
-            .map_err(|error| config_error(&error))?;
+        layer.refuse_renamed("fit", "sequence")?;
     }
-    let values = LayeredSettings::merge(defaults, layers, LISTING).map_err(|error| config_error(&error))?;
-    values.extract(expected).map_err(|error| config_error(&error))
+    let values = LayeredSettings::merge(defaults, layers, LISTING)?;
+    Ok(values.extract(expected)?)
 }
 
 /// What a setting must be, where its type does not say it well.
@@ -115,14 +113,10 @@ fn expected(key: &str) -> Option<String> {
     Some(expected.to_owned())
 }
 
-fn config_error(error: &SettingsError) -> TrainError {
-    TrainError::Config(error.to_string())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::training::config::{All, CodecTraining, WindowBudget};
+    use crate::training::config::{CodecTraining, WindowBudget};
     use foreframe_core::types::Seed;
 
     #[test]
@@ -156,7 +150,7 @@ mod tests {
         );
         assert_eq!(
             (config.data.windows, config.sequence.codec),
-            (WindowBudget::All(All::All), CodecTraining::Frozen)
+            (WindowBudget::All, CodecTraining::Frozen)
         );
     }
 

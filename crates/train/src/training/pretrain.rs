@@ -4,7 +4,6 @@ use candle_core::Tensor;
 
 use super::batches::Shuffle;
 use super::config::TrainConfig;
-use super::observer::TrainingStage;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan, window_frames};
 use foreframe_core::nn::loss::Loss;
@@ -46,18 +45,6 @@ impl<'a> CodecObjective<'a> {
 }
 
 impl Objective for CodecObjective<'_> {
-    fn stage(&self) -> TrainingStage {
-        TrainingStage::Pretrain
-    }
-
-    fn steps(&self) -> usize {
-        self.config.pretrain.steps
-    }
-
-    fn learning_rate(&self) -> f64 {
-        self.config.pretrain.learning_rate
-    }
-
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
         let batch = part.of(self.shuffle.batch(step, self.config.pretrain.batch_size));
         let batch: Vec<usize> = batch.into_iter().map(|position| self.frames[position]).collect();

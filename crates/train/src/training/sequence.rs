@@ -4,7 +4,6 @@ use candle_core::Tensor;
 
 use super::batches::{DrawnWindow, Shuffle, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
-use super::observer::TrainingStage;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan};
 use foreframe_core::nn::loss::Loss;
@@ -82,18 +81,6 @@ impl<'a> SequenceObjective<'a> {
 }
 
 impl Objective for SequenceObjective<'_> {
-    fn stage(&self) -> TrainingStage {
-        TrainingStage::Sequence
-    }
-
-    fn steps(&self) -> usize {
-        self.config.sequence.steps
-    }
-
-    fn learning_rate(&self) -> f64 {
-        self.config.sequence.learning_rate
-    }
-
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError> {
         let sequence = &self.config.sequence;
         let drawn = self.shuffle.batch(step, sequence.batch_size).into_iter().enumerate();

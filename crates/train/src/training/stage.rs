@@ -8,9 +8,9 @@ use candle_core::Tensor;
 use rayon::prelude::*;
 
 use super::TrainError;
-use super::checkpoint::{Checkpoint, RunFiles};
-use super::config::RunConfig;
-use super::observer::{Observer, TrainingEvent, TrainingStage};
+use super::checkpoint::RunFiles;
+use super::config::TrainConfig;
+use super::observer::{Observer, TrainingEvent};
 use super::optimizer::{Gradients, OptimizerError};
 use super::state::{HistoryPoint, TrainState};
 use foreframe_core::nn::Parameters;
@@ -20,12 +20,6 @@ const MAX_LOSS: f64 = 1e3;
 
 /// The objective of a stage.
 pub(super) trait Objective: Sync {
-    /// The stage.
-    fn stage(&self) -> TrainingStage;
-    /// Number of updates.
-    fn steps(&self) -> usize;
-    /// The highest learning rate.
-    fn learning_rate(&self) -> f64;
     /// The loss of one part of a step's batch, as a scalar with gradients.
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
     /// The mean squared error of the validation split against the target frames.
@@ -58,102 +52,85 @@ pub(super) enum StageEnd {
 /// Runs the training loop of a stage.
 pub(super) struct StageRunner<'a> {
     pub(super) files: &'a RunFiles,
-    pub(super) run: &'a RunConfig,
+    pub(super) config: &'a TrainConfig,
     pub(super) cancelled: &'a AtomicBool,
 }
 
 impl StageRunner<'_> {
-    /// Runs until the stage's last step or until cancelled, then writes a checkpoint. Errors: `Diverged`, and those of the
-    /// objective; the last checkpoint stays on disk.
+    /// Runs until the last step of the state's stage or until cancelled, then writes a checkpoint. Errors: `Diverged`, and those
+    /// of the objective; the last checkpoint stays on disk.
     pub(super) fn run(
         &self,
         objective: &dyn Objective,
         state: &mut TrainState,
         observer: &mut dyn Observer,
     ) -> Result<StageEnd, TrainError> {
-        let (stage, steps) = (objective.stage(), objective.steps());
-        let mut saved_step = state.step;
-        while state.step < steps {
+        let (stage, run) = (state.progress.stage, &self.config.run);
+        let (steps, learning_rate) = self.config.stage(stage);
+        let mut checkpoint_step = state.progress.step;
+        while state.progress.step < steps {
             if self.cancelled.load(Ordering::Relaxed) {
                 self.save(state, observer)?;
                 return Ok(StageEnd::Interrupted);
             }
-            let loss = self.update(objective, state, saved_step)?;
-            state.step += 1;
-            let step = state.step;
+            let rate = learning_rate * self.schedule(state.progress.step, steps);
+            let step = state.progress.step + 1;
+            let diverged = |what| TrainError::Diverged {
+                stage,
+                step,
+                what,
+                checkpoint_step,
+            };
+            let loss = match self.update(objective, state, rate) {
+                Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, more than {MAX_LOSS}"))),
+                Err(TrainError::Optimizer(OptimizerError::LossNotFinite { value })) => {
+                    Err(diverged(format!("the loss is {value}")))
+                }
+                Err(TrainError::Optimizer(error @ OptimizerError::GradientNotFinite { .. })) => {
+                    Err(diverged(error.to_string()))
+                }
+                updated => updated,
+            }?;
+            state.progress.step = step;
             observer.on_event(TrainingEvent::Step {
                 stage,
                 step,
                 steps,
                 loss,
             });
-            if step.is_multiple_of(self.run.validate_every_steps) || step == steps {
+            if step.is_multiple_of(run.validate_every_steps) || step == steps {
                 Self::validate(objective, state, loss, observer)?;
             }
-            if step.is_multiple_of(self.run.checkpoint_every_steps) || step == steps {
+            if step.is_multiple_of(run.checkpoint_every_steps) || step == steps {
                 self.save(state, observer)?;
-                saved_step = step;
+                checkpoint_step = step;
             }
         }
         Ok(StageEnd::Done)
     }
 
     /// Computes one update and returns the batch's loss.
-    fn update(
-        &self,
-        objective: &dyn Objective,
-        state: &mut TrainState,
-        checkpoint_step: usize,
-    ) -> Result<f64, TrainError> {
-        let step = state.step;
-        let diverged = |what| TrainError::Diverged {
-            stage: objective.stage(),
-            step: step + 1,
-            what,
-            checkpoint_step,
+    fn update(&self, objective: &dyn Objective, state: &mut TrainState, rate: f64) -> Result<f64, TrainError> {
+        let (parameters, step, count) = (&state.parameters, state.progress.step, self.config.run.batch_parts);
+        let gradients = |index| -> Result<Gradients, TrainError> {
+            let loss = objective.loss(parameters, step, BatchPart { index, count })?;
+            Ok(Gradients::of(&loss, parameters, &[])?)
         };
-        let parameters = &state.parameters;
-        let gradients_of_part = |index| -> Result<Result<Gradients, OptimizerError>, TrainError> {
-            let loss = objective.loss(
-                parameters,
-                step,
-                BatchPart {
-                    index,
-                    count: self.run.batch_parts,
-                },
-            )?;
-            Ok(Gradients::of(&loss, parameters, &[]))
-        };
-        let parts = (0..self.run.batch_parts)
-            .into_par_iter()
-            .map(gradients_of_part)
-            .collect::<Result<Vec<_>, _>>()?;
-        let rate = objective.learning_rate() * self.schedule(step, objective.steps());
-        let updated = parts
-            .into_iter()
-            .collect::<Result<_, _>>()
-            .and_then(Gradients::mean)
-            .and_then(|gradients| {
-                state.optimizer.update(&state.parameters, &gradients, rate)?;
-                Ok(gradients.loss())
-            });
-        match updated {
-            Ok(loss) if loss > MAX_LOSS => Err(diverged(format!("the loss is {loss:.1}, more than {MAX_LOSS}"))),
-            Ok(loss) => Ok(loss),
-            Err(OptimizerError::LossNotFinite { value }) => Err(diverged(format!("the loss is {value}"))),
-            Err(error @ OptimizerError::GradientNotFinite { .. }) => Err(diverged(error.to_string())),
-            Err(other) => Err(TrainError::Optimizer(other)),
-        }
+        let parts: Vec<_> = (0..count).into_par_iter().map(gradients).collect();
+        // Of several errors, the first part's, so that it is the same in each run.
+        let gradients = Gradients::mean(parts.into_iter().collect::<Result<_, _>>()?)?;
+        state.optimizer.update(parameters, &gradients, rate)?;
+        Ok(gradients.loss())
     }
 
     /// The learning rate as a share of its highest value: a linear rise, then half a cosine.
     fn schedule(&self, step: usize, steps: usize) -> f64 {
-        let (step, steps, warmup) = (step as f64, steps as f64, self.run.warmup_steps as f64);
+        let (step, steps, warmup) = (step as f64, steps as f64, self.config.run.warmup_steps as f64);
         if step < warmup {
             return (step + 1.0) / warmup;
         }
         let progress = (step - warmup) / (steps - warmup).max(1.0);
-        let last = self.run.final_learning_rate;
+        let last = self.config.run.final_learning_rate;
         last + (1.0 - last) * 0.5 * (1.0 + (PI * progress).cos())
     }
 
@@ -163,15 +140,15 @@ impl StageRunner<'_> {
         train_loss: f64,
         observer: &mut dyn Observer,
     ) -> Result<(), TrainError> {
-        let (stage, step) = (objective.stage(), state.step);
+        let progress = &mut state.progress;
+        let (stage, step) = (progress.stage, progress.step);
         let loss = objective.validation_loss(&state.parameters)?;
-        let is_best = state.best_loss.is_none_or(|best| loss < best);
+        let is_best = progress.best_loss.is_none_or(|best| loss < best);
         if is_best {
             state.best = state.parameters.snapshot()?;
-            state.best_step = step;
-            state.best_loss = Some(loss);
+            (progress.best_step, progress.best_loss) = (step, Some(loss));
         }
-        state.history.push(HistoryPoint {
+        progress.history.push(HistoryPoint {
             stage,
             step,
             train_loss,
@@ -188,11 +165,9 @@ impl StageRunner<'_> {
 
     /// Writes a checkpoint.
     pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
-        Checkpoint::save(self.files, state)?;
-        observer.on_event(TrainingEvent::Checkpointed {
-            stage: state.stage,
-            step: state.step,
-        });
+        self.files.save(state)?;
+        let (stage, step) = (state.progress.stage, state.progress.step);
+        observer.on_event(TrainingEvent::Checkpointed { stage, step });
         Ok(())
     }
 }

@@ -2,16 +2,13 @@
 
 use std::sync::atomic::AtomicBool;
 
-use serde_json::json;
-
 use super::super::datasets;
 use super::super::report::JobReporter;
-use super::super::retry_policy::retry_while_busy;
 use super::super::spec::ImportSpec;
 use super::{Pipeline, failed};
 use crate::jobs::executor::{JobFailure, JobResult};
-use foreframe_data::dataset::DatasetError;
-use foreframe_data::dataset::import::{ImportConfig, ImportError, ImportProgress, Imported, import, saved_shards};
+use foreframe_data::dataset::IMPORT_ARGUMENTS;
+use foreframe_data::dataset::import::{ImportError, ImportProgress, Imported, check_out, import, saved_shards};
 
 /// How many left-out items are written to the job's log; `meta/skipped.json` lists up to 10,000.
 const LOGGED_ITEMS: usize = 200;
@@ -24,34 +21,26 @@ impl Pipeline {
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
         let data_dir = self.store.objects().data_dir();
-        let config = spec
-            .config(data_dir, self.import_dir.as_deref())
+        let mut config = spec
+            .config(data_dir, self.resources.import_dir.as_deref())
             .map_err(|error| failed(&error))?;
-        let config = ImportConfig {
-            disk_mib: self.import_disk_mib,
-            ..config
-        };
+        config.disk_mib = self.resources.import_disk_mib;
         report.progress(0, 0, "reading the recording");
         let retry = self.retry_policy(report, cancelled);
-        retry.run(async || datasets::clear_stale_import(self.store.objects(), &spec.name, &config).await)?;
+        let is_stale = |was_deleted| {
+            let is_of_another_import = config.out.join(IMPORT_ARGUMENTS).is_file();
+            matches!(check_out(&config), Err(ImportError::OutExists { .. })) && (was_deleted || is_of_another_import)
+        };
+        retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, is_stale).await)?;
         // Whole shards are saved; a new attempt continues after them.
         report.checkpoint(saved_shards(&config.out) as u64);
         let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
-        let work = || import(&config, &on_progress, cancelled);
-        let is_busy = |error: &ImportError| matches!(error, ImportError::Dataset(DatasetError::Busy { .. }));
         // After an error it continues with the shards that are finished.
-        let imported = retry.repeat(|| retry_while_busy(work, is_busy, cancelled))?;
+        let imported = retry.repeat_once_free(|| import(&config, &on_progress, cancelled))?;
         log_skipped(&imported, report);
-        self.push_dataset(&spec.name, &retry)?;
-        let info = &imported.info;
-        Ok(JobResult {
-            result: json!({
-                "dataset": spec.name, "episodes": info.episode_count, "frames": info.frame_count,
-                "content_hash": info.content_hash, "skipped": imported.skipped_count(),
-            }),
-            published: None,
-            measured: None,
-        })
+        let mut result = self.finish_dataset(&spec.name, &imported.info, &retry)?;
+        result["skipped"] = imported.skipped_count().into();
+        Ok(JobResult::of(result))
     }
 }
 

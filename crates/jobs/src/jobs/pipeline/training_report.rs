@@ -1,6 +1,5 @@
 //! A training's events in the job's report.
 
-use super::super::Losses;
 use super::super::report::JobReporter;
 use crate::store::LossRow;
 use foreframe_train::training::{TrainingEvent, TrainingStage};
@@ -46,10 +45,7 @@ impl TrainingReporter<'_> {
                 }
                 self.progress(stage, step);
                 self.train_loss = Some(loss);
-                self.report.losses(Losses {
-                    train: Some(loss),
-                    validation: None,
-                });
+                self.report.losses(Some(loss), None);
                 if step.is_multiple_of(steps.div_ceil(CURVE_POINTS)) {
                     self.point(stage, step, None);
                 }
@@ -60,23 +56,20 @@ impl TrainingReporter<'_> {
                 loss,
                 is_best,
             } => {
-                self.report.losses(Losses {
-                    train: None,
-                    validation: Some(loss),
-                });
+                self.report.losses(None, Some(loss));
                 self.point(stage, step, Some(loss));
                 let best = if is_best { ", the best so far" } else { "" };
                 self.report
                     .line(format!("{stage} step {step}: validation MSE {loss:.6}{best}"));
             }
-            TrainingEvent::CheckpointDamaged { is_previous } => self.report.line(
-                if is_previous {
-                    "the previous checkpoint is damaged too; starting from the beginning"
-                } else {
-                    "the latest checkpoint is damaged; resuming from the previous one"
-                }
-                .to_owned(),
-            ),
+            TrainingEvent::CheckpointDamaged { is_previous: true } => {
+                let line = "the previous checkpoint is damaged too; starting from the beginning";
+                self.report.line(line.to_owned());
+            }
+            TrainingEvent::CheckpointDamaged { is_previous: false } => {
+                let line = "the latest checkpoint is damaged; resuming from the previous one";
+                self.report.line(line.to_owned());
+            }
             TrainingEvent::Checkpointed { stage, step } => self.report.checkpoint(self.done(stage, step)),
         }
     }

@@ -1,6 +1,6 @@
 //! The ranges of all settings of a training, and which settings others must allow.
 
-use super::{Mirror, MirrorWord, TrainConfig, WindowBudget};
+use super::{Mirror, TrainConfig, WindowBudget};
 use crate::training::TrainError;
 use crate::training::optimizer::UpdateRule;
 use foreframe_core::nn::{ArchitectureKind, Conditioning};
@@ -27,9 +27,7 @@ impl TrainConfig {
         ];
         for (field, value, min, max) in counts {
             if !(min..=max).contains(&value) {
-                return Err(TrainError::Config(format!(
-                    "{field} is {value}; it must be {min} to {max}"
-                )));
+                return refused(format!("{field} is {value}; it must be {min} to {max}"));
             }
         }
         let numbers = [
@@ -47,34 +45,27 @@ impl TrainConfig {
         ];
         for (field, value, max) in numbers {
             if !(0.0..=max).contains(&value) {
-                return Err(TrainError::Config(format!("{field} is {value}; it must be 0 to {max}")));
+                return refused(format!("{field} is {value}; it must be 0 to {max}"));
             }
         }
-        for (field, value) in [
+        let rates = [
             ("sequence.learning_rate", sequence.learning_rate),
             ("run.clip_norm", run.clip_norm),
-        ] {
-            if value == 0.0 {
-                return Err(TrainError::Config(format!(
-                    "{field} is 0, so nothing would be learned; it must be above 0"
-                )));
-            }
+        ];
+        if let Some((field, _)) = rates.iter().find(|(_, value)| *value == 0.0) {
+            return refused(format!("{field} is 0, so nothing would be learned; it must be above 0"));
         }
-        for (field, size) in [
-            ("pretrain.batch_size", pretrain.batch_size),
-            ("sequence.batch_size", sequence.batch_size),
-        ] {
-            if !size.is_multiple_of(run.batch_parts) {
-                return Err(TrainError::Config(format!(
-                    "{field} is {size}; it must be a multiple of run.batch_parts, {}",
-                    run.batch_parts
-                )));
-            }
+        let (parts, sizes) = (
+            run.batch_parts,
+            [("pretrain", pretrain.batch_size), ("sequence", sequence.batch_size)],
+        );
+        if let Some((stage, size)) = sizes.iter().find(|(_, size)| !size.is_multiple_of(parts)) {
+            return refused(format!(
+                "{stage}.batch_size is {size}; it must be a multiple of run.batch_parts, {parts}"
+            ));
         }
         if self.data.windows == WindowBudget::Count(0) {
-            return Err(TrainError::Config(
-                "data.windows is 0; it must be at least 1, or \"all\"".to_owned(),
-            ));
+            return refused("data.windows is 0; it must be at least 1, or \"all\"".to_owned());
         }
         self.validate_together()
     }
@@ -83,36 +74,40 @@ impl TrainConfig {
     fn validate_together(&self) -> Result<(), TrainError> {
         let (run, sequence) = (&self.run, &self.sequence);
         if self.model.architecture == ArchitectureKind::Dense {
-            let refused = [
+            let dense_needs = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
                 ("sequence.short_share", sequence.short_share > 0.0, "0"),
             ];
-            if let Some((field, _, needed)) = refused.iter().find(|(_, is_set, _)| *is_set) {
-                return Err(TrainError::Config(format!(
+            if let Some((field, _, needed)) = dense_needs.iter().find(|(_, is_set, _)| *is_set) {
+                return refused(format!(
                     "{field} is for the flow network only; it must be {needed} where model.architecture is dense"
-                )));
+                ));
             }
         }
-        if self.data.mirror == Mirror::Word(MirrorWord::Movers) && self.model.conditioning != Conditioning::None {
-            return Err(TrainError::Config(format!(
+        if self.data.mirror == Mirror::Movers && self.model.conditioning != Conditioning::None {
+            return refused(format!(
                 "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
                  model.conditioning is {}: set it to none, or data.mirror to off",
                 self.model.conditioning
-            )));
+            ));
         }
         if self.data.reverse && self.model.conditioning != Conditioning::None {
-            return Err(TrainError::Config(format!(
+            return refused(format!(
                 "data.reverse is true, but actions and states do not fit a window that is played backwards; \
                  model.conditioning is {}: set it to none, or data.reverse to false",
                 self.model.conditioning
-            )));
+            ));
         }
         if sequence.short_share > 0.0 && !(1..=self.model.horizon).contains(&sequence.short_horizon) {
-            return Err(TrainError::Config(format!(
+            return refused(format!(
                 "sequence.short_horizon is {}; it must be 1 to model.horizon, {}",
                 sequence.short_horizon, self.model.horizon
-            )));
+            ));
         }
         Ok(())
     }
+}
+
+fn refused(reason: String) -> Result<(), TrainError> {
+    Err(TrainError::Config(reason))
 }
