@@ -1,5 +1,6 @@
 //! The life of a server: it accepts connections, drains, and stops within a deadline.
 
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tokio::net::TcpListener;
@@ -57,41 +58,35 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     let limit = Duration::from_millis(config.shutdown_deadline_ms);
     let drain = Duration::from_millis(config.drain_ms);
     let listener = BoundedListener::new(listener, config);
-    let connections = Connections::new(router(app.clone()), config, app.streams().stopping());
-    let mut connections = connections.with_tls(app.tls().cloned());
+    let connections = Connections::new(router(app.clone()), config, app.streams.stopping());
+    let mut connections = connections.with_tls(app.tls.clone());
     tokio::select! {
         never = connections.accept(&listener) => match never {},
         never = metrics::keep_folded() => match never {},
-        never = ServerTls::keep_fresh(app.tls()) => match never {},
-        never = app.keys().keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
+        never = ServerTls::keep_fresh(app.tls.as_ref()) => match never {},
+        never = app.keys.keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
         () = shutdown => {}
     }
     info!("stopping");
     let deadline = Instant::now() + limit;
-    app.drain();
+    app.draining.store(true, Ordering::Release);
     app.jobs().begin_stop();
     // Even without time to drain, established connections are accepted: their clients wait for an answer.
     let Err(_) = timeout(drain, connections.accept(&listener)).await;
     drop(listener);
-    app.streams().stop();
-    app.event_streams().stop();
+    app.streams.stop();
+    app.event_streams.stop();
     if timeout_at(deadline.into(), connections.ended()).await.is_err() {
         warn!("some requests were not answered within the deadline");
     }
-    let tasks = async {
-        tokio::join!(
-            app.streams().ended(),
-            app.event_streams().ended(),
-            app.changes().ended()
-        )
-    };
+    let tasks = async { tokio::join!(app.streams.ended(), app.event_streams.ended(), app.changes.ended()) };
     if timeout_at(deadline.into(), tasks).await.is_err() {
         warn!("some streams or changes did not end within the deadline");
     }
     let ended = async {
         let jobs_ended = app.jobs().finish_stop(deadline).await;
         let predictor = app.predictor().clone();
-        jobs_ended && app.blocking().run(move || predictor.stop()).await.is_ok()
+        jobs_ended && app.blocking.run(move || predictor.stop()).await.is_ok()
     };
     if timeout_at((deadline + GRACE).into(), ended).await == Ok(true) {
         info!("stopped");

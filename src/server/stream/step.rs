@@ -37,18 +37,25 @@ impl FrameStep {
     ) -> Result<Self, StepError> {
         let limit = max_steps.max(manifest.spec.horizon);
         if let Some(found) = message.steps.filter(|steps| *steps > limit) {
-            return Err(StepError::Steps { found, limit });
+            return Err(StepError::Invalid(format!(
+                "steps is {found}; this server predicts 1 to {limit}"
+            )));
         }
-        let action = |field| {
-            move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
-        };
-        let past: Option<Action> = message.action.map(action("action")).transpose()?;
-        let plan: Option<Vec<Action>> = message
+        let unfit = |field| move |error: ValueError| StepError::Invalid(format!("{field}: {error}"));
+        let past = message
+            .action
+            .map(Action::try_from)
+            .transpose()
+            .map_err(unfit("action"))?;
+        let plan = message
             .plan
-            .map(|plan| plan.into_iter().map(action("plan")).collect())
-            .transpose()?;
-        let state = message.state.map(RobotState::try_from).transpose();
-        let state = state.map_err(|source| StepError::Value { field: "state", source })?;
+            .map(|plan| plan.into_iter().map(Action::try_from).collect());
+        let plan: Option<Vec<Action>> = plan.transpose().map_err(unfit("plan"))?;
+        let state = message
+            .state
+            .map(RobotState::try_from)
+            .transpose()
+            .map_err(unfit("state"))?;
         let given = RawConditioning {
             past: past.as_slice(),
             plan: plan.as_deref(),
@@ -72,14 +79,10 @@ impl FrameStep {
 pub(in crate::server) enum StepError {
     #[error("seq is {found}; seq {expected} is next")]
     Gap { found: u64, expected: u64 },
-    #[error("seq is {0}; the greatest is one less")]
-    Seq(u64),
-    #[error("steps is {found}; this server predicts 1 to {limit}")]
-    Steps { found: usize, limit: usize },
+    #[error("{0}")]
+    Invalid(String),
     #[error(transparent)]
     Image(#[from] ImageError),
-    #[error("{field}: {source}")]
-    Value { field: &'static str, source: ValueError },
     #[error(transparent)]
     Input(#[from] InputError),
     #[error(transparent)]
@@ -98,18 +101,9 @@ impl StepError {
             Self::Serving(error) => match error.kind() {
                 ErrorKind::Busy | ErrorKind::Away => ErrorCode::Overloaded,
                 ErrorKind::Usage => ErrorCode::Invalid,
-                ErrorKind::NotFound
-                | ErrorKind::Conflict
-                | ErrorKind::Unusable
-                | ErrorKind::Cancelled
-                | ErrorKind::Internal => ErrorCode::Internal,
+                _ => ErrorCode::Internal,
             },
-            Self::Seq(_)
-            | Self::Steps { .. }
-            | Self::Image(_)
-            | Self::Value { .. }
-            | Self::Input(_)
-            | Self::NotOwner => ErrorCode::Invalid,
+            Self::Invalid(_) | Self::Image(_) | Self::Input(_) | Self::NotOwner => ErrorCode::Invalid,
         }
     }
 }
@@ -146,7 +140,7 @@ impl SessionCore {
     pub(super) fn missing_before(&self, seq: u64) -> Result<Option<u64>, StepError> {
         let expected = self.state.next_seq();
         if seq == u64::MAX {
-            return Err(StepError::Seq(seq));
+            return Err(StepError::Invalid(format!("seq is {seq}; the greatest is one less")));
         }
         if seq > expected && self.settings.on_gap == OnGap::Error {
             return Err(StepError::Gap { found: seq, expected });
