@@ -1,5 +1,5 @@
-//! The command line, one file for each subcommand. Exit code 2: the command cannot be carried out as it was given. Exit
-//! code 1: it failed. Exit code 130: it was interrupted.
+//! The command line, one file for each subcommand, or for two that belong together. Exit code 2: the command cannot be
+//! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
 //! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `process` and
 //! `progress`, `interrupt`, `settings`, `output`, `admin_address`, `workspace`.

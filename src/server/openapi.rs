@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 use serde_json::Value;
 use utoipa::OpenApi;
-use utoipa::openapi::path::Parameter;
+use utoipa::openapi::path::{Parameter, ParameterBuilder};
 use utoipa::openapi::schema::{KnownFormat, Schema, SchemaFormat};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{OpenApi as Document, RefOr};
@@ -105,7 +105,8 @@ fn add_examples(contract: &mut Document) {
                 let RefOr::T(parameter) = parameter else { continue };
                 limit(parameter);
                 if parameter.name == "model" {
-                    parameter.example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
+                    let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
+                    *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
                 }
             }
             if let (Some(RefOr::T(body)), Some(example)) = (&mut operation.request_body, &example)

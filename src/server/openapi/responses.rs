@@ -6,12 +6,13 @@ use utoipa::openapi::path::{Operation, Parameter, ParameterIn, PathItem};
 use utoipa::openapi::schema::{Schema, SchemaType, Type};
 use utoipa::openapi::{Content, Header, OpenApi, Ref, RefOr, Response};
 
-/// Completes the parameters and responses of all operations.
+/// Completes the tags, parameters and responses of all operations.
 pub(super) fn complete_operations(contract: &mut OpenApi) {
     for (path, item) in &mut contract.paths.paths {
         let resource = path.strip_prefix("/v1/").and_then(|path| path.split('/').next());
         for (_, operation) in operations(item) {
             if let Some(resource) = resource {
+                operation.tags.get_or_insert_with(|| vec![resource.to_owned()]);
                 describe_parameters(resource, operation);
                 add_common_errors(resource, operation);
             }
@@ -80,8 +81,9 @@ fn add_common_errors(resource: &str, operation: &mut Operation) {
     } else {
         ("403", "The API key's scope does not include this")
     });
-    let mut in_path = parameters(operation).filter(|parameter| parameter.parameter_in == ParameterIn::Path);
-    if let Some(first) = in_path.next() {
+    let in_path = parameters(operation).filter(|parameter| parameter.parameter_in == ParameterIn::Path);
+    let are_numbers: Vec<bool> = in_path.map(is_number).collect();
+    if !are_numbers.is_empty() {
         common.extend(match resource {
             "models" => vec![("404", "No such model")],
             "datasets" => vec![("404", "No such data set")],
@@ -93,7 +95,7 @@ fn add_common_errors(resource: &str, operation: &mut Operation) {
             "sessions" => vec![("404", "No such session"), ("410", "It has expired")],
             _ => Vec::new(),
         });
-        if std::iter::once(first).chain(in_path).any(is_number) {
+        if are_numbers.contains(&true) {
             common.push(("400", "A number in the path is not one"));
         }
     }
@@ -130,7 +132,9 @@ fn complete(status: &str, response: &mut Response) {
     }
     if status.starts_with(['4', '5']) {
         let problem = Content::new(Some(Ref::from_schema_name("Problem")));
-        response.content.insert("application/problem+json".to_owned(), problem);
+        response
+            .content
+            .insert("application/problem+json".to_owned(), RefOr::T(problem));
     }
     if ["429", "503"].contains(&status) {
         let seconds = Header::new(utoipa::schema!(u64));

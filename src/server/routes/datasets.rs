@@ -78,7 +78,7 @@ struct DatasetDescription {
 
 /// Lists the finished data sets.
 #[utoipa::path(
-    get, path = "/v1/datasets", tag = "datasets",
+    get, path = "/v1/datasets",
     responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
@@ -94,10 +94,7 @@ async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<DatasetLi
 }
 
 /// Describes a data set.
-#[utoipa::path(
-    get, path = "/v1/datasets/{dataset}", tag = "datasets",
-    responses((status = 200, body = DatasetDescription))
-)]
+#[utoipa::path(get, path = "/v1/datasets/{dataset}", responses((status = 200, body = DatasetDescription)))]
 async fn get(app: App, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
     let name = dataset_name(&app, &name).await?;
     describe(&app, &name).await.map(axum::Json)
@@ -105,7 +102,7 @@ async fn get(app: App, Path(name): Path<String>) -> Result<axum::Json<DatasetDes
 
 /// Deletes a data set that no job uses; also an unfinished one of a collection that was cancelled or failed.
 #[utoipa::path(
-    delete, path = "/v1/datasets/{dataset}", tag = "datasets",
+    delete, path = "/v1/datasets/{dataset}",
     responses(
         (status = 204, description = "Deleted"),
         (status = 409, description = "A job that has not ended uses it"),
@@ -123,7 +120,7 @@ async fn delete(app: App, author: Author, Path(name): Path<String>) -> Result<St
 
 /// A contact sheet of an episode.
 #[utoipa::path(
-    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.png", tag = "datasets",
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.png",
     responses(
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
         (status = 404, description = "No such data set or episode"),
@@ -139,7 +136,7 @@ async fn sheet(app: App, Path((name, episode)): Path<(String, usize)>) -> Result
 
 /// An episode in motion.
 #[utoipa::path(
-    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.gif", tag = "datasets",
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.gif",
     responses(
         (status = 200, description = "The animation", body = Vec<u8>, content_type = "image/gif"),
         (status = 404, description = "No such data set or episode"),

@@ -128,7 +128,7 @@ struct StepBody {
 /// Creates a simulated robot that you can drive. If all environments are in use, it replaces the one that was idle the
 /// longest, if that was idle for some seconds.
 #[utoipa::path(
-    post, path = "/v1/environments", tag = "environments",
+    post, path = "/v1/environments",
     responses(
         (status = 201, description = "Created; the header Location names it", body = EnvironmentBody),
         (status = 422, description = "Not a valid world; the answer names the field"),
@@ -144,10 +144,7 @@ async fn create(app: App, caller: Caller, Json(request): Json<NewEnvironment>) -
 }
 
 /// Begins the next episode.
-#[utoipa::path(
-    post, path = "/v1/environments/{id}/reset", tag = "environments",
-    responses((status = 200, body = ResetBody))
-)]
+#[utoipa::path(post, path = "/v1/environments/{id}/reset", responses((status = 200, body = ResetBody)))]
 async fn reset(
     app: App,
     caller: Caller,
@@ -161,7 +158,7 @@ async fn reset(
 
 /// Applies an action for one frame period.
 #[utoipa::path(
-    post, path = "/v1/environments/{id}/step", tag = "environments",
+    post, path = "/v1/environments/{id}/step",
     responses(
         (status = 200, body = StepBody),
         (status = 409, description = "The episode is over"),
@@ -181,7 +178,7 @@ async fn step(
 
 /// Deletes an environment.
 #[utoipa::path(
-    delete, path = "/v1/environments/{id}", tag = "environments",
+    delete, path = "/v1/environments/{id}",
     responses(
         (status = 204, description = "Deleted"),
         (status = 404, description = "No such environment of this API key"),

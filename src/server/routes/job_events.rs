@@ -44,7 +44,7 @@ struct JobEvent {
 /// Sends the job whenever it changes (`event: job`) and each line of its log (`event: log`), until it has ended, the
 /// server stops, or the API key is revoked. With `Last-Event-ID`, the log continues after that line.
 #[utoipa::path(
-    get, path = "/v1/jobs/{id}/events", tag = "jobs",
+    get, path = "/v1/jobs/{id}/events",
     params(("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received")),
     responses(
         (status = 200, description = "Events", content_type = "text/event-stream", body = JobEvent),

@@ -92,7 +92,7 @@ struct LossCurves {
 /// publishes the next version of its model. The first version of a name becomes active at once, later ones when they are
 /// activated.
 #[utoipa::path(
-    post, path = "/v1/jobs", tag = "jobs",
+    post, path = "/v1/jobs",
     params(("Idempotency-Key" = Option<String>, Header, pattern = "^[!-~]{1,128}$",
         description = "The client's own key for this request: a second request with the same key makes no second job")),
     responses(
@@ -123,11 +123,8 @@ async fn create(
 
 /// Lists jobs, the newest first.
 #[utoipa::path(
-    get, path = "/v1/jobs", tag = "jobs",
-    responses(
-        (status = 200, body = JobList),
-        (status = 422, description = "No such kind or state"),
-    )
+    get, path = "/v1/jobs",
+    responses((status = 200, body = JobList), (status = 422, description = "No such kind or state"))
 )]
 async fn list(app: App, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
     let limit = page::checked_limit(query.limit, DEFAULT_LIMIT)?;
@@ -142,21 +139,15 @@ async fn list(app: App, Query(query): Query<ListQuery>) -> Result<axum::Json<Job
 }
 
 /// Describes a job and its progress.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}", tag = "jobs",
-    responses((status = 200, body = Job))
-)]
+#[utoipa::path(get, path = "/v1/jobs/{id}", responses((status = 200, body = Job)))]
 async fn get(app: App, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiError> {
     Ok(axum::Json(app.jobs().get(job_id(&id)?).await?))
 }
 
 /// Cancels a job. A job that waits ends at once; a job that runs ends at its next checkpoint.
 #[utoipa::path(
-    post, path = "/v1/jobs/{id}/cancel", tag = "jobs",
-    responses(
-        (status = 202, description = "It will stop", body = Job),
-        (status = 409, description = "It has ended"),
-    )
+    post, path = "/v1/jobs/{id}/cancel",
+    responses((status = 202, description = "It will stop", body = Job), (status = 409, description = "It has ended"))
 )]
 async fn cancel(app: App, author: Author, Path(id): Path<String>) -> Result<impl IntoResponse, ApiError> {
     Ok(accepted(app.jobs().cancel(job_id(&id)?, &author).await?))
@@ -164,7 +155,7 @@ async fn cancel(app: App, author: Author, Path(id): Path<String>) -> Result<impl
 
 /// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
 #[utoipa::path(
-    post, path = "/v1/jobs/{id}/resume", tag = "jobs",
+    post, path = "/v1/jobs/{id}/resume",
     responses(
         (status = 202, description = "Queued again", body = Job),
         (status = 409, description = "It has not ended, or has succeeded"),
@@ -176,10 +167,7 @@ async fn resume(app: App, author: Author, Path(id): Path<String>) -> Result<impl
 }
 
 /// The log of a job.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}/logs", tag = "jobs",
-    responses((status = 200, body = Log))
-)]
+#[utoipa::path(get, path = "/v1/jobs/{id}/logs", responses((status = 200, body = Log)))]
 async fn logs(app: App, Path(id): Path<String>, Query(query): Query<LogQuery>) -> Result<axum::Json<Log>, ApiError> {
     let limit = page::checked_limit(query.limit, page::MAX_LIMIT)?;
     let lines = app.jobs().log(job_id(&id)?, query.after.unwrap_or(0), limit).await?;
@@ -187,10 +175,7 @@ async fn logs(app: App, Path(id): Path<String>, Query(query): Query<LogQuery>) -
 }
 
 /// The loss curves of a training.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}/metrics", tag = "jobs",
-    responses((status = 200, body = LossCurves))
-)]
+#[utoipa::path(get, path = "/v1/jobs/{id}/metrics", responses((status = 200, body = LossCurves)))]
 async fn metrics(app: App, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
     let points = app.jobs().losses(job_id(&id)?).await?;
     Ok(axum::Json(LossCurves { points }))
@@ -198,7 +183,7 @@ async fn metrics(app: App, Path(id): Path<String>) -> Result<axum::Json<LossCurv
 
 /// A file of an evaluation: its report or a figure. The job's `result.files` lists them.
 #[utoipa::path(
-    get, path = "/v1/jobs/{id}/files/{file}", tag = "jobs",
+    get, path = "/v1/jobs/{id}/files/{file}",
     responses(
         (status = 200, description = "The file", body = Vec<u8>, content_type = "application/octet-stream"),
         (status = 404, description = "No such job or file"),

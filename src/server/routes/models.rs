@@ -110,7 +110,7 @@ impl ModelDescription {
 
 /// Lists the loaded models.
 #[utoipa::path(
-    get, path = "/v1/models", tag = "models",
+    get, path = "/v1/models",
     responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
@@ -128,7 +128,7 @@ async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<ModelList
 
 /// Describes one model.
 #[utoipa::path(
-    get, path = "/v1/models/{model}", tag = "models",
+    get, path = "/v1/models/{model}",
     responses(
         (status = 200, body = ModelDescription),
         (status = 404, description = "No such model; the answer lists the models"),
@@ -143,7 +143,7 @@ async fn get(app: App, Path(model): Path<String>) -> Result<axum::Json<ModelDesc
 
 /// Makes a version the active one, on every server of the store and after a restart. Open streams keep their version.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/versions/{version}/activate", tag = "models",
+    post, path = "/v1/models/{model}/versions/{version}/activate",
     responses(
         (status = 200, description = "It is active", body = ModelDescription),
         (status = 404, description = "No such version; the answer lists the versions"),
@@ -163,7 +163,7 @@ async fn activate(
 
 /// Deletes a version that a job published.
 #[utoipa::path(
-    delete, path = "/v1/models/{model}/versions/{version}", tag = "models",
+    delete, path = "/v1/models/{model}/versions/{version}",
     responses(
         (status = 204, description = "Deleted"),
         (status = 404, description = "No such version; the answer lists the versions"),

@@ -105,7 +105,7 @@ impl WithFrames for PredictRequest {
 /// `frames` and the other fields as JSON in a part `request`. `Accept: image/png` gives a labelled contact sheet of the
 /// context and the prediction, `image/gif` an animation.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/predict", tag = "models",
+    post, path = "/v1/models/{model}/predict",
     request_body(content((PredictRequest = "application/json"), (PredictForm = "multipart/form-data"))),
     responses(
         (status = 200, description = "The prediction", content(

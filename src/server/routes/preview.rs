@@ -32,7 +32,7 @@ const TRIAL: u64 = 1;
 
 /// A contact sheet of a simulated trial: the context, the predicted frames and the true frames.
 #[utoipa::path(
-    get, path = "/v1/models/{model}/preview.png", tag = "models",
+    get, path = "/v1/models/{model}/preview.png",
     responses(
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
         (status = 422, description = "The simulator cannot make the frames that this model takes"),

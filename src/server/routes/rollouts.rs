@@ -105,7 +105,7 @@ impl WithFrames for RolloutRequest {
 /// Predicts a rollout for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
 /// `image/gif` an animation with all of them side by side.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/rollouts", tag = "models", request_body = RolloutRequest,
+    post, path = "/v1/models/{model}/rollouts", request_body = RolloutRequest,
     responses(
         (status = 200, description = "The rollouts", content(
             (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
@@ -134,7 +134,7 @@ async fn model_rollouts(
 
 /// Predicts a rollout for each of many plans from the session's last frame. The session does not change.
 #[utoipa::path(
-    post, path = "/v1/sessions/{id}/rollouts", tag = "sessions",
+    post, path = "/v1/sessions/{id}/rollouts",
     params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
     responses(
         (status = 200, description = "The rollouts", content(

@@ -29,7 +29,7 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 
 /// Opens a session, or continues one from its exported state.
 #[utoipa::path(
-    post, path = "/v1/sessions", tag = "sessions",
+    post, path = "/v1/sessions",
     responses(
         (status = 201, description = "Open; only this answer contains the token", body = CreatedSession),
         (status = 400, description = "Not JSON"),
@@ -56,7 +56,7 @@ async fn create(app: App, caller: Caller, Json(request): Json<CreateSession>) ->
 
 /// Lists the open sessions that this key opened; with the scope `admin`, those of all keys.
 #[utoipa::path(
-    get, path = "/v1/sessions", tag = "sessions",
+    get, path = "/v1/sessions",
     responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, caller: Caller, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
@@ -72,10 +72,7 @@ async fn list(app: App, caller: Caller, Query(page): Query<Page>) -> Result<axum
 }
 
 /// Describes a session that this key opened; with the scope `admin`, any session.
-#[utoipa::path(
-    get, path = "/v1/sessions/{id}", tag = "sessions",
-    responses((status = 200, body = SessionDescription))
-)]
+#[utoipa::path(get, path = "/v1/sessions/{id}", responses((status = 200, body = SessionDescription)))]
 async fn get(app: App, caller: Caller, Path(id): Path<String>) -> Result<axum::Json<SessionDescription>, ApiError> {
     let now = Instant::now();
     let session = app.sessions.find(&id, caller, now)?;
@@ -84,7 +81,7 @@ async fn get(app: App, caller: Caller, Path(id): Path<String>) -> Result<axum::J
 
 /// Deletes a session and ends its stream.
 #[utoipa::path(
-    delete, path = "/v1/sessions/{id}", tag = "sessions",
+    delete, path = "/v1/sessions/{id}",
     params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
     responses((status = 204, description = "Deleted"))
 )]
@@ -95,7 +92,7 @@ async fn delete(app: App, session: AuthorizedSession) -> StatusCode {
 
 /// Exports the session state, for `POST /v1/sessions` on this or another server.
 #[utoipa::path(
-    get, path = "/v1/sessions/{id}/state", tag = "sessions",
+    get, path = "/v1/sessions/{id}/state",
     params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
     responses((status = 200, body = ExportedState))
 )]

@@ -40,7 +40,7 @@ type Messages = Option<Extension<MessageBytes>>;
 /// frames. Sub-protocols: `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` describes the messages. If the
 /// session has an open stream, the new stream replaces it.
 #[utoipa::path(
-    get, path = "/v1/sessions/{id}/stream", tag = "sessions",
+    get, path = "/v1/sessions/{id}/stream",
     params(("id" = String, Path), ("token" = Option<String>, Query)),
     responses(
         (status = 101, description = "The WebSocket is open"),
@@ -62,7 +62,7 @@ async fn session_stream(
 
 /// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
 #[utoipa::path(
-    get, path = "/v1/models/{model}/stream", tag = "models",
+    get, path = "/v1/models/{model}/stream",
     responses(
         (status = 101, description = "The WebSocket is open"),
         (status = 400, description = "The server speaks none of the requested sub-protocols"),

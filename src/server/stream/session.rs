@@ -192,8 +192,10 @@ impl Ownership {
         let answer = if let Some(task) = task {
             let mut prediction = predictor.compute(model, task, Some(key)).await?;
             let core = &mut self.inner()?.core;
-            if missing.is_some() {
-                core.advance(step.seq, step.conditioning, &mut prediction, spec);
+            if missing.is_some()
+                && let Some(features) = prediction.features.pop()
+            {
+                core.state.advance(step.seq, features, step.conditioning, spec);
             }
             core.keep(step.timestamp_us, missing.unwrap_or(0), prediction)
         } else {

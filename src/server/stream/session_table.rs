@@ -62,7 +62,7 @@ impl SessionTable {
 
     /// The session. Errors: `NotFound`, `Gone`.
     fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, ApiError> {
-        let mut inner = self.current(now);
+        let inner = self.current(now);
         let session = inner.sessions.get(id).cloned();
         session.ok_or_else(|| {
             if inner.expired.iter().any(|expired| expired == id) {
@@ -95,7 +95,7 @@ impl SessionTable {
 
     /// The sessions after an id that the caller may see, in the order of their ids.
     pub(in crate::server) fn page(&self, after: &str, limit: usize, caller: Caller, now: Instant) -> Vec<Arc<Session>> {
-        let mut inner = self.current(now);
+        let inner = self.current(now);
         let later = inner
             .sessions
             .range::<str, _>((std::ops::Bound::Excluded(after), std::ops::Bound::Unbounded));

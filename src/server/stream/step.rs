@@ -41,21 +41,10 @@ impl FrameStep {
                 "steps is {found}; this server predicts 1 to {limit}"
             )));
         }
-        let unfit = |field| move |error: ValueError| StepError::Invalid(format!("{field}: {error}"));
-        let past = message
-            .action
-            .map(Action::try_from)
-            .transpose()
-            .map_err(unfit("action"))?;
-        let plan = message
-            .plan
-            .map(|plan| plan.into_iter().map(Action::try_from).collect());
-        let plan: Option<Vec<Action>> = plan.transpose().map_err(unfit("plan"))?;
-        let state = message
-            .state
-            .map(RobotState::try_from)
-            .transpose()
-            .map_err(unfit("state"))?;
+        let past: Option<Action> = message.action.map(|action| checked("action", action)).transpose()?;
+        let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked("plan", action)).collect();
+        let plan: Option<Vec<Action>> = message.plan.map(actions).transpose()?;
+        let state: Option<RobotState> = message.state.map(|state| checked("state", state)).transpose()?;
         let given = RawConditioning {
             past: past.as_slice(),
             plan: plan.as_deref(),
@@ -72,6 +61,10 @@ impl FrameStep {
             is_overtaken: false,
         })
     }
+}
+
+fn checked<T: TryFrom<Vec<f32>, Error = ValueError>>(field: &str, values: Vec<f32>) -> Result<T, StepError> {
+    T::try_from(values).map_err(|error| StepError::Invalid(format!("{field}: {error}")))
 }
 
 /// Why a frame was refused. The session stays as it was.
@@ -136,7 +129,7 @@ impl SessionCore {
         }
     }
 
-    /// How many frames are missing before this one; `None` if it was answered before. Errors: `Seq`, `Gap`.
+    /// How many frames are missing before this one; `None` if it was answered before. Errors: `Invalid`, `Gap`.
     pub(super) fn missing_before(&self, seq: u64) -> Result<Option<u64>, StepError> {
         let expected = self.state.next_seq();
         if seq == u64::MAX {
@@ -173,19 +166,6 @@ impl SessionCore {
     pub(super) fn last_answer(&self, timestamp_us: i64) -> StepAnswer {
         let last = self.last_answer.clone();
         last.unwrap_or_else(|| self.answer(timestamp_us, 0, None))
-    }
-
-    /// Advances the session by frame `seq`, of which this is the prediction.
-    pub(super) fn advance(
-        &mut self,
-        seq: u64,
-        conditioning: ConditioningInput,
-        prediction: &mut Prediction,
-        spec: &ModelSpec,
-    ) {
-        if let Some(features) = prediction.features.pop() {
-            self.state.advance(seq, features, conditioning, spec);
-        }
     }
 
     /// Keeps the prediction as the answer to the last frame.
