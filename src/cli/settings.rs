@@ -1,8 +1,10 @@
 //! The flags that set values of the configuration. Each flag has the name of its setting.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::builder::NonEmptyStringValueParser;
 use serde::Serialize;
 
 use super::error::CliError;
@@ -18,10 +20,10 @@ const HEADING: &str = "Settings";
 #[derive(clap::Args, Default, Serialize)]
 pub(super) struct DirectoryArgs {
     /// The data directory: data sets, published models and the database [default: data]
-    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
+    #[arg(global = true, long, value_name = "DIR", value_parser = NonEmptyStringValueParser::new(), help_heading = HEADING)]
     data_dir: Option<String>,
     /// The directory of the models that came with the program [default: models]
-    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
+    #[arg(global = true, long, value_name = "DIR", value_parser = NonEmptyStringValueParser::new(), help_heading = HEADING)]
     models_dir: Option<String>,
     /// A PostgreSQL URL, to share the database with other servers [default: SQLite in the data directory]
     #[arg(global = true, long, value_name = "URL", help_heading = HEADING, hide_short_help = true)]
@@ -37,7 +39,7 @@ pub(super) struct DirectoryArgs {
 impl DirectoryArgs {
     /// The configuration with these flags over everything else; starts the log.
     pub(super) fn start(&self) -> Result<Config, CliError> {
-        start(LoadedConfig::read(None, SettingsLayer::flags(self))?)
+        start(LoadedConfig::read(None, flag_layers(self))?)
     }
 }
 
@@ -66,7 +68,7 @@ impl CommonArgs {
     }
 
     fn load_with(&self, mut flags: Vec<SettingsLayer>) -> Result<LoadedConfig, CliError> {
-        flags.extend(SettingsLayer::flags(&self.directories));
+        flags.extend(flag_layers(&self.directories));
         for setting in &self.settings {
             flags.push(SettingsLayer::assignment(setting)?);
         }
@@ -98,8 +100,24 @@ pub(super) struct ServerArgs {
 impl ServerArgs {
     /// The configuration with these flags over everything else.
     pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
-        self.common.load_with(SettingsLayer::flags(self))
+        self.common.load_with(flag_layers(self))
     }
+}
+
+/// A layer for each flag that was given. Its origin is the flag, as `--data-dir` for the setting `data_dir`.
+fn flag_layers(flags: &impl Serialize) -> Vec<SettingsLayer> {
+    let flags = serde_json::to_value(flags).expect("a flag that is not JSON is a bug");
+    let given = flags
+        .as_object()
+        .into_iter()
+        .flatten()
+        .filter(|(_, value)| !value.is_null());
+    given
+        .map(|(key, value)| {
+            let flag = format!("--{}", key.replace('_', "-"));
+            SettingsLayer::serialized(flag, &BTreeMap::from([(key, value)]))
+        })
+        .collect()
 }
 
 fn start(loaded: LoadedConfig) -> Result<Config, CliError> {

@@ -90,10 +90,6 @@ struct PathExample {
     body: Value,
 }
 
-#[expect(
-    clippy::expect_used,
-    reason = "the examples are part of the program, and a test sends each"
-)]
 fn add_examples(contract: &mut Document) {
     let mut examples: BTreeMap<String, PathExample> =
         serde_json::from_str(EXAMPLES).expect("an example that is not JSON is a bug");
@@ -134,7 +130,6 @@ pub(super) fn frame() -> Document {
 }
 
 /// The contract with its paths, completed with what all paths have in common, as JSON with a line break at its end.
-#[expect(clippy::expect_used, reason = "the document is made of texts and maps")]
 pub(super) fn text(mut contract: Document) -> String {
     complete_variants(&mut contract);
     add_key(&mut contract);

@@ -160,18 +160,6 @@ impl SettingsLayer {
         }
     }
 
-    /// A layer for each field that is not empty. Its origin is the flag of the command line, as `--data-dir` for `data_dir`.
-    #[must_use]
-    pub fn flags(fields: &impl Serialize) -> Vec<Self> {
-        let values = Self::serialized("", fields).values;
-        let given = values
-            .into_iter()
-            .filter(|(_, value)| !matches!(value, Value::Empty(..)));
-        given
-            .map(|(key, value)| Self::value(format!("--{}", key.replace('_', "-")), &key, value))
-            .collect()
-    }
-
     /// These values, and those of another layer at the top level.
     #[must_use]
     pub fn with(mut self, other: Self) -> Self {

@@ -131,10 +131,6 @@ impl JobEventStream {
         Ok(())
     }
 
-    #[expect(
-        clippy::expect_used,
-        reason = "jobs and log lines are plain structs, always valid JSON"
-    )]
     fn push(&mut self, name: &str, id: Option<i64>, data: &impl serde::Serialize) {
         let event = Event::default().event(name).json_data(data);
         let event = event.expect("a job or a log line that is not JSON is a bug");
