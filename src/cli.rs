@@ -1,5 +1,5 @@
-//! The command line, one file for each subcommand. Exit code 2: the command cannot be carried out as it was given. Exit
-//! code 1: it failed. Exit code 130: it was interrupted.
+//! The command line, one file for each subcommand, or for two that belong together. Exit code 2: the command cannot be
+//! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
 //! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `process` and
 //! `progress`, `interrupt`, `settings`, `output`, `admin_address`, `workspace`.
@@ -23,8 +23,6 @@ mod predict;
 mod process;
 mod progress;
 mod publish;
-mod restore;
-mod run_job;
 mod serve;
 mod settings;
 mod train;
@@ -70,7 +68,7 @@ enum Command {
     Models(models::ModelsArgs),
     Keys(keys::KeysArgs),
     Backup(backup::BackupArgs),
-    Restore(restore::RestoreArgs),
+    Restore(backup::RestoreArgs),
     Config(config::ConfigArgs),
     Healthcheck(healthcheck::HealthcheckArgs),
     Worker(worker::WorkerArgs),
@@ -109,10 +107,10 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Worker(args) => worker::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Backup(args) => backup::run(&args),
-        Command::Restore(args) => restore::run(&args),
+        Command::Restore(args) => backup::run_restore(&args),
         Command::Config(args) => config::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
-        Command::RunJob => run_job::run(),
+        Command::RunJob => worker::run_job(),
         Command::Inspect(args) => inspect::run(&args),
         Command::Export(args) => export::run(&args),
     }

@@ -37,55 +37,38 @@
 //! `foreframe-sim`, `foreframe-data`, `foreframe-train` and `foreframe-jobs`, one a layer, change as the program needs it.
 #![deny(unsafe_code)]
 
-#[doc(inline)]
 pub use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-#[doc(inline)]
 pub use foreframe_core::frame::{Frame, FrameError};
-#[doc(inline)]
 pub use foreframe_core::nn::{
     Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec, NnError,
     PredictorOutput, Reconstruction, TensorError,
 };
-#[doc(inline)]
 pub use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,
 };
-#[doc(inline)]
 pub use foreframe_core::registry::{DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load};
-#[doc(inline)]
 pub use foreframe_core::serving::session::{SessionSnapshot, SnapshotError};
-#[doc(inline)]
 pub use foreframe_core::serving::{
     InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError, Session, Timing,
     predict,
 };
-#[doc(inline)]
 pub use foreframe_core::types::{Action, Channel, ModelName, RobotState, Seed, ValueError};
 
 /// Image files, resizing, and the measures of a prediction's error.
 pub mod images {
-    #[doc(inline)]
     pub use foreframe_core::frame::codec::{decode, encode_png};
-    #[doc(inline)]
     pub use foreframe_core::frame::jpeg::JpegDamage;
-    #[doc(inline)]
     pub use foreframe_core::frame::preprocess::Preprocess;
-    #[doc(inline)]
     pub use foreframe_core::frame::quality::{mse, psnr_db, ssim};
-    #[doc(inline)]
     pub use foreframe_core::frame::resize::{Resize, ResizeError, resize};
-    #[doc(inline)]
     pub use foreframe_core::frame::warp::CameraModel;
 }
 
 /// The simulated room: robots, physics and a camera.
 #[cfg(feature = "sim")]
 pub mod sim {
-    #[doc(inline)]
     pub use foreframe_sim::pid::Gains;
-    #[doc(inline)]
     pub use foreframe_sim::scenario::Route;
-    #[doc(inline)]
     pub use foreframe_sim::{
         CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, Scenario, SimError, StepResult,
         TrialParameters, World, WorldConfig, action_channels, state_channels,
@@ -95,18 +78,14 @@ pub mod sim {
 /// Data sets: simulated, imported, opened, inspected and exported.
 #[cfg(feature = "train")]
 pub mod dataset {
-    #[doc(inline)]
     pub use foreframe_data::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mcap, to_mp4};
-    #[doc(inline)]
     pub use foreframe_data::dataset::import::{
         ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, import,
     };
-    #[doc(inline)]
     pub use foreframe_data::dataset::{
         CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, Episode, EpisodeData, Split, Splits,
         Window, WindowShape, collect,
     };
-    #[doc(inline)]
     pub use foreframe_data::inspection::{
         ActionDelay, ChannelRole, ChannelSummary, ExposureJump, FramePlace, FrameTiming, FrozenSpan, Histogram,
         ImageSummary, Inspection, LagCorrelation, MotionSignal, TimeGap, inspect, page,
@@ -116,13 +95,9 @@ pub mod dataset {
 /// Training on a data set.
 #[cfg(feature = "train")]
 pub mod training {
-    #[doc(inline)]
     pub use foreframe_core::registry::{StoredWeights, load_weights};
-    #[doc(inline)]
     pub use foreframe_train::settings::{SettingsError, SettingsLayer};
-    #[doc(inline)]
     pub use foreframe_train::training::optimizer::OptimizerError;
-    #[doc(inline)]
     pub use foreframe_train::training::{
         Observer, TrainConfig, TrainError, Training, TrainingEvent, TrainingOutcome, TrainingStage, run,
     };
@@ -131,25 +106,16 @@ pub mod training {
 /// The scores of a model beside simple baselines.
 #[cfg(feature = "train")]
 pub mod evaluation {
-    #[doc(inline)]
     pub use foreframe_train::evaluation::actions::{ActionRow, ActionTable, Variant};
-    #[doc(inline)]
     pub use foreframe_train::evaluation::bootstrap::Interval;
-    #[doc(inline)]
     pub use foreframe_train::evaluation::method::Method;
-    #[doc(inline)]
     pub use foreframe_train::evaluation::metrics::{BenchmarkScores, MethodScores, StepCurve};
-    #[doc(inline)]
     pub use foreframe_train::evaluation::plans::{PlanIdentification, PlanOutcome};
-    #[doc(inline)]
     pub use foreframe_train::evaluation::report::{
         ModelSummary, ReportStamp, SampleWindow, SetOutcome, SetReport, SetScores,
     };
-    #[doc(inline)]
     pub use foreframe_train::evaluation::skill::Skill;
-    #[doc(inline)]
     pub use foreframe_train::evaluation::uncertainty::{NoveltyScores, UncertaintyScores};
-    #[doc(inline)]
     pub use foreframe_train::evaluation::{
         EvaluateConfig, EvaluationError, EvaluationProgress, EvaluationReport, EvaluationStage, ScoredSplit, calibrate,
         run,

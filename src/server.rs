@@ -29,5 +29,5 @@ pub use http::{keys, shutdown};
 pub use images::{ImageBytes, ImageFormat};
 pub use router::{openapi_document, router};
 pub use serve::{ServerListeners, serve};
-pub use state::{App, AppParts, ServerError};
+pub use state::{App, AppParts, start_jobs};
 pub use stream::protocol;

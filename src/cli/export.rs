@@ -1,7 +1,7 @@
 //! `foreframe export`
 
 use std::ops::Range;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::value_parser;
 use serde_json::json;
@@ -78,13 +78,20 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
     }
     let workspace = Workspace::new(args.settings.start()?);
     let (dir, dataset) = workspace.open_dataset(&args.dataset)?;
-    if args.to == ExportFormat::Lerobot {
-        return write_lerobot(args, &dataset);
+    match args.to {
+        ExportFormat::Lerobot => write_lerobot(args, &dataset),
+        ExportFormat::Mcap if !is_part => {
+            let episodes: Vec<_> = dataset.episodes().iter().map(Episode::frames).collect();
+            write_mcap(args, &dataset, &episodes)
+        }
+        ExportFormat::Mcap => write_mcap(args, &dataset, &[selected(args, &dir, &dataset)?]),
+        ExportFormat::Mp4 => write_mp4(args, &dataset, selected(args, &dir, &dataset)?),
+        ExportFormat::Png => write_png(args, &dataset, selected(args, &dir, &dataset)?),
     }
-    if args.to == ExportFormat::Mcap && !is_part {
-        let episodes: Vec<_> = dataset.episodes().iter().map(Episode::frames).collect();
-        return write_mcap(args, &dataset, &episodes);
-    }
+}
+
+/// The frames to write, counted over the whole data set.
+fn selected(args: &ExportArgs, dir: &Path, dataset: &Dataset) -> Result<Range<usize>, CliError> {
     let number = args.episode.unwrap_or(0);
     let find = |episode: &&Episode| episode.index == number;
     let episode = dataset.episodes().iter().find(find).ok_or_else(|| {
@@ -94,21 +101,15 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
             dataset.episodes().len()
         ))
     })?;
-    let range = selected(args, episode)?;
-    if args.to == ExportFormat::Mp4 {
-        return write_mp4(args, &dataset, range);
+    if args.first >= episode.frame_count {
+        return Err(CliError::Usage(format!(
+            "--first is {}; episode {number} has {} frames, counted from 0",
+            args.first, episode.frame_count
+        )));
     }
-    if args.to == ExportFormat::Mcap {
-        return write_mcap(args, &dataset, &[range]);
-    }
-    let output = OutputDirectory::create(&args.out)?;
-    write(&output, &dataset, range.clone())?;
-    output.finish()?;
-    print_line(format!(
-        "{}: {} frames, episode.gif, actions.json",
-        args.out.display(),
-        range.len()
-    ))
+    let count = args.count.map_or(usize::MAX, |count| count as usize);
+    let end = episode.frame_count.min(args.first.saturating_add(count));
+    Ok(episode.first_frame + args.first..episode.first_frame + end)
 }
 
 fn write_lerobot(args: &ExportArgs, dataset: &Dataset) -> Result<(), CliError> {
@@ -168,21 +169,8 @@ fn write_mp4(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Resul
     print_line(format!("{}: {frames} frames", args.out.display()))
 }
 
-/// The frames to write, counted over the whole data set.
-fn selected(args: &ExportArgs, episode: &Episode) -> Result<Range<usize>, CliError> {
-    if args.first >= episode.frame_count {
-        return Err(CliError::Usage(format!(
-            "--first is {}; episode {} has {} frames, counted from 0",
-            args.first, episode.index, episode.frame_count
-        )));
-    }
-    let count = args.count.map_or(usize::MAX, |count| count as usize);
-    let end = episode.frame_count.min(args.first.saturating_add(count));
-    Ok(episode.first_frame + args.first..episode.first_frame + end)
-}
-
-fn write(output: &OutputDirectory, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
-    let info = dataset.info();
+fn write_png(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {
+    let output = OutputDirectory::create(&args.out)?;
     let mut frames = Vec::with_capacity(range.len());
     for (index, frame) in range.clone().enumerate() {
         let frame = dataset.frame(frame)?;
@@ -190,11 +178,17 @@ fn write(output: &OutputDirectory, dataset: &Dataset, range: Range<usize>) -> Re
         output.write(&format!("frame-{index:03}.png"), &png)?;
         frames.push(frame);
     }
-    let delay_ms = (info.frame_period_s * 1000.0).round() as u32;
+    let delay_ms = (dataset.info().frame_period_s * 1000.0).round() as u32;
     let gif = enlarged_gif(&frames, delay_ms).map_err(CliError::failed)?;
     output.write("episode.gif", &gif)?;
     let actions: Vec<&[f32]> = range.clone().map(|frame| dataset.action(frame)).collect();
     let states: Vec<&[f32]> = range.map(|frame| dataset.state(frame)).collect();
     let text = json!({ "states": states, "actions": actions }).to_string();
-    output.write("actions.json", text.as_bytes())
+    output.write("actions.json", text.as_bytes())?;
+    output.finish()?;
+    print_line(format!(
+        "{}: {} frames, episode.gif, actions.json",
+        args.out.display(),
+        frames.len()
+    ))
 }

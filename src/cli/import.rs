@@ -64,7 +64,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             frame_height_px: args.size.1,
             ..args.options
         },
-        disk_mib: workspace.import_disk_mib(),
+        disk_mib: workspace.config.server.import_disk_mib,
     };
     let was_complete = is_finished(&out);
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));

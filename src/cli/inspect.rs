@@ -54,7 +54,7 @@ pub(super) fn run(args: &InspectArgs) -> Result<(), CliError> {
             None => model::describe(&dir, &loaded.manifest, args.json),
         };
     }
-    let config = workspace.config();
+    let config = &workspace.config;
     let models_dir = &config.server.models_dir;
     let misnamed = models_dir.join(name);
     if misnamed.join(registry::MANIFEST_FILE).is_file() {

@@ -34,19 +34,7 @@ pub(super) struct KeysArgs {
 enum KeysCommand {
     /// Create a key and print it. Only its hash is stored, so it cannot be shown again
     #[command(after_help = "Example:\n  foreframe keys create robot-7 --data-dir /var/lib/foreframe")]
-    Create {
-        /// Who will use it; for the list
-        name: String,
-        /// What it allows: predict, jobs or admin
-        #[arg(long, default_value_t = KeyScope::Admin)]
-        scope: KeyScope,
-        /// How long it is valid: a number with s, m, h or d, as in 30d [default: until it is revoked]
-        #[arg(long, value_name = "TIME", value_parser = duration_s)]
-        expires: Option<f64>,
-        /// How many requests a second each server accepts with it; others get 429 [default: no limit]
-        #[arg(long, value_name = "REQUESTS", value_parser = rate)]
-        rate: Option<f64>,
-    },
+    Create(CreateArgs),
     /// List the keys: id, state, age, scope, limits, name
     #[command(after_help = "Example:\n  foreframe keys list")]
     List,
@@ -58,30 +46,35 @@ enum KeysCommand {
     },
 }
 
+#[derive(clap::Args)]
+struct CreateArgs {
+    /// Who will use it; for the list
+    name: String,
+    /// What it allows: predict, jobs or admin
+    #[arg(long, default_value_t = KeyScope::Admin)]
+    scope: KeyScope,
+    /// How long it is valid: a number with s, m, h or d, as in 30d [default: until it is revoked]
+    #[arg(long, value_name = "TIME", value_parser = duration_s)]
+    expires: Option<f64>,
+    /// How many requests a second each server accepts with it; others get 429 [default: no limit]
+    #[arg(long, value_name = "REQUESTS", value_parser = rate)]
+    rate: Option<f64>,
+}
+
 pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
     let config = args.settings.start()?;
     block_on(async {
         let store = open_store(&config).await?;
         match &args.action {
-            KeysCommand::Create {
-                name,
-                scope,
-                expires,
-                rate,
-            } => create(&store, name, *scope, *expires, *rate).await,
+            KeysCommand::Create(args) => create(&store, args).await,
             KeysCommand::List => list(&store).await,
             KeysCommand::Revoke { id } => revoke(&store, id).await,
         }
     })
 }
 
-async fn create(
-    store: &Store,
-    name: &str,
-    scope: KeyScope,
-    expires_in_s: Option<f64>,
-    requests_per_s: Option<f64>,
-) -> Result<(), CliError> {
+async fn create(store: &Store, args: &CreateArgs) -> Result<(), CliError> {
+    let name = &args.name;
     if name.is_empty() || name.len() > 64 || name.chars().any(char::is_control) {
         return Err(CliError::Usage(format!(
             "{name:?} is not a name for a key; use one line of 1 to 64 bytes"
@@ -95,9 +88,9 @@ async fn create(
         hash: key.hash,
         created_s: now_s,
         revoked_s: None,
-        scope,
-        expires_s: expires_in_s.map(|seconds| now_s + seconds),
-        requests_per_s,
+        scope: args.scope,
+        expires_s: args.expires.map(|seconds| now_s + seconds),
+        requests_per_s: args.rate,
     };
     store.add_key(row, &Author::CommandLine).await?;
     print_line(key.text)

@@ -58,7 +58,7 @@ pub(super) fn run(args: &ModelsArgs) -> Result<(), CliError> {
 }
 
 async fn list(workspace: &Workspace, versions: &Versions) -> Result<(), CliError> {
-    let server = &workspace.config().server;
+    let server = &workspace.config.server;
     let all = versions.all().await?;
     if all.is_empty() {
         print_line(format!(

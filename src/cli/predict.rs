@@ -78,7 +78,7 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (_, loaded) = workspace.load_model(&args.model)?;
     let spec = loaded.spec();
-    let most = workspace.config().server.max_steps.max(spec.horizon);
+    let most = workspace.config.server.max_steps.max(spec.horizon);
     let steps = args.steps.unwrap_or(spec.horizon);
     if !(1..=most).contains(&steps) {
         return Err(CliError::Usage(format!(

@@ -3,7 +3,7 @@
 use tokio::net::TcpListener;
 use tracing::{info, warn};
 
-use super::admin_address::AdminAddress;
+use super::admin_address::{self, ADMIN_BIND};
 use super::error::CliError;
 use super::process::print_line;
 use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
@@ -32,7 +32,7 @@ pub(super) struct ServeArgs {
 
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let loaded = args.settings.load()?;
-    let admin = AdminAddress::of(&loaded);
+    let has_default_admin = loaded.is_default(ADMIN_BIND);
     let mut config = with_checked_directories(loaded)?;
     config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
@@ -43,13 +43,13 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .max_blocking_threads(config.server.request_threads)
         .build()
         .map_err(CliError::failed)?;
-    let result = runtime.block_on(listen(config, admin));
+    let result = runtime.block_on(listen(config, has_default_admin));
     // Tasks that did not end by the deadline are dropped.
     runtime.shutdown_background();
     result
 }
 
-async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
+async fn listen(config: Config, has_default_admin: bool) -> Result<(), CliError> {
     let tls = ServerTls::open(&config.server).map_err(|error| CliError::Usage(error.to_string()))?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let store = open_store_waiting(&config).await?;
@@ -61,10 +61,10 @@ async fn listen(config: Config, admin: AdminAddress) -> Result<(), CliError> {
         ))
     })?;
     let address = listener.local_addr().map_err(CliError::failed)?;
-    let admin = admin.listen().await?;
+    let admin = admin_address::listen(&config, has_default_admin).await?;
     let app = Box::pin(App::with_store(config.server, store))
         .await
-        .map_err(CliError::failed)?
+        .map_err(|error| CliError::failed(&*error))?
         .with_keys(keys)
         .with_tls(tls);
     report_models(&app);

@@ -1,7 +1,11 @@
 //! The flags that set values of the configuration. Each flag has the name of its setting.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
+
+use clap::builder::NonEmptyStringValueParser;
+use serde::Serialize;
 
 use super::error::CliError;
 use crate::config::{Config, LoadedConfig};
@@ -13,14 +17,14 @@ use foreframe_train::settings::SettingsLayer;
 const HEADING: &str = "Settings";
 
 /// Where data sets, models and state are.
-#[derive(clap::Args, Default)]
+#[derive(clap::Args, Default, Serialize)]
 pub(super) struct DirectoryArgs {
     /// The data directory: data sets, published models and the database [default: data]
-    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
-    data_dir: Option<PathBuf>,
+    #[arg(global = true, long, value_name = "DIR", value_parser = NonEmptyStringValueParser::new(), help_heading = HEADING)]
+    data_dir: Option<String>,
     /// The directory of the models that came with the program [default: models]
-    #[arg(global = true, long, value_name = "DIR", help_heading = HEADING)]
-    models_dir: Option<PathBuf>,
+    #[arg(global = true, long, value_name = "DIR", value_parser = NonEmptyStringValueParser::new(), help_heading = HEADING)]
+    models_dir: Option<String>,
     /// A PostgreSQL URL, to share the database with other servers [default: SQLite in the data directory]
     #[arg(global = true, long, value_name = "URL", help_heading = HEADING, hide_short_help = true)]
     database_url: Option<String>,
@@ -35,20 +39,7 @@ pub(super) struct DirectoryArgs {
 impl DirectoryArgs {
     /// The configuration with these flags over everything else; starts the log.
     pub(super) fn start(&self) -> Result<Config, CliError> {
-        start(LoadedConfig::read(None, self.layers())?)
-    }
-
-    fn layers(&self) -> Vec<SettingsLayer> {
-        let text = |path: &Option<PathBuf>| path.as_ref().map(|path| path.to_string_lossy().into_owned());
-        let flags = [
-            ("--data-dir", "data_dir", text(&self.data_dir)),
-            ("--models-dir", "models_dir", text(&self.models_dir)),
-            ("--database-url", "database_url", self.database_url.clone()),
-            ("--objects-url", "objects_url", self.objects_url.clone()),
-            ("--log-format", "log_format", self.log_format.clone()),
-        ];
-        let layer = |(flag, key, value): (&str, &str, Option<String>)| Some(SettingsLayer::value(flag, key, value?));
-        flags.into_iter().filter_map(layer).collect()
+        start(LoadedConfig::read(None, flag_layers(self))?)
     }
 }
 
@@ -77,7 +68,7 @@ impl CommonArgs {
     }
 
     fn load_with(&self, mut flags: Vec<SettingsLayer>) -> Result<LoadedConfig, CliError> {
-        flags.extend(self.directories.layers());
+        flags.extend(flag_layers(&self.directories));
         for setting in &self.settings {
             flags.push(SettingsLayer::assignment(setting)?);
         }
@@ -86,7 +77,7 @@ impl CommonArgs {
 }
 
 /// The settings of a server.
-#[derive(clap::Args, Default)]
+#[derive(clap::Args, Default, Serialize)]
 pub(super) struct ServerArgs {
     /// The address to listen on: an IP address or a name, with or without a port [default: 127.0.0.1:8642]
     #[arg(long, value_name = "HOST:PORT", help_heading = HEADING)]
@@ -99,29 +90,34 @@ pub(super) struct ServerArgs {
     run_jobs: Option<bool>,
     /// Accept requests from other machines although no API key exists
     #[arg(long, help_heading = HEADING)]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     insecure: bool,
     #[command(flatten)]
+    #[serde(skip)]
     common: CommonArgs,
 }
 
 impl ServerArgs {
     /// The configuration with these flags over everything else.
     pub(super) fn load(&self) -> Result<LoadedConfig, CliError> {
-        let mut flags = Vec::new();
-        if let Some(bind) = &self.bind {
-            flags.push(SettingsLayer::value("--bind", "bind", bind.clone()));
-        }
-        if let Some(port) = self.port {
-            flags.push(SettingsLayer::value("--port", "port", port));
-        }
-        if let Some(run_jobs) = self.run_jobs {
-            flags.push(SettingsLayer::value("--run-jobs", "run_jobs", run_jobs));
-        }
-        if self.insecure {
-            flags.push(SettingsLayer::value("--insecure", "insecure", true));
-        }
-        self.common.load_with(flags)
+        self.common.load_with(flag_layers(self))
     }
+}
+
+/// A layer for each flag that was given. Its origin is the flag, as `--data-dir` for the setting `data_dir`.
+fn flag_layers(flags: &impl Serialize) -> Vec<SettingsLayer> {
+    let flags = serde_json::to_value(flags).expect("a flag that is not JSON is a bug");
+    let given = flags
+        .as_object()
+        .into_iter()
+        .flatten()
+        .filter(|(_, value)| !value.is_null());
+    given
+        .map(|(key, value)| {
+            let flag = format!("--{}", key.replace('_', "-"));
+            SettingsLayer::serialized(flag, &BTreeMap::from([(key, value)]))
+        })
+        .collect()
 }
 
 fn start(loaded: LoadedConfig) -> Result<Config, CliError> {

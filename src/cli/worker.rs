@@ -1,19 +1,17 @@
-//! `foreframe worker`
+//! `foreframe worker` and `foreframe run-job`
 
 use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use super::admin_address::AdminAddress;
+use super::admin_address::{self, ADMIN_BIND};
 use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
-use crate::server::serve_worker_health;
-use crate::telemetry;
-use foreframe_jobs::jobs::pipeline::Pipeline;
-use foreframe_jobs::jobs::{Jobs, child};
+use crate::server::{serve_worker_health, start_jobs};
+use crate::telemetry::{self, LogFormat};
 use foreframe_jobs::versions::Versions;
 
 /// Run jobs without serving.
@@ -32,7 +30,7 @@ pub(super) struct WorkerArgs {
 
 pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
     let loaded = args.settings.load()?;
-    let admin = AdminAddress::of(&loaded);
+    let has_default_admin = loaded.is_default(ADMIN_BIND);
     let mut config = with_checked_directories(loaded)?;
     config.server.job_program = Some(std::env::current_exe().map_err(CliError::failed)?);
     let _telemetry = telemetry::init(config.log_format, config.otlp_endpoint.as_deref())?;
@@ -41,19 +39,27 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(CliError::failed)?;
-    runtime.block_on(work(&config, &admin))
+    runtime.block_on(work(&config, has_default_admin))
 }
 
-async fn work(config: &Config, admin: &AdminAddress) -> Result<(), CliError> {
+/// `foreframe run-job`: the child process of a server or worker that runs one job.
+pub(super) fn run_job() -> Result<(), CliError> {
+    let _telemetry = telemetry::init(LogFormat::Text, None)?;
+    child::run().map_err(CliError::Failed)
+}
+
+async fn work(config: &Config, has_default_admin: bool) -> Result<(), CliError> {
     let server = &config.server;
     let store = open_store_waiting(config).await?;
     let versions = Versions::new(store.clone(), &server.models_dir);
-    let pipeline = Pipeline::new(store.clone(), versions, server.job_resources());
-    let executor = child::executor(pipeline, server.job_process());
-    let jobs = Jobs::start(store.clone(), server.jobs(), executor, true).map_err(CliError::failed)?;
+    let jobs = start_jobs(server, &store, &versions, true).map_err(CliError::failed)?;
     let (stopping, is_stopping) = watch::channel(false);
     // Beside a server of the same machine, the default address would be taken.
-    let admin = if admin.is_default { None } else { admin.listen().await? };
+    let admin = if has_default_admin {
+        None
+    } else {
+        admin_address::listen(config, false).await?
+    };
     let admin = admin.map(|admin| {
         let (server, store) = (server.clone(), store.clone());
         tokio::spawn(async move { serve_worker_health(admin, &server, store, is_stopping).await })

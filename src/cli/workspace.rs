@@ -16,7 +16,7 @@ use foreframe_jobs::versions::{VersionError, Versions};
 
 /// The directories of a configuration.
 pub(super) struct Workspace {
-    config: Config,
+    pub(super) config: Config,
 }
 
 impl Workspace {
@@ -31,11 +31,6 @@ impl Workspace {
     /// Where data sets are kept by name.
     pub(super) fn datasets_dir(&self) -> PathBuf {
         self.server().data_dir.join("datasets")
-    }
-
-    /// Disk space for frames that an import decompresses, in MiB.
-    pub(super) fn import_disk_mib(&self) -> u64 {
-        self.server().import_disk_mib
     }
 
     /// Reads a data set by its directory or its name.
@@ -84,7 +79,12 @@ impl Workspace {
             let versions = self.versions().await?;
             let active = versions.active(&name).await?;
             let Some(version) = version.or(active) else {
-                return Err(self.unknown_model(name, versions.all().await?.into_keys()));
+                return Err(RegistryError::Unknown {
+                    name,
+                    dir: self.server().models_dir.clone(),
+                    known: versions.all().await?.into_keys().collect(),
+                }
+                .into());
             };
             Ok((
                 versions.directory(&name, version).await?,
@@ -108,15 +108,6 @@ impl Workspace {
         }
     }
 
-    fn unknown_model(&self, name: ModelName, known: impl Iterator<Item = ModelName>) -> CliError {
-        RegistryError::Unknown {
-            name,
-            dir: self.server().models_dir.clone(),
-            known: known.collect(),
-        }
-        .into()
-    }
-
     /// The versions of all models; opens the store.
     pub(super) async fn versions(&self) -> Result<Versions, CliError> {
         Ok(Versions::new(
@@ -136,11 +127,6 @@ impl Workspace {
             names.extend(published.into_keys());
         }
         Ok(names.into_iter().collect())
-    }
-
-    /// The settings.
-    pub(super) fn config(&self) -> &Config {
-        &self.config
     }
 }
 

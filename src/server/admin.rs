@@ -33,7 +33,7 @@ struct WorkerHealth {
 pub(super) fn server_router(app: &App) -> Router {
     let routes = health::routes().merge(metrics::routes());
     let routes = Router::from(routes).with_state(app.clone());
-    finish(routes, app.config(), app.keys().clone())
+    finish(routes, app.config(), app.keys.clone())
 }
 
 /// Answers `/livez`, `/readyz` and `/metrics` of a worker until it is dropped. `is_stopping`: the worker is not ready any

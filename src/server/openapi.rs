@@ -5,17 +5,16 @@ mod variants;
 
 use std::collections::BTreeMap;
 
-use axum::http::Method;
 use serde::Deserialize;
 use serde_json::Value;
-use utoipa::openapi::RefOr;
+use utoipa::OpenApi;
 use utoipa::openapi::path::{Parameter, ParameterBuilder};
 use utoipa::openapi::schema::{KnownFormat, Schema, SchemaFormat};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
-use utoipa::{Modify, OpenApi};
+use utoipa::openapi::{OpenApi as Document, RefOr};
 
-use self::responses::{Responses, operations};
-use self::variants::Variants;
+use self::responses::{complete_operations, operations};
+use self::variants::complete_variants;
 use super::http::access::required_scope;
 use super::http::problem::Problem;
 
@@ -42,52 +41,39 @@ use super::http::problem::Problem;
 struct Contract;
 
 /// How a request sends its API key. If authentication is on, a request without a valid key gets 401.
-struct KeySecurity;
-
-impl Modify for KeySecurity {
-    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
-        let scheme = HttpBuilder::new()
-            .scheme(HttpAuthScheme::Bearer)
-            .description(Some(
-                "An API key of this server, as `foreframe keys create` prints it. Each operation names the scope that it needs; `admin` includes `jobs`, and `jobs` includes `predict`.",
-            ))
-            .build();
-        let components = contract.components.get_or_insert_default();
-        components.add_security_scheme("key", SecurityScheme::Http(scheme));
-        for (path, item) in &mut contract.paths.paths {
-            for (method, operation) in [
-                (Method::GET, &mut item.get),
-                (Method::POST, &mut item.post),
-                (Method::DELETE, &mut item.delete),
-            ] {
-                if let Some(operation) = operation.as_mut().filter(|_| path.starts_with("/v1")) {
-                    let scope = required_scope(&method, path).name();
-                    let with_key = SecurityRequirement::new("key", [scope]);
-                    operation.security = Some(vec![SecurityRequirement::default(), with_key]);
-                }
-            }
+fn add_key(contract: &mut Document) {
+    let scheme = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some(
+            "An API key of this server, as `foreframe keys create` prints it. Each operation names the scope that it needs; `admin` includes `jobs`, and `jobs` includes `predict`.",
+        ))
+        .build();
+    let components = contract.components.get_or_insert_default();
+    components.add_security_scheme("key", SecurityScheme::Http(scheme));
+    let paths = contract.paths.paths.iter_mut();
+    for (path, item) in paths.filter(|(path, _)| path.starts_with("/v1")) {
+        for (method, operation) in operations(item) {
+            let scope = required_scope(&method, path).name();
+            let with_key = SecurityRequirement::new("key", [scope]);
+            operation.security = Some(vec![SecurityRequirement::default(), with_key]);
         }
     }
 }
 
 /// Makes the names of operations unique: a name that several resources use gets its tag in front.
-struct OperationIds;
-
-impl Modify for OperationIds {
-    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
-        let mut uses = BTreeMap::<String, usize>::new();
-        for operation in contract.paths.paths.values_mut().flat_map(operations) {
-            *uses
-                .entry(operation.operation_id.clone().unwrap_or_default())
-                .or_default() += 1;
-        }
-        for operation in contract.paths.paths.values_mut().flat_map(operations) {
-            let tag = operation.tags.iter().flatten().next();
-            if let (Some(id), Some(tag)) = (&mut operation.operation_id, tag)
-                && uses.get(id).is_some_and(|uses| *uses > 1)
-            {
-                *id = format!("{tag}_{id}");
-            }
+fn add_operation_ids(contract: &mut Document) {
+    let mut uses = BTreeMap::<String, usize>::new();
+    for (_, operation) in contract.paths.paths.values_mut().flat_map(operations) {
+        *uses
+            .entry(operation.operation_id.clone().unwrap_or_default())
+            .or_default() += 1;
+    }
+    for (_, operation) in contract.paths.paths.values_mut().flat_map(operations) {
+        let tag = operation.tags.iter().flatten().next();
+        if let (Some(id), Some(tag)) = (&mut operation.operation_id, tag)
+            && uses.get(id).is_some_and(|uses| *uses > 1)
+        {
+            *id = format!("{tag}_{id}");
         }
     }
 }
@@ -104,37 +90,29 @@ struct PathExample {
     body: Value,
 }
 
-struct Examples;
-
-impl Modify for Examples {
-    #[expect(
-        clippy::expect_used,
-        reason = "the examples are part of the program, and a test sends each"
-    )]
-    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
-        let mut examples: BTreeMap<String, PathExample> =
-            serde_json::from_str(EXAMPLES).expect("an example that is not JSON is a bug");
-        for (path, item) in &mut contract.paths.paths {
-            let example = examples.remove(path);
-            let model = example.as_ref().and_then(|example| example.model.as_deref());
-            for operation in operations(item) {
-                for parameter in operation.parameters.iter_mut().flatten() {
-                    let RefOr::T(parameter) = parameter else { continue };
-                    limit(parameter);
-                    if parameter.name == "model" {
-                        let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
-                        *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
-                    }
-                }
-                if let (Some(RefOr::T(body)), Some(example)) = (&mut operation.request_body, &example)
-                    && let Some(RefOr::T(content)) = body.content.get_mut("application/json")
-                {
-                    content.example = Some(example.body.clone());
+fn add_examples(contract: &mut Document) {
+    let mut examples: BTreeMap<String, PathExample> =
+        serde_json::from_str(EXAMPLES).expect("an example that is not JSON is a bug");
+    for (path, item) in &mut contract.paths.paths {
+        let example = examples.remove(path);
+        let model = example.as_ref().and_then(|example| example.model.as_deref());
+        for (_, operation) in operations(item) {
+            for parameter in operation.parameters.iter_mut().flatten() {
+                let RefOr::T(parameter) = parameter else { continue };
+                limit(parameter);
+                if parameter.name == "model" {
+                    let example = Some(model.unwrap_or(EXAMPLE_MODEL).into());
+                    *parameter = ParameterBuilder::from(parameter.clone()).example(example).build();
                 }
             }
+            if let (Some(RefOr::T(body)), Some(example)) = (&mut operation.request_body, &example)
+                && let Some(RefOr::T(content)) = body.content.get_mut("application/json")
+            {
+                content.example = Some(example.body.clone());
+            }
         }
-        assert!(examples.is_empty(), "an example without a path is a bug");
     }
+    assert!(examples.is_empty(), "an example without a path is a bug");
 }
 
 /// Says how large the number in a path can be: not every client knows the format `uint32`.
@@ -147,18 +125,17 @@ fn limit(parameter: &mut Parameter) {
 }
 
 /// The contract without its paths.
-pub(super) fn frame() -> utoipa::openapi::OpenApi {
+pub(super) fn frame() -> Document {
     Contract::openapi()
 }
 
 /// The contract with its paths, completed with what all paths have in common, as JSON with a line break at its end.
-#[expect(clippy::expect_used, reason = "the document is made of texts and maps")]
-pub(super) fn text(mut contract: utoipa::openapi::OpenApi) -> String {
-    Variants.modify(&mut contract);
-    KeySecurity.modify(&mut contract);
-    Responses.modify(&mut contract);
-    OperationIds.modify(&mut contract);
-    Examples.modify(&mut contract);
+pub(super) fn text(mut contract: Document) -> String {
+    complete_variants(&mut contract);
+    add_key(&mut contract);
+    complete_operations(&mut contract);
+    add_operation_ids(&mut contract);
+    add_examples(&mut contract);
     let mut text = contract.to_pretty_json().expect("a contract that is not JSON is a bug");
     text.push('\n');
     text

@@ -1,5 +1,7 @@
 //! All routes with the layers around them. A route is declared once, at its handler; this also makes the contract.
 
+use std::sync::Arc;
+
 use axum::extract::DefaultBodyLimit;
 use axum::middleware::from_fn_with_state;
 use axum::{Extension, Router};
@@ -15,8 +17,8 @@ use super::http::problem::ApiError;
 use super::http::requests;
 use super::openapi;
 use super::routes::{
-    audit, contract, dashboard, datasets, docs, environments, health, job_events, jobs, metrics, models, predict,
-    preview, rollouts, sessions, streams,
+    audit, datasets, environments, health, job_events, jobs, metrics, models, pages, predict, preview, rollouts,
+    sessions, streams,
 };
 use super::state::App;
 
@@ -24,20 +26,20 @@ use super::state::App;
 pub fn router(app: App) -> Router {
     let config = app.config();
     let api = request_routes(config)
-        .route_layer(from_fn_with_state(app.requests().clone(), requests::answer))
+        .route_layer(from_fn_with_state(app.requests.clone(), requests::answer))
         .merge(stream_routes())
-        .route_layer(from_fn_with_state(app.keys().clone(), keys::check));
+        .route_layer(from_fn_with_state(app.keys.clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();
     let document = openapi::text(contract);
-    let trace = RequestTrace::new(config, app.draining());
-    let origins = OriginPolicy::new(config, app.keys().clone());
+    let trace = RequestTrace::new(config, Arc::clone(&app.draining));
+    let origins = OriginPolicy::new(config, app.keys.clone());
     router
-        .merge(docs::routes())
-        .layer(Extension(contract::ContractText::from(document)))
+        .merge(pages::docs())
+        .layer(Extension(pages::ContractText(document.into())))
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
         .layer(DefaultBodyLimit::max(config.max_body_bytes))
-        .layer(from_fn_with_state(app.body_budget().clone(), body_budget::count))
+        .layer(from_fn_with_state(app.body_budget.clone(), body_budget::count))
         .layer(from_fn_with_state(origins, origin::check))
         .layer(from_fn_with_state(trace, middleware::trace))
         .with_state(app)
@@ -59,10 +61,9 @@ fn contract(config: &ServerConfig) -> OpenApi {
 /// The routes that need no API key.
 fn open_routes() -> OpenApiRouter<App> {
     OpenApiRouter::with_openapi(openapi::frame())
-        .merge(dashboard::routes())
+        .merge(pages::routes())
         .merge(health::routes())
         .merge(metrics::routes())
-        .merge(contract::routes())
 }
 
 /// The routes of requests; they need an API key if authentication is on.

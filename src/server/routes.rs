@@ -1,16 +1,14 @@
 //! The handlers, one resource a file. Each file declares its routes in a function `routes`.
 
 pub(super) mod audit;
-pub(super) mod contract;
-pub(super) mod dashboard;
 pub(super) mod datasets;
-pub(super) mod docs;
 pub(super) mod environments;
 pub(super) mod health;
 pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;
 pub(super) mod models;
+pub(super) mod pages;
 pub(super) mod predict;
 pub(super) mod preview;
 pub(super) mod rollouts;

@@ -1,5 +1,6 @@
 //! The life of a server: it accepts connections, drains, and stops within a deadline.
 
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tokio::net::TcpListener;
@@ -54,31 +55,27 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     let drain = Duration::from_millis(config.drain_ms);
     let (total, per_address) = (config.max_connections, config.max_connections_per_address);
     let listener = BoundedListener::new(listener, config, total, per_address);
-    let stopping = app.streams().stopping();
-    let mut connections = Connections::new(router(app.clone()), config, stopping, app.tls().cloned());
+    let stopping = app.streams.stopping();
+    let mut connections = Connections::new(router(app.clone()), config, stopping, app.tls.clone());
     tokio::select! {
         never = connections.accept(&listener) => match never {},
         never = metrics::keep_folded() => match never {},
-        never = ServerTls::keep_fresh(app.tls()) => match never {},
-        never = app.keys().keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
+        never = ServerTls::keep_fresh(app.tls.as_ref()) => match never {},
+        never = app.keys.keep_fresh(Duration::from_millis(config.key_refresh_ms)) => match never {},
         () = shutdown => {}
     }
     info!("stopping");
     let deadline = Instant::now() + limit;
-    app.drain();
+    app.draining.store(true, Ordering::Release);
     app.jobs().begin_stop();
     // Even without time to drain, established connections are accepted: their clients wait for an answer.
     let Err(_) = timeout(drain, connections.accept(&listener)).await;
     drop(listener);
-    app.streams().stop();
-    app.event_streams().stop();
+    app.streams.stop();
+    app.event_streams.stop();
     let answered = async {
         connections.ended().await;
-        tokio::join!(
-            app.requests().ended(),
-            app.streams().ended(),
-            app.event_streams().ended()
-        )
+        tokio::join!(app.requests.ended(), app.streams.ended(), app.event_streams.ended())
     };
     if timeout_at(deadline.into(), answered).await.is_err() {
         warn!("some requests or streams did not end within the deadline");
@@ -86,7 +83,7 @@ async fn serve_public(listener: TcpListener, app: App, shutdown: impl Future<Out
     let ended = async {
         let jobs_ended = app.jobs().finish_stop(deadline).await;
         let predictor = app.predictor().clone();
-        jobs_ended && app.blocking().run(move || predictor.stop()).await.is_ok()
+        jobs_ended && app.blocking.run(move || predictor.stop()).await.is_ok()
     };
     if timeout_at((deadline + GRACE).into(), ended).await == Ok(true) {
         info!("stopped");

@@ -1,68 +1,48 @@
 //! [`App`]: what the handlers share, and how it starts.
 
 use std::collections::BTreeSet;
+use std::convert::Infallible;
+use std::error::Error;
+use std::ops::Deref;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use axum::extract::FromRef;
+use axum::Extension;
+use axum::extract::rejection::ExtensionRejection;
+use axum::extract::{FromRef, FromRequestParts};
+use axum::http::request::Parts;
 use tracing::warn;
 
 use super::blocking::BlockingWork;
-use super::config::{ServerConfig, SettingError};
+use super::config::ServerConfig;
 use super::environments::Environments;
 use super::http::admission::Admission;
 use super::http::body_budget::BodyBudget;
 use super::http::keys::{Caller, Keys};
-use super::http::message_bytes::MessageBytes;
 use super::http::task_limit::{TaskLimit, stop_requested};
 use super::http::tls::ServerTls;
 use super::render_cache::RenderCache;
-use super::stream::connection::StreamServices;
 use super::stream::session_table::SessionTable;
 use foreframe_core::registry::Model;
-use foreframe_core::serving::{Predictor, ServingError};
-use foreframe_jobs::jobs::child;
+use foreframe_core::serving::Predictor;
 use foreframe_jobs::jobs::pipeline::Pipeline;
-use foreframe_jobs::jobs::{JobError, Jobs};
-use foreframe_jobs::store::{Store, StoreError};
-use foreframe_jobs::versions::{VersionError, Versions};
+use foreframe_jobs::jobs::{JobError, Jobs, child};
+use foreframe_jobs::store::{Author, Store};
+use foreframe_jobs::versions::Versions;
 
 /// How often the server checks which versions other servers of the same store activated.
 const FOLLOW_EVERY: Duration = Duration::from_secs(1);
 
-/// Why the server could not start.
-#[derive(Debug, thiserror::Error)]
-pub enum ServerError {
-    /// A setting is out of range.
-    #[error(transparent)]
-    Config(#[from] SettingError),
-    /// The predictor could not start.
-    #[error(transparent)]
-    Serving(#[from] ServingError),
-    /// The job runner could not start.
-    #[error(transparent)]
-    Jobs(#[from] JobError),
-    /// The store could not be opened.
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    /// The models could not be listed.
-    #[error(transparent)]
-    Versions(Box<VersionError>),
-}
-
-impl From<VersionError> for ServerError {
-    fn from(error: VersionError) -> Self {
-        Self::Versions(Box::new(error))
-    }
-}
+/// Why the server could not start; nobody tells the reasons apart.
+type StartError = Box<dyn Error + Send + Sync>;
 
 /// What the handlers share; clones share it too.
 #[derive(Clone)]
 pub struct App {
     shared: Arc<AppState>,
-    keys: Keys,
-    tls: Option<ServerTls>,
+    pub(super) keys: Keys,
+    pub(super) tls: Option<ServerTls>,
 }
 
 /// The parts of an [`App`] that have threads or a database.
@@ -77,66 +57,62 @@ pub struct AppParts {
     pub versions: Versions,
 }
 
-struct AppState {
-    config: Arc<ServerConfig>,
+/// What all clones of an [`App`] share.
+pub struct AppState {
     parts: AppParts,
-    streams: TaskLimit,
-    event_streams: TaskLimit,
-    requests: TaskLimit,
-    admission: Admission,
-    body_budget: BodyBudget,
-    predictions: BlockingWork,
-    render_cache: RenderCache,
-    blocking: BlockingWork,
-    environments: Environments,
-    draining: Arc<AtomicBool>,
-    sessions: SessionTable,
+    pub(super) config: Arc<ServerConfig>,
+    pub(super) streams: TaskLimit,
+    pub(super) event_streams: TaskLimit,
+    /// The requests that are being processed.
+    pub(super) requests: TaskLimit,
+    pub(super) admission: Admission,
+    pub(super) body_budget: BodyBudget,
+    /// The threads for images of predictions.
+    pub(super) predictions: BlockingWork,
+    pub(super) render_cache: RenderCache,
+    /// The threads for simulations and for what is neither a prediction nor a picture.
+    pub(super) blocking: BlockingWork,
+    pub(super) environments: Environments,
+    /// Whether the server is stopping: it still answers, but reports that it is not ready.
+    pub(super) draining: Arc<AtomicBool>,
+    pub(super) sessions: SessionTable,
+}
+
+impl Deref for App {
+    type Target = AppState;
+
+    fn deref(&self) -> &AppState {
+        &self.shared
+    }
 }
 
 impl App {
     /// Opens the store, loads the models to serve, and starts. To be called within a tokio runtime.
-    /// Errors: `Config`, `Store`, `Versions`, `Serving`, `Jobs`.
-    pub async fn open(config: ServerConfig) -> Result<Self, ServerError> {
-        config.validate()?;
+    pub async fn open(config: ServerConfig) -> Result<Self, StartError> {
         let store = Store::open(&config.store()).await?;
         Self::with_store(config, store).await
     }
 
-    /// The same with a store that is open already. Errors: `Config`, `Versions`, `Serving`, `Jobs`.
-    pub async fn with_store(config: ServerConfig, store: Store) -> Result<Self, ServerError> {
+    /// The same with a store that is open already.
+    pub async fn with_store(config: ServerConfig, store: Store) -> Result<Self, StartError> {
         config.validate()?;
         let versions = Versions::new(store.clone(), &config.models_dir);
         let models = versions.load_serving().await?;
-        Self::start_with(config, models, store, versions)
+        Self::start(config, models, store)
     }
 
     /// Starts the threads that predict with these models and that run jobs. To be called within a tokio runtime.
-    /// Errors: `Config`, `Serving`, `Jobs`.
-    pub fn start(config: ServerConfig, models: Vec<Model>, store: Store) -> Result<Self, ServerError> {
-        let versions = Versions::new(store.clone(), &config.models_dir);
-        Self::start_with(config, models, store, versions)
-    }
-
-    fn start_with(
-        config: ServerConfig,
-        models: Vec<Model>,
-        store: Store,
-        versions: Versions,
-    ) -> Result<Self, ServerError> {
+    pub fn start(config: ServerConfig, models: Vec<Model>, store: Store) -> Result<Self, StartError> {
         config.validate()?;
+        let versions = Versions::new(store.clone(), &config.models_dir);
         let predictor = Predictor::start(models, config.predictor())?;
-        let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_resources());
-        let executor = child::executor(pipeline, config.job_process());
-        let jobs = Jobs::start(store.clone(), config.jobs(), executor, config.run_jobs)?;
-        let app = Self::with_parts(
-            config,
-            AppParts {
-                predictor,
-                jobs,
-                store,
-                versions,
-            },
-        );
+        let parts = AppParts {
+            predictor,
+            jobs: start_jobs(&config, &store, &versions, config.run_jobs)?,
+            store,
+            versions,
+        };
+        let app = Self::with_parts(config, parts);
         tokio::spawn(follow(app.clone()));
         Ok(app)
     }
@@ -171,10 +147,6 @@ impl App {
         Self { tls, ..self }
     }
 
-    pub(super) fn tls(&self) -> Option<&ServerTls> {
-        self.tls.as_ref()
-    }
-
     /// The same app with these API keys. Without this call, authentication is off.
     #[must_use]
     pub fn with_keys(self, keys: Keys) -> Self {
@@ -184,109 +156,31 @@ impl App {
     /// The predictor.
     #[must_use]
     pub fn predictor(&self) -> &Predictor {
-        &self.shared.parts.predictor
+        &self.parts.predictor
     }
 
     /// The jobs.
     #[must_use]
     pub fn jobs(&self) -> &Jobs {
-        &self.shared.parts.jobs
+        &self.parts.jobs
     }
 
     /// Where metadata and files are kept.
     #[must_use]
     pub fn store(&self) -> &Store {
-        &self.shared.parts.store
+        &self.parts.store
     }
 
     /// The versions of the models.
     #[must_use]
     pub fn versions(&self) -> &Versions {
-        &self.shared.parts.versions
+        &self.parts.versions
     }
 
     /// The settings.
     #[must_use]
     pub fn config(&self) -> &ServerConfig {
-        &self.shared.config
-    }
-
-    pub(super) fn shared_config(&self) -> Arc<ServerConfig> {
-        Arc::clone(&self.shared.config)
-    }
-
-    pub(super) fn body_budget(&self) -> &BodyBudget {
-        &self.shared.body_budget
-    }
-
-    pub(super) fn keys(&self) -> &Keys {
-        &self.keys
-    }
-
-    pub(super) fn streams(&self) -> &TaskLimit {
-        &self.shared.streams
-    }
-
-    pub(super) fn event_streams(&self) -> &TaskLimit {
-        &self.shared.event_streams
-    }
-
-    /// The requests that are being processed.
-    pub(super) fn requests(&self) -> &TaskLimit {
-        &self.shared.requests
-    }
-
-    pub(super) fn admission(&self) -> &Admission {
-        &self.shared.admission
-    }
-
-    /// The threads for images of predictions.
-    pub(super) fn predictions(&self) -> &BlockingWork {
-        &self.shared.predictions
-    }
-
-    pub(super) fn render_cache(&self) -> &RenderCache {
-        &self.shared.render_cache
-    }
-
-    /// The threads for simulations and for what is neither a prediction nor a picture.
-    pub(super) fn blocking(&self) -> &BlockingWork {
-        &self.shared.blocking
-    }
-
-    pub(super) fn environments(&self) -> &Environments {
-        &self.shared.environments
-    }
-
-    pub(super) fn sessions(&self) -> &SessionTable {
-        &self.shared.sessions
-    }
-
-    /// Whether the server is stopping: it still answers, but reports that it is not ready.
-    pub(super) fn is_draining(&self) -> bool {
-        self.shared.draining.load(Ordering::Acquire)
-    }
-
-    pub(super) fn drain(&self) {
-        self.shared.draining.store(true, Ordering::Release);
-    }
-
-    /// Becomes true when the server stops.
-    pub(super) fn draining(&self) -> Arc<AtomicBool> {
-        Arc::clone(&self.shared.draining)
-    }
-
-    /// What a stream of that caller needs of this app.
-    pub(super) fn stream_services(&self, caller: Caller, messages: MessageBytes) -> StreamServices {
-        StreamServices {
-            config: self.shared_config(),
-            predictor: self.predictor().clone(),
-            blocking: self.predictions().clone(),
-            streams: self.streams().clone(),
-            keys: self.keys().clone(),
-            caller,
-            messages,
-        }
+        &self.config
     }
 
     /// What to do if no model is loaded; `None` if there is one.
@@ -303,22 +197,61 @@ impl App {
     }
 }
 
+impl FromRequestParts<App> for App {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(_: &mut Parts, app: &App) -> Result<Self, Infallible> {
+        Ok(app.clone())
+    }
+}
+
+impl FromRequestParts<App> for Caller {
+    type Rejection = ExtensionRejection;
+
+    async fn from_request_parts(parts: &mut Parts, app: &App) -> Result<Self, ExtensionRejection> {
+        let Extension(caller) = Extension::from_request_parts(parts, app).await?;
+        Ok(caller)
+    }
+}
+
+impl FromRequestParts<App> for Author {
+    type Rejection = ExtensionRejection;
+
+    async fn from_request_parts(parts: &mut Parts, app: &App) -> Result<Self, ExtensionRejection> {
+        let Extension(author) = Extension::from_request_parts(parts, app).await?;
+        Ok(author)
+    }
+}
+
 impl FromRef<App> for Admission {
     fn from_ref(app: &App) -> Self {
-        app.admission().clone()
+        app.admission.clone()
     }
 }
 
 impl FromRef<App> for Arc<ServerConfig> {
     fn from_ref(app: &App) -> Self {
-        app.shared_config()
+        Arc::clone(&app.config)
     }
+}
+
+/// Starts the runner of jobs. `runs_jobs`: it also works on them, instead of only accepting them. To be called within a tokio
+/// runtime.
+pub fn start_jobs(
+    config: &ServerConfig,
+    store: &Store,
+    versions: &Versions,
+    runs_jobs: bool,
+) -> Result<Jobs, JobError> {
+    let pipeline = Pipeline::new(store.clone(), versions.clone(), config.job_resources());
+    let executor = child::executor(pipeline, config.job_process());
+    Jobs::start(store.clone(), config.jobs(), executor, runs_jobs)
 }
 
 /// Loads the versions that were activated on other servers, or that a job published as the first of their name, until the
 /// server stops.
 async fn follow(app: App) {
-    let (mut stopping, mut refused) = (app.streams().stopping(), BTreeSet::new());
+    let (mut stopping, mut refused) = (app.streams.stopping(), BTreeSet::new());
     loop {
         tokio::select! {
             () = app.jobs().job_ended() => {}

@@ -302,7 +302,7 @@ async fn jobs_are_listed_by_kind_and_state_in_pages() {
         ),
         ("state=asleep", "unknown variant `asleep`"),
         ("before=7", "\"7\" is not a job id"),
-        ("limit=0", "limit: 0 is out of range; it must be 1 to 1000"),
+        ("limit=0", "limit is 0; it must be 1 to 1000"),
         ("colour=red", "unknown field `colour`"),
     ] {
         let detail = get(&app, &format!("{JOBS}?{query}")).await.detail(422);

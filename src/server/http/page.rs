@@ -5,9 +5,9 @@ use serde::Deserialize;
 use super::problem::ApiError;
 
 /// Entries of a page by default.
-const DEFAULT_LIMIT: usize = 100;
+pub(in crate::server) const DEFAULT_LIMIT: usize = 100;
 /// The maximum number of entries of a page.
-const MAX_LIMIT: usize = 1000;
+pub(in crate::server) const MAX_LIMIT: usize = 1000;
 
 /// Which page of a list.
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
@@ -23,7 +23,12 @@ pub(in crate::server) struct Page {
 }
 
 impl Page {
-    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`checked_limit`].
+    /// The maximum number of entries. Errors: `Unprocessable` if it is out of range.
+    pub(in crate::server) fn limit(&self) -> Result<usize, ApiError> {
+        checked_limit(self.limit, DEFAULT_LIMIT)
+    }
+
+    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`Page::limit`].
     pub(in crate::server) fn of<T>(
         &self,
         all: impl IntoIterator<Item = T>,
@@ -37,9 +42,18 @@ impl Page {
     }
 }
 
+/// Of the first entries, one more than the limit if there are so many, those of the page, and the key of the last one if more
+/// follow.
+pub(in crate::server) fn cut<T, K>(mut entries: Vec<T>, limit: usize, key: impl Fn(&T) -> K) -> (Vec<T>, Option<K>) {
+    let has_more = entries.len() > limit;
+    entries.truncate(limit);
+    let next = entries.last().filter(|_| has_more).map(key);
+    (entries, next)
+}
+
 /// The maximum number of entries of a page. Errors: `Unprocessable` if it is out of range.
-pub(in crate::server) fn checked_limit(limit: Option<usize>) -> Result<usize, ApiError> {
-    let limit = limit.unwrap_or(DEFAULT_LIMIT);
+pub(in crate::server) fn checked_limit(limit: Option<usize>, default: usize) -> Result<usize, ApiError> {
+    let limit = limit.unwrap_or(default);
     if (1..=MAX_LIMIT).contains(&limit) {
         return Ok(limit);
     }

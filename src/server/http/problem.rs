@@ -1,6 +1,7 @@
 //! The HTTP status of an error, and the one shape that errors have: problem details (RFC 9457).
 
 use std::error::Error;
+use std::fmt::Display;
 
 use axum::body::Body;
 use axum::http::{HeaderValue, StatusCode, header};
@@ -166,6 +167,11 @@ impl IntoResponse for ApiError {
         response.extensions_mut().insert(Problem::new(status, slug, &detail));
         response
     }
+}
+
+/// The answer to a request in which a field cannot be used.
+pub(in crate::server) fn unfit<E: Display>(field: &str) -> impl Fn(E) -> ApiError {
+    move |error| ApiError::Unprocessable(format!("{field}: {error}"))
 }
 
 /// Writes the body of an error response.

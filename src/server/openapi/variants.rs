@@ -3,13 +3,8 @@
 use std::collections::BTreeMap;
 
 use serde_json::Value;
-use utoipa::Modify;
 use utoipa::openapi::schema::{Discriminator, OneOf, Schema};
-use utoipa::openapi::{Ref, RefOr};
-
-/// utoipa writes such an enum as `allOf` of the variant's fields and the property. A variant that allows no additional
-/// properties then refuses the property, and every body with it. So the property moves into the variant.
-pub(super) struct Variants;
+use utoipa::openapi::{OpenApi, Ref, RefOr};
 
 /// A variant of an enum.
 struct TaggedVariant {
@@ -21,25 +16,25 @@ struct TaggedVariant {
     value: String,
 }
 
-impl Modify for Variants {
-    fn modify(&self, contract: &mut utoipa::openapi::OpenApi) {
-        let components = contract.components.get_or_insert_default();
-        let mut found = Vec::new();
-        for schema in components.schemas.values_mut() {
-            if let RefOr::T(Schema::OneOf(union)) = schema
-                && let Some(variants) = union.items.iter().map(TaggedVariant::of).collect::<Option<Vec<_>>>()
-            {
-                discriminate(union, &variants);
-                found.extend(variants);
-            }
+/// utoipa writes such an enum as `allOf` of the variant's fields and the property. A variant that allows no additional
+/// properties then refuses the property, and every body with it. So the property moves into the variant.
+pub(super) fn complete_variants(contract: &mut OpenApi) {
+    let components = contract.components.get_or_insert_default();
+    let mut found = Vec::new();
+    for schema in components.schemas.values_mut() {
+        if let RefOr::T(Schema::OneOf(union)) = schema
+            && let Some(variants) = union.items.iter().map(TaggedVariant::of).collect::<Option<Vec<_>>>()
+        {
+            discriminate(union, &variants);
+            found.extend(variants);
         }
-        for variant in found {
-            let name = variant.location.rsplit('/').next().unwrap_or_default();
-            if let Some(RefOr::T(Schema::Object(object))) = components.schemas.get_mut(name) {
-                let (property, schema) = variant.property;
-                object.required.insert(0, property.clone());
-                object.properties.insert(property, schema);
-            }
+    }
+    for variant in found {
+        let name = variant.location.rsplit('/').next().unwrap_or_default();
+        if let Some(RefOr::T(Schema::Object(object))) = components.schemas.get_mut(name) {
+            let (property, schema) = variant.property;
+            object.required.insert(0, property.clone());
+            object.properties.insert(property, schema);
         }
     }
 }

@@ -1,13 +1,12 @@
 //! The audit trail.
 
-use axum::extract::State;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::server::http::extract::Query;
 use crate::server::http::page;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_jobs::store::audit::AuditRow;
 
@@ -19,43 +18,10 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct AuditList {
     /// The newest first.
-    entries: Vec<AuditEntry>,
+    entries: Vec<AuditRow>,
     /// The value of `before` for the next page; absent on the last page.
     #[serde(skip_serializing_if = "Option::is_none")]
     next: Option<i64>,
-}
-
-/// A change of state.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-struct AuditEntry {
-    /// Its number, from 1. The oldest are deleted.
-    number: i64,
-    /// When, in seconds since 1970.
-    unix_s: f64,
-    /// The id of an API key, `anonymous` (authentication is off) or `command line`.
-    who: String,
-    /// The name of that key.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<String>,
-    /// `job.create`, `job.cancel`, `job.resume`, `version.publish`, `version.activate`, `version.delete`, `dataset.delete`,
-    /// `key.create` or `key.revoke`. The entry of `dataset.delete` is written before the files are deleted; if that fails,
-    /// `dataset.delete.failed` follows.
-    action: String,
-    /// The job, the version (`NAME@VERSION`), the data set or the key.
-    target: String,
-}
-
-impl From<AuditRow> for AuditEntry {
-    fn from(row: AuditRow) -> Self {
-        Self {
-            number: row.number,
-            unix_s: row.time_s,
-            who: row.who,
-            name: row.name,
-            action: row.action,
-            target: row.target,
-        }
-    }
 }
 
 /// Which changes to list.
@@ -72,22 +38,17 @@ struct AuditQuery {
 
 /// Who changed what and when, the newest first. Needs the scope `admin`.
 #[utoipa::path(
-    get, path = "/v1/audit", tag = "about", operation_id = "audit", params(AuditQuery),
+    get, path = "/v1/audit", tag = "about", operation_id = "audit",
     responses(
         (status = 200, body = AuditList),
-        (status = 422, description = "A number is out of range", body = Problem),
-        (status = 503, description = "The database cannot be read now", body = Problem),
+        (status = 422, description = "A number is out of range"),
+        (status = 503, description = "The database cannot be read now"),
     )
 )]
-async fn list(State(app): State<App>, Query(query): Query<AuditQuery>) -> Result<axum::Json<AuditList>, ApiError> {
-    let limit = page::checked_limit(query.limit)?;
-    let rows = app
-        .store()
-        .audit(query.before, limit as i64 + 1)
-        .await
-        .map_err(|error| ApiError::of_own_data(&error))?;
-    let has_more = rows.len() > limit;
-    let entries: Vec<AuditEntry> = rows.into_iter().take(limit).map(AuditEntry::from).collect();
-    let next = entries.last().filter(|_| has_more).map(|entry| entry.number);
+async fn list(app: App, Query(query): Query<AuditQuery>) -> Result<axum::Json<AuditList>, ApiError> {
+    let limit = page::checked_limit(query.limit, page::DEFAULT_LIMIT)?;
+    let rows = app.store().audit(query.before, limit as i64 + 1).await;
+    let rows = rows.map_err(|error| ApiError::of_own_data(&error))?;
+    let (entries, next) = page::cut(rows, limit, |entry| entry.number);
     Ok(axum::Json(AuditList { entries, next }))
 }

@@ -1,22 +1,20 @@
 //! The data sets, and pictures of their episodes.
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::picture::PictureError;
+use super::picture;
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::types::{Channel, DatasetName};
-use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo};
+use foreframe_data::dataset::{Dataset, DatasetError};
 use foreframe_jobs::jobs::{JobError, datasets};
 use foreframe_jobs::store::Author;
 use foreframe_train::evaluation::figures::animation::enlarged_gif;
@@ -78,33 +76,13 @@ struct DatasetDescription {
     has_masks: bool,
 }
 
-impl DatasetDescription {
-    fn new(name: String, info: DatasetInfo) -> Self {
-        Self {
-            name,
-            title: info.name,
-            episodes: info.episode_count,
-            frames: info.frame_count,
-            frame_width_px: info.frame_width_px,
-            frame_height_px: info.frame_height_px,
-            frame_period_s: info.frame_period_s,
-            actions: info.action_channels,
-            states: info.state_channels,
-            content_hash: info.content_hash,
-            scenario: info.scenario,
-            seed: info.seed.map(|seed| seed.0),
-            has_masks: info.has_masks,
-        }
-    }
-}
-
 /// Lists the finished data sets.
 #[utoipa::path(
-    get, path = "/v1/datasets", tag = "datasets", params(Page),
-    responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range", body = Problem))
+    get, path = "/v1/datasets",
+    responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range"))
 )]
-async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
-    let _turn = app.render_cache().turn().await;
+async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {
+    let _turn = app.render_cache.turn().await;
     let names = datasets::names(app.store().objects()).await?;
     let (names, next) = page.of(names, DatasetName::as_str)?;
     let mut datasets = Vec::new();
@@ -116,31 +94,21 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
 }
 
 /// Describes a data set.
-#[utoipa::path(
-    get, path = "/v1/datasets/{dataset}", tag = "datasets",
-    params(("dataset" = String, Path, description = "The data set's name")),
-    responses((status = 200, body = DatasetDescription), (status = 404, description = "No such data set", body = Problem))
-)]
-async fn get(State(app): State<App>, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
+#[utoipa::path(get, path = "/v1/datasets/{dataset}", responses((status = 200, body = DatasetDescription)))]
+async fn get(app: App, Path(name): Path<String>) -> Result<axum::Json<DatasetDescription>, ApiError> {
     let name = dataset_name(&app, &name).await?;
     describe(&app, &name).await.map(axum::Json)
 }
 
 /// Deletes a data set that no job uses; also an unfinished one of a collection that was cancelled or failed.
 #[utoipa::path(
-    delete, path = "/v1/datasets/{dataset}", tag = "datasets",
-    params(("dataset" = String, Path, description = "The data set's name")),
+    delete, path = "/v1/datasets/{dataset}",
     responses(
         (status = 204, description = "Deleted"),
-        (status = 404, description = "No such data set", body = Problem),
-        (status = 409, description = "A job that has not ended uses it", body = Problem),
+        (status = 409, description = "A job that has not ended uses it"),
     )
 )]
-async fn delete(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
-    Path(name): Path<String>,
-) -> Result<StatusCode, ApiError> {
+async fn delete(app: App, author: Author, Path(name): Path<String>) -> Result<StatusCode, ApiError> {
     let name = dataset_name(&app, &name).await?;
     let open = app.jobs().open().await?;
     if let Some(job) = open.into_iter().find(|job| *job.spec.dataset() == name) {
@@ -152,47 +120,33 @@ async fn delete(
 
 /// A contact sheet of an episode.
 #[utoipa::path(
-    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.png", tag = "datasets",
-    params(
-        ("dataset" = String, Path, description = "The data set's name"),
-        ("episode" = usize, Path, description = "The episode's number, from 0"),
-    ),
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.png",
     responses(
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
-        (status = 404, description = "No such data set or episode", body = Problem),
+        (status = 404, description = "No such data set or episode"),
     )
 )]
-async fn sheet(
-    State(app): State<App>,
-    Path((name, episode)): Path<(String, usize)>,
-) -> Result<impl IntoResponse, ApiError> {
+async fn sheet(app: App, Path((name, episode)): Path<(String, usize)>) -> Result<impl IntoResponse, ApiError> {
     let name = dataset_name(&app, &name).await?;
     let title = format!("{name}, episode {episode}");
     let draw = move |frames, _| contact_sheet(&title, frames);
-    let png = picture(&app, &name, episode, "png", draw).await?;
+    let png = episode_picture(&app, &name, episode, "png", draw).await?;
     Ok(([(header::CONTENT_TYPE, "image/png")], png))
 }
 
 /// An episode in motion.
 #[utoipa::path(
-    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.gif", tag = "datasets",
-    params(
-        ("dataset" = String, Path, description = "The data set's name"),
-        ("episode" = usize, Path, description = "The episode's number, from 0"),
-    ),
+    get, path = "/v1/datasets/{dataset}/episodes/{episode}/preview.gif",
     responses(
         (status = 200, description = "The animation", body = Vec<u8>, content_type = "image/gif"),
-        (status = 404, description = "No such data set or episode", body = Problem),
+        (status = 404, description = "No such data set or episode"),
     )
 )]
-async fn animation(
-    State(app): State<App>,
-    Path((name, episode)): Path<(String, usize)>,
-) -> Result<impl IntoResponse, ApiError> {
+async fn animation(app: App, Path((name, episode)): Path<(String, usize)>) -> Result<impl IntoResponse, ApiError> {
     let name = dataset_name(&app, &name).await?;
-    let gif = picture(&app, &name, episode, "gif", |mut frames, period_s| {
+    let gif = episode_picture(&app, &name, episode, "gif", |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
-        enlarged_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+        enlarged_gif(&frames, picture::delay_ms(period_s))
     });
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
 }
@@ -204,12 +158,26 @@ async fn dataset_name(app: &App, text: &str) -> Result<DatasetName, ApiError> {
 
 async fn describe(app: &App, name: &DatasetName) -> Result<DatasetDescription, ApiError> {
     let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
-    Ok(DatasetDescription::new(name.to_string(), info))
+    Ok(DatasetDescription {
+        name: name.to_string(),
+        title: info.name,
+        episodes: info.episode_count,
+        frames: info.frame_count,
+        frame_width_px: info.frame_width_px,
+        frame_height_px: info.frame_height_px,
+        frame_period_s: info.frame_period_s,
+        actions: info.action_channels,
+        states: info.state_channels,
+        content_hash: info.content_hash,
+        scenario: info.scenario,
+        seed: info.seed.map(|seed| seed.0),
+        has_masks: info.has_masks,
+    })
 }
 
 /// A picture of an episode's frames, given them and the seconds from one to the next. It is kept as long as the data set
 /// has the same content.
-async fn picture(
+async fn episode_picture(
     app: &App,
     name: &DatasetName,
     episode: usize,
@@ -218,15 +186,15 @@ async fn picture(
 ) -> Result<Bytes, ApiError> {
     let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
     let key = format!("dataset/{name}/{}/{episode}.{kind}", info.content_hash);
-    if let Some(picture) = app.render_cache().cached(&key) {
+    if let Some(picture) = app.render_cache.cached(&key) {
         return Ok(picture);
     }
     let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
     let make = move || {
         let frames = Dataset::episode_frames(&dir, episode)?;
-        Ok::<_, ApiError>(draw(frames, info.frame_period_s).map_err(PictureError::from)?)
+        draw(frames, info.frame_period_s).map_err(picture::not_drawn)
     };
-    app.render_cache().get_or_make(key, make).await
+    app.render_cache.get_or_make(key, make).await
 }
 
 /// Frames spread evenly over an episode, in rows, each with its number.
@@ -239,13 +207,7 @@ fn contact_sheet(title: &str, frames: Vec<Frame>) -> Result<Vec<u8>, FrameError>
         .step_by(stride)
         .map(|(number, frame)| (number.to_string(), frame))
         .collect();
-    let rows: Vec<MontageRow> = shown
-        .chunks(ROW_FRAMES)
-        .map(|cells| MontageRow {
-            label: String::new(),
-            cells: cells.to_vec(),
-        })
-        .collect();
+    let rows: Vec<MontageRow> = shown.chunks(ROW_FRAMES).map(picture::unlabelled).collect();
     montage(title, &rows, &style).and_then(|sheet| codec::encode_png(&sheet))
 }
 

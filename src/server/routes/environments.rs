@@ -3,10 +3,8 @@
 use std::sync::{MutexGuard, PoisonError};
 use std::time::Instant;
 
-use axum::Extension;
-use axum::extract::State;
-use axum::http::{HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -14,11 +12,11 @@ use utoipa_axum::routes;
 use crate::server::environments::SharedEnvironment;
 use crate::server::http::extract::{Json, Path};
 use crate::server::http::keys::Caller;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::{ApiError, unfit};
 use crate::server::images::{self, ImageBytes, ImageFormat};
 use crate::server::state::App;
 use foreframe_core::nn::spec::MAX_MODEL_SIDE_PX;
-use foreframe_core::types::{Action, Channel, Seed, ValueError};
+use foreframe_core::types::{Action, Channel, Seed};
 use foreframe_sim::{
     Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig, action_channels,
     state_channels,
@@ -51,7 +49,6 @@ struct NewEnvironment {
 #[serde(deny_unknown_fields)]
 struct ResetRequest {
     /// Begins the sequence of this seed. Without it, the next trial of the current sequence begins.
-    #[serde(default)]
     seed: Option<u64>,
 }
 
@@ -128,114 +125,78 @@ struct StepBody {
     info: Info,
 }
 
-/// Why a request to an environment failed.
-#[derive(Debug, thiserror::Error)]
-enum EnvironmentError {
-    #[error("world: a frame of {width}×{height} px; the maximum is {MAX_MODEL_SIDE_PX}×{MAX_MODEL_SIDE_PX} px")]
-    FrameSize { width: u32, height: u32 },
-    #[error("world: {0}")]
-    World(SimError),
-    #[error("action: {0}")]
-    Value(#[from] ValueError),
-    #[error("action: {0}")]
-    Step(SimError),
-    #[error("the episode is over; reset the environment to begin the next")]
-    Ended,
-    #[error(transparent)]
-    Image(#[from] images::ImageError),
-}
-
 /// Creates a simulated robot that you can drive. If all environments are in use, it replaces the one that was idle the
 /// longest, if that was idle for some seconds.
 #[utoipa::path(
-    post, path = "/v1/environments", tag = "environments", request_body = NewEnvironment,
+    post, path = "/v1/environments",
     responses(
         (status = 201, description = "Created; the header Location names it", body = EnvironmentBody),
-        (status = 422, description = "Not a valid world; the answer names the field", body = Problem),
-        (status = 503, description = "All environments are in use", body = Problem),
+        (status = 422, description = "Not a valid world; the answer names the field"),
+        (status = 503, description = "All environments are in use"),
     )
 )]
-async fn create(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
-    Json(request): Json<NewEnvironment>,
-) -> Result<Response, ApiError> {
-    let (environment, body) = app.blocking().run(move || begin(&request)).await??;
-    let id = app.environments().add(environment, caller, Instant::now())?;
-    let location = HeaderValue::from_str(&format!("/v1/environments/{id}"));
-    let mut response = (StatusCode::CREATED, axum::Json(EnvironmentBody { id, ..body })).into_response();
-    if let Ok(location) = location {
-        response.headers_mut().insert(header::LOCATION, location);
-    }
-    Ok(response)
+async fn create(app: App, caller: Caller, Json(request): Json<NewEnvironment>) -> Result<impl IntoResponse, ApiError> {
+    let (environment, body) = app.blocking.run(move || begin(&request)).await??;
+    let id = app.environments.add(environment, caller, Instant::now())?;
+    let location = format!("/v1/environments/{id}");
+    let created = axum::Json(EnvironmentBody { id, ..body });
+    Ok((StatusCode::CREATED, [(header::LOCATION, location)], created))
 }
 
 /// Begins the next episode.
-#[utoipa::path(
-    post, path = "/v1/environments/{id}/reset", tag = "environments", request_body = ResetRequest,
-    params(("id" = String, Path, description = "The environment's id")),
-    responses(
-        (status = 200, body = ResetBody),
-        (status = 404, description = "No such environment of this API key; one that nobody steps is dropped", body = Problem),
-    )
-)]
+#[utoipa::path(post, path = "/v1/environments/{id}/reset", responses((status = 200, body = ResetBody)))]
 async fn reset(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    app: App,
+    caller: Caller,
     Path(id): Path<String>,
     Json(request): Json<ResetRequest>,
 ) -> Result<axum::Json<ResetBody>, ApiError> {
-    let environment = app.environments().get(&id, caller, Instant::now())?;
+    let environment = app.environments.get(&id, caller, Instant::now())?;
     let work = move || restart(&mut lock(&environment), request.seed.map(Seed));
-    Ok(axum::Json(app.blocking().run(work).await??))
+    Ok(axum::Json(app.blocking.run(work).await??))
 }
 
 /// Applies an action for one frame period.
 #[utoipa::path(
-    post, path = "/v1/environments/{id}/step", tag = "environments", request_body = StepRequest,
-    params(("id" = String, Path, description = "The environment's id")),
+    post, path = "/v1/environments/{id}/step",
     responses(
         (status = 200, body = StepBody),
-        (status = 404, description = "No such environment of this API key; one that nobody steps is dropped", body = Problem),
-        (status = 409, description = "The episode is over", body = Problem),
-        (status = 422, description = "Not an action of this environment", body = Problem),
+        (status = 409, description = "The episode is over"),
+        (status = 422, description = "Not an action of this environment"),
     )
 )]
 async fn step(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    app: App,
+    caller: Caller,
     Path(id): Path<String>,
     Json(request): Json<StepRequest>,
 ) -> Result<axum::Json<StepBody>, ApiError> {
-    let environment = app.environments().get(&id, caller, Instant::now())?;
+    let environment = app.environments.get(&id, caller, Instant::now())?;
     let work = move || advance(&mut lock(&environment), request.action);
-    Ok(axum::Json(app.blocking().run(work).await??))
+    Ok(axum::Json(app.blocking.run(work).await??))
 }
 
 /// Deletes an environment.
 #[utoipa::path(
-    delete, path = "/v1/environments/{id}", tag = "environments",
-    params(("id" = String, Path, description = "The environment's id")),
+    delete, path = "/v1/environments/{id}",
     responses(
         (status = 204, description = "Deleted"),
-        (status = 404, description = "No such environment of this API key", body = Problem),
+        (status = 404, description = "No such environment of this API key"),
     )
 )]
-async fn delete(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
-) -> Result<StatusCode, ApiError> {
-    app.environments().remove(&id, caller, Instant::now())?;
+async fn delete(app: App, caller: Caller, Path(id): Path<String>) -> Result<StatusCode, ApiError> {
+    app.environments.remove(&id, caller, Instant::now())?;
     Ok(StatusCode::NO_CONTENT)
 }
 
-fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), EnvironmentError> {
+fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), ApiError> {
     let (width, height) = (request.world.frame_width_px, request.world.frame_height_px);
     if width.max(height) > MAX_MODEL_SIDE_PX {
-        return Err(EnvironmentError::FrameSize { width, height });
+        return Err(ApiError::Unprocessable(format!(
+            "world: a frame of {width}×{height} px; the maximum is {MAX_MODEL_SIDE_PX}×{MAX_MODEL_SIDE_PX} px"
+        )));
     }
-    let mut environment = Environment::new(request.scenario, request.world.clone()).map_err(EnvironmentError::World)?;
+    let mut environment = Environment::new(request.scenario, request.world.clone()).map_err(unfit("world"))?;
     let ResetBody { observation, info } = restart(&mut environment, Some(Seed(request.seed)))?;
     let body = EnvironmentBody {
         id: String::new(),
@@ -249,24 +210,26 @@ fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), Env
     Ok((environment, body))
 }
 
-fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, EnvironmentError> {
-    let (observation, trial) = environment.reset(seed).map_err(EnvironmentError::World)?;
+fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, ApiError> {
+    let (observation, trial) = environment.reset(seed).map_err(unfit("world"))?;
     Ok(ResetBody {
         info: info(environment.world(), &observation, Some(trial)),
         observation: body(observation)?,
     })
 }
 
-fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, EnvironmentError> {
-    let action = Action::try_from(action)?;
+fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, ApiError> {
+    let action = Action::try_from(action).map_err(unfit("action"))?;
     let StepResult {
         observation,
         reward,
         terminated,
         truncated,
     } = environment.step(&action).map_err(|error| match error {
-        SimError::Ended => EnvironmentError::Ended,
-        other => EnvironmentError::Step(other),
+        SimError::Ended => {
+            ApiError::Conflict("the episode is over; reset the environment to begin the next".to_owned())
+        }
+        other => unfit("action")(other),
     })?;
     Ok(StepBody {
         info: info(environment.world(), &observation, None),
@@ -277,7 +240,7 @@ fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, 
     })
 }
 
-fn body(observation: Observation) -> Result<ObservationBody, EnvironmentError> {
+fn body(observation: Observation) -> Result<ObservationBody, ApiError> {
     Ok(ObservationBody {
         frame: images::encode_one(&observation.frame, ImageFormat::Png)?,
         state: observation.state.into(),
@@ -294,14 +257,4 @@ fn info(world: Option<&World>, observation: &Observation, trial: Option<TrialPar
 
 fn lock(environment: &SharedEnvironment) -> MutexGuard<'_, Environment> {
     environment.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-impl From<EnvironmentError> for ApiError {
-    fn from(error: EnvironmentError) -> Self {
-        match error {
-            EnvironmentError::Ended => Self::Conflict(error.to_string()),
-            EnvironmentError::Image(image) => image.into(),
-            _ => Self::Unprocessable(error.to_string()),
-        }
-    }
 }

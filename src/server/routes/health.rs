@@ -1,11 +1,12 @@
 //! Whether the server is alive and whether it is ready.
 
-use axum::extract::State;
+use std::sync::atomic::Ordering;
+
 use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_jobs::store::Store;
 
@@ -29,10 +30,10 @@ pub(in crate::server) async fn livez() -> axum::Json<Health> {
 /// Tells whether the server is ready: every model has made its first prediction, the store can be written, and the server is not stopping.
 #[utoipa::path(
     get, path = "/readyz", tag = "health",
-    responses((status = 200, body = Health), (status = 503, description = "Not ready", body = Problem))
+    responses((status = 200, body = Health), (status = 503, description = "Not ready"))
 )]
-async fn readyz(State(app): State<App>) -> Result<axum::Json<Health>, ApiError> {
-    if app.is_draining() {
+async fn readyz(app: App) -> Result<axum::Json<Health>, ApiError> {
+    if app.draining.load(Ordering::Acquire) {
         return Err(ApiError::unavailable("the server is stopping"));
     }
     if !app.predictor().is_ready() {

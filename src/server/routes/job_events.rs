@@ -4,8 +4,6 @@ use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::time::Duration;
 
-use axum::Extension;
-use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, stream};
@@ -13,10 +11,10 @@ use tokio::sync::{OwnedSemaphorePermit, watch};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::jobs::{LogLine, job_id};
+use super::jobs::job_id;
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::http::task_limit::stop_requested;
 use crate::server::state::App;
 use foreframe_jobs::jobs::{Job, JobError};
@@ -46,20 +44,16 @@ struct JobEvent {
 /// Sends the job whenever it changes (`event: job`) and each line of its log (`event: log`), until it has ended, the
 /// server stops, or the API key is revoked. With `Last-Event-ID`, the log continues after that line.
 #[utoipa::path(
-    get, path = "/v1/jobs/{id}/events", tag = "jobs",
-    params(
-        ("id" = String, Path, description = "The job's id"),
-        ("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received"),
-    ),
+    get, path = "/v1/jobs/{id}/events",
+    params(("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received")),
     responses(
         (status = 200, description = "Events", content_type = "text/event-stream", body = JobEvent),
-        (status = 404, description = "No such job", body = Problem),
-        (status = 503, description = "Too many event streams are open", body = Problem),
+        (status = 503, description = "Too many event streams are open"),
     )
 )]
 async fn events(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    app: App,
+    caller: Caller,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, ApiError> {
@@ -69,8 +63,8 @@ async fn events(
         .get("last-event-id")
         .and_then(|seen| seen.to_str().ok()?.parse().ok());
     let watch = JobEventStream {
-        _place: app.event_streams().enter()?,
-        stopping: app.event_streams().stopping(),
+        _place: app.event_streams.enter()?,
+        stopping: app.event_streams.stopping(),
         app,
         caller,
         id,
@@ -116,7 +110,7 @@ impl JobEventStream {
                 tokio::select! {
                     () = tokio::time::sleep(POLL_EVERY) => {}
                     () = stop_requested(&mut self.stopping) => return None,
-                    () = self.app.keys().revoked(self.caller) => return None,
+                    () = self.app.keys.revoked(self.caller) => return None,
                 }
             }
         }
@@ -126,7 +120,7 @@ impl JobEventStream {
         let job = self.app.jobs().get(self.id).await?;
         let lines = self.app.jobs().log(self.id, self.after, LINES).await?;
         self.is_over = job.state.is_final() && lines.len() < LINES;
-        for line in lines.into_iter().map(LogLine::from) {
+        for line in lines {
             self.after = line.seq;
             self.push("log", Some(line.seq), &line);
         }
@@ -137,10 +131,6 @@ impl JobEventStream {
         Ok(())
     }
 
-    #[expect(
-        clippy::expect_used,
-        reason = "jobs and log lines are plain structs, always valid JSON"
-    )]
     fn push(&mut self, name: &str, id: Option<i64>, data: &impl serde::Serialize) {
         let event = Event::default().event(name).json_data(data);
         let event = event.expect("a job or a log line that is not JSON is a bug");

@@ -1,16 +1,16 @@
 //! Collection, import, training and evaluation in the background.
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::{DefaultBodyLimit, State};
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::extract::DefaultBodyLimit;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::IntoResponse;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
 use utoipa_axum::routes;
 
 use crate::server::http::extract::{Json, Path, Query};
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::page;
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_jobs::jobs::pipeline::report_key;
 use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
@@ -31,8 +31,6 @@ pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
 
 /// Jobs on a page by default.
 const DEFAULT_LIMIT: usize = 50;
-/// The maximum number of jobs on a page, or of lines of a log in an answer.
-const MAX_LIMIT: usize = 1000;
 
 /// When to try again if a key's share of the queue is full: jobs take minutes.
 const SHARE_RETRY_AFTER_S: u64 = 60;
@@ -68,28 +66,7 @@ struct ListQuery {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Log {
     /// The oldest first.
-    lines: Vec<LogLine>,
-}
-
-/// A line of a job's log.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct LogLine {
-    /// The number of the line, from 1. The oldest lines are removed.
-    pub(super) seq: i64,
-    /// Time in seconds since 1970.
-    unix_s: f64,
-    /// What happened.
-    line: String,
-}
-
-impl From<LogRow> for LogLine {
-    fn from(row: LogRow) -> Self {
-        Self {
-            seq: row.seq,
-            unix_s: row.time_s,
-            line: row.line,
-        }
-    }
+    lines: Vec<LogRow>,
 }
 
 /// Which lines of a log to list.
@@ -108,57 +85,33 @@ struct LogQuery {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct LossCurves {
     /// In the order of the training.
-    points: Vec<CurvePoint>,
-}
-
-/// A point of the loss curves.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-struct CurvePoint {
-    /// `pretrain` or `sequence`.
-    stage: String,
-    /// Optimizer steps in that stage.
-    step: i64,
-    /// Loss on the training windows of that step.
-    train: Option<f64>,
-    /// Loss on the validation windows, if it was computed.
-    validation: Option<f64>,
-}
-
-impl From<LossRow> for CurvePoint {
-    fn from(row: LossRow) -> Self {
-        Self {
-            stage: row.stage,
-            step: row.step,
-            train: row.train,
-            validation: row.validation,
-        }
-    }
+    points: Vec<LossRow>,
 }
 
 /// Queues a collection, an import, a training or an evaluation. Each process runs one job at a time. A finished training
 /// publishes the next version of its model. The first version of a name becomes active at once, later ones when they are
 /// activated.
 #[utoipa::path(
-    post, path = "/v1/jobs", tag = "jobs", request_body = JobSpec,
+    post, path = "/v1/jobs",
     params(("Idempotency-Key" = Option<String>, Header, pattern = "^[!-~]{1,128}$",
         description = "The client's own key for this request: a second request with the same key makes no second job")),
     responses(
         (status = 202, description = "Queued; the header Location names the job", body = Job),
-        (status = 400, description = "Not JSON", body = Problem),
-        (status = 409, description = "Its result exists already, or another job makes it", body = Problem),
-        (status = 413, description = "The body exceeds its limit", body = Problem),
-        (status = 415, description = "Content-Type is not JSON", body = Problem),
-        (status = 422, description = "Not a valid job; the answer names the field", body = Problem),
-        (status = 429, description = "The key's rate limit, or its share of the job queue, is reached", body = Problem),
-        (status = 503, description = "Too many jobs wait", body = Problem),
+        (status = 400, description = "Not JSON"),
+        (status = 409, description = "Its result exists already, or another job makes it"),
+        (status = 413, description = "The body exceeds its limit"),
+        (status = 415, description = "Content-Type is not JSON"),
+        (status = 422, description = "Not a valid job; the answer names the field"),
+        (status = 429, description = "The key's rate limit, or its share of the job queue, is reached"),
+        (status = 503, description = "Too many jobs wait"),
     )
 )]
 async fn create(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
+    app: App,
+    author: Author,
     headers: HeaderMap,
     Json(spec): Json<JobSpec>,
-) -> Result<Response, ApiError> {
+) -> Result<impl IntoResponse, ApiError> {
     let key = headers
         .get("idempotency-key")
         .map(|key| key.to_str().map(str::to_owned));
@@ -170,118 +123,73 @@ async fn create(
 
 /// Lists jobs, the newest first.
 #[utoipa::path(
-    get, path = "/v1/jobs", tag = "jobs", params(ListQuery),
-    responses(
-        (status = 200, body = JobList),
-        (status = 422, description = "No such kind or state", body = Problem),
-    )
+    get, path = "/v1/jobs",
+    responses((status = 200, body = JobList), (status = 422, description = "No such kind or state"))
 )]
-async fn list(State(app): State<App>, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
-    let limit = page(query.limit, DEFAULT_LIMIT)?;
+async fn list(app: App, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
+    let limit = page::checked_limit(query.limit, DEFAULT_LIMIT)?;
     let filter = JobFilter {
         kind: query.kind,
         state: query.state,
         before: query.before,
         limit: limit + 1,
     };
-    let mut jobs = app.jobs().list(filter).await?;
-    let has_more = jobs.len() > limit;
-    jobs.truncate(limit);
-    let next = jobs.last().filter(|_| has_more).map(|job| job.id.to_string());
+    let (jobs, next) = page::cut(app.jobs().list(filter).await?, limit, |job| job.id.to_string());
     Ok(axum::Json(JobList { jobs, next }))
 }
 
 /// Describes a job and its progress.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}", tag = "jobs",
-    params(("id" = String, Path, description = "The job's id")),
-    responses((status = 200, body = Job), (status = 404, description = "No such job", body = Problem))
-)]
-async fn get(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiError> {
+#[utoipa::path(get, path = "/v1/jobs/{id}", responses((status = 200, body = Job)))]
+async fn get(app: App, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiError> {
     Ok(axum::Json(app.jobs().get(job_id(&id)?).await?))
 }
 
 /// Cancels a job. A job that waits ends at once; a job that runs ends at its next checkpoint.
 #[utoipa::path(
-    post, path = "/v1/jobs/{id}/cancel", tag = "jobs",
-    params(("id" = String, Path, description = "The job's id")),
-    responses(
-        (status = 202, description = "It will stop", body = Job),
-        (status = 404, description = "No such job", body = Problem),
-        (status = 409, description = "It has ended", body = Problem),
-    )
+    post, path = "/v1/jobs/{id}/cancel",
+    responses((status = 202, description = "It will stop", body = Job), (status = 409, description = "It has ended"))
 )]
-async fn cancel(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
-    Path(id): Path<String>,
-) -> Result<Response, ApiError> {
+async fn cancel(app: App, author: Author, Path(id): Path<String>) -> Result<impl IntoResponse, ApiError> {
     Ok(accepted(app.jobs().cancel(job_id(&id)?, &author).await?))
 }
 
 /// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
 #[utoipa::path(
-    post, path = "/v1/jobs/{id}/resume", tag = "jobs",
-    params(("id" = String, Path, description = "The job's id")),
+    post, path = "/v1/jobs/{id}/resume",
     responses(
         (status = 202, description = "Queued again", body = Job),
-        (status = 404, description = "No such job", body = Problem),
-        (status = 409, description = "It has not ended, or has succeeded", body = Problem),
-        (status = 503, description = "Too many jobs wait", body = Problem),
+        (status = 409, description = "It has not ended, or has succeeded"),
+        (status = 503, description = "Too many jobs wait"),
     )
 )]
-async fn resume(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
-    Path(id): Path<String>,
-) -> Result<Response, ApiError> {
+async fn resume(app: App, author: Author, Path(id): Path<String>) -> Result<impl IntoResponse, ApiError> {
     Ok(accepted(app.jobs().resume(job_id(&id)?, &author).await?))
 }
 
 /// The log of a job.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}/logs", tag = "jobs",
-    params(("id" = String, Path, description = "The job's id"), LogQuery),
-    responses((status = 200, body = Log), (status = 404, description = "No such job", body = Problem))
-)]
-async fn logs(
-    State(app): State<App>,
-    Path(id): Path<String>,
-    Query(query): Query<LogQuery>,
-) -> Result<axum::Json<Log>, ApiError> {
-    let limit = page(query.limit, MAX_LIMIT)?;
+#[utoipa::path(get, path = "/v1/jobs/{id}/logs", responses((status = 200, body = Log)))]
+async fn logs(app: App, Path(id): Path<String>, Query(query): Query<LogQuery>) -> Result<axum::Json<Log>, ApiError> {
+    let limit = page::checked_limit(query.limit, page::MAX_LIMIT)?;
     let lines = app.jobs().log(job_id(&id)?, query.after.unwrap_or(0), limit).await?;
-    Ok(axum::Json(Log {
-        lines: lines.into_iter().map(LogLine::from).collect(),
-    }))
+    Ok(axum::Json(Log { lines }))
 }
 
 /// The loss curves of a training.
-#[utoipa::path(
-    get, path = "/v1/jobs/{id}/metrics", tag = "jobs",
-    params(("id" = String, Path, description = "The job's id")),
-    responses((status = 200, body = LossCurves), (status = 404, description = "No such job", body = Problem))
-)]
-async fn metrics(State(app): State<App>, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
+#[utoipa::path(get, path = "/v1/jobs/{id}/metrics", responses((status = 200, body = LossCurves)))]
+async fn metrics(app: App, Path(id): Path<String>) -> Result<axum::Json<LossCurves>, ApiError> {
     let points = app.jobs().losses(job_id(&id)?).await?;
-    Ok(axum::Json(LossCurves {
-        points: points.into_iter().map(CurvePoint::from).collect(),
-    }))
+    Ok(axum::Json(LossCurves { points }))
 }
 
 /// A file of an evaluation: its report or a figure. The job's `result.files` lists them.
 #[utoipa::path(
-    get, path = "/v1/jobs/{id}/files/{file}", tag = "jobs",
-    params(
-        ("id" = String, Path, description = "The job's id"),
-        ("file" = String, Path, description = "The file's name"),
-    ),
+    get, path = "/v1/jobs/{id}/files/{file}",
     responses(
         (status = 200, description = "The file", body = Vec<u8>, content_type = "application/octet-stream"),
-        (status = 404, description = "No such job or file", body = Problem),
+        (status = 404, description = "No such job or file"),
     )
 )]
-async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) -> Result<impl IntoResponse, ApiError> {
+async fn file(app: App, Path((id, file)): Path<(String, String)>) -> Result<impl IntoResponse, ApiError> {
     let id = job_id(&id)?;
     let job = app.jobs().get(id).await?;
     let files = job.result.as_ref().and_then(|result| result["files"].as_array());
@@ -296,19 +204,19 @@ async fn file(State(app): State<App>, Path((id, file)): Path<(String, String)>) 
 /// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.
 async fn report_file(app: &App, id: JobId, file: &str) -> Result<Bytes, ApiError> {
     let key = format!("report/{id}/{file}");
-    if let Some(bytes) = app.render_cache().cached(&key) {
+    if let Some(bytes) = app.render_cache.cached(&key) {
         return Ok(bytes);
     }
     let objects = app.store().objects();
     let path = objects.data_dir().join(report_key(id)).join(file);
     let local = path.clone();
-    if !app.render_cache().threads().run(move || local.is_file()).await? {
+    if !app.render_cache.threads().run(move || local.is_file()).await? {
         let pulled = objects.pull(&report_key(id), file).await;
         pulled.map_err(JobError::Store)?;
     }
     let gone = format!("the file of job {id} no longer exists");
     let read = move || std::fs::read(path).map_err(|_| ApiError::NotFound(gone));
-    app.render_cache().get_or_make(key, read).await
+    app.render_cache.get_or_make(key, read).await
 }
 
 fn media_type(file: &str) -> &'static str {
@@ -328,23 +236,9 @@ pub(super) fn job_id(text: &str) -> Result<JobId, ApiError> {
 }
 
 /// The response to an accepted job: the job, and where to find it.
-fn accepted(job: Job) -> Response {
-    let location = HeaderValue::from_str(&format!("/v1/jobs/{}", job.id));
-    let mut response = (StatusCode::ACCEPTED, axum::Json(job)).into_response();
-    if let Ok(location) = location {
-        response.headers_mut().insert(header::LOCATION, location);
-    }
-    response
-}
-
-fn page(limit: Option<usize>, default: usize) -> Result<usize, ApiError> {
-    let limit = limit.unwrap_or(default);
-    if (1..=MAX_LIMIT).contains(&limit) {
-        return Ok(limit);
-    }
-    Err(ApiError::Unprocessable(format!(
-        "limit: {limit} is out of range; it must be 1 to {MAX_LIMIT}"
-    )))
+fn accepted(job: Job) -> impl IntoResponse {
+    let location = format!("/v1/jobs/{}", job.id);
+    (StatusCode::ACCEPTED, [(header::LOCATION, location)], axum::Json(job))
 }
 
 impl From<JobError> for ApiError {

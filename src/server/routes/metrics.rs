@@ -3,7 +3,6 @@
 use std::convert::Infallible;
 use std::time::{Duration, Instant};
 
-use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
 use metrics::gauge;
@@ -31,9 +30,9 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     get, path = "/metrics", tag = "health",
     responses((status = 200, description = "Prometheus' text format", content_type = "text/plain"))
 )]
-async fn metrics(State(app): State<App>) -> impl IntoResponse {
-    gauge!(metric_names::STREAMS).set(app.streams().count() as f64);
-    gauge!(metric_names::SESSIONS).set(app.sessions().count(Instant::now()) as f64);
+async fn metrics(app: App) -> impl IntoResponse {
+    gauge!(metric_names::STREAMS).set(app.streams.count() as f64);
+    gauge!(metric_names::SESSIONS).set(app.sessions.count(Instant::now()) as f64);
     gauge!(metric_names::MODELS_LOADED).set(app.predictor().models().len() as f64);
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], text(app.store()).await)
 }

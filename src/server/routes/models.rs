@@ -1,7 +1,5 @@
 //! The models and their versions.
 
-use axum::Extension;
-use axum::extract::State;
 use axum::http::StatusCode;
 use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
@@ -9,7 +7,7 @@ use utoipa_axum::routes;
 
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
@@ -112,10 +110,10 @@ impl ModelDescription {
 
 /// Lists the loaded models.
 #[utoipa::path(
-    get, path = "/v1/models", tag = "models", params(Page),
-    responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range", body = Problem))
+    get, path = "/v1/models",
+    responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range"))
 )]
-async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
+async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {
     let (manifests, next) = page.of(app.predictor().models(), |manifest| manifest.name.as_str())?;
     let mut versions = app.versions().all().await?;
     let mut models = Vec::with_capacity(manifests.len());
@@ -130,14 +128,13 @@ async fn list(State(app): State<App>, Query(page): Query<Page>) -> Result<axum::
 
 /// Describes one model.
 #[utoipa::path(
-    get, path = "/v1/models/{model}", tag = "models",
-    params(("model" = String, Path, description = "The model's name")),
+    get, path = "/v1/models/{model}",
     responses(
         (status = 200, body = ModelDescription),
-        (status = 404, description = "No such model; the answer lists the models", body = Problem),
+        (status = 404, description = "No such model; the answer lists the models"),
     )
 )]
-async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
+async fn get(app: App, Path(model): Path<String>) -> Result<axum::Json<ModelDescription>, ApiError> {
     let manifest = app.predictor().model(&model)?;
     let versions = app.versions().of(&manifest.name).await?;
     let metrics = app.versions().metrics(&manifest).await?;
@@ -146,46 +143,34 @@ async fn get(State(app): State<App>, Path(model): Path<String>) -> Result<axum::
 
 /// Makes a version the active one, on every server of the store and after a restart. Open streams keep their version.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/versions/{version}/activate", tag = "models",
-    params(
-        ("model" = String, Path, description = "The model's name"),
-        ("version" = u32, Path, description = "The version"),
-    ),
+    post, path = "/v1/models/{model}/versions/{version}/activate",
     responses(
         (status = 200, description = "It is active", body = ModelDescription),
-        (status = 404, description = "No such version; the answer lists the versions", body = Problem),
-        (status = 422, description = "Its files are damaged or do not fit; the previous version stays active", body = Problem),
+        (status = 404, description = "No such version; the answer lists the versions"),
+        (status = 422, description = "Its files are damaged or do not fit; the previous version stays active"),
     )
 )]
 async fn activate(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
+    app: App,
+    author: Author,
     Path((model, version)): Path<(String, u32)>,
 ) -> Result<axum::Json<ModelDescription>, ApiError> {
     let versions = app.versions();
     let name = model_name(&model, version)?;
     versions.activate(app.predictor(), &name, version, &author).await?;
-    get(State(app), Path(model)).await
+    get(app, Path(model)).await
 }
 
 /// Deletes a version that a job published.
 #[utoipa::path(
-    delete, path = "/v1/models/{model}/versions/{version}", tag = "models",
-    params(
-        ("model" = String, Path, description = "The model's name"),
-        ("version" = u32, Path, description = "The version"),
-    ),
+    delete, path = "/v1/models/{model}/versions/{version}",
     responses(
         (status = 204, description = "Deleted"),
-        (status = 404, description = "No such version; the answer lists the versions", body = Problem),
-        (status = 409, description = "It is active, or was not published by a job", body = Problem),
+        (status = 404, description = "No such version; the answer lists the versions"),
+        (status = 409, description = "It is active, or was not published by a job"),
     )
 )]
-async fn delete(
-    State(app): State<App>,
-    Extension(author): Extension<Author>,
-    Path((model, version)): Path<(String, u32)>,
-) -> Result<StatusCode, ApiError> {
+async fn delete(app: App, author: Author, Path((model, version)): Path<(String, u32)>) -> Result<StatusCode, ApiError> {
     let versions = app.versions();
     let name = model_name(&model, version)?;
     versions.delete(app.predictor(), &name, version, &author).await?;

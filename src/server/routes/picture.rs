@@ -14,27 +14,11 @@ use foreframe_train::evaluation::figures::montage::{MontageRow, Style, montage};
 /// How long an animation stays on its last frame, in frame periods.
 const REST_PERIODS: usize = 4;
 
-/// A picture that could not be made.
-#[derive(Debug, thiserror::Error)]
-#[error("could not make the picture")]
-pub(in crate::server) struct PictureError(#[from] FrameError);
-
-impl From<PictureError> for ApiError {
-    fn from(error: PictureError) -> Self {
-        match &error.0 {
-            FrameError::Size { .. } => {
-                Self::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
-            }
-            _ => Self::Internal(with_causes(&error)),
-        }
-    }
-}
-
 /// The threads that write predictions in that format.
 pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
     match format {
-        ResponseFormat::Json => app.predictions(),
-        ResponseFormat::Png | ResponseFormat::Gif => app.render_cache().threads(),
+        ResponseFormat::Json => &app.predictions,
+        ResponseFormat::Png | ResponseFormat::Gif => app.render_cache.threads(),
     }
 }
 
@@ -47,35 +31,44 @@ pub(super) fn context_for(format: ResponseFormat, context: &[Frame]) -> Vec<Fram
 }
 
 /// The response with a PNG picture.
-pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, PictureError> {
+pub(super) fn png(picture: Result<Frame, FrameError>) -> Result<Response, ApiError> {
     let bytes = png_file(picture)?;
     Ok(([(header::CONTENT_TYPE, "image/png")], bytes).into_response())
 }
 
 /// The picture as PNG.
-pub(super) fn png_file(picture: Result<Frame, FrameError>) -> Result<Vec<u8>, PictureError> {
-    Ok(picture.and_then(|picture| codec::encode_png(&picture))?)
+pub(super) fn png_file(picture: Result<Frame, FrameError>) -> Result<Vec<u8>, ApiError> {
+    picture
+        .and_then(|picture| codec::encode_png(&picture))
+        .map_err(not_drawn)
 }
 
 /// The response with a GIF animation.
-pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, PictureError> {
-    Ok(([(header::CONTENT_TYPE, "image/gif")], bytes?).into_response())
+pub(super) fn gif(bytes: Result<Vec<u8>, FrameError>) -> Result<Response, ApiError> {
+    let bytes = bytes.map_err(not_drawn)?;
+    Ok(([(header::CONTENT_TYPE, "image/gif")], bytes).into_response())
+}
+
+/// The answer if a picture could not be made.
+pub(super) fn not_drawn(error: FrameError) -> ApiError {
+    match error {
+        FrameError::Size { .. } => {
+            ApiError::NotAcceptable("the picture would be too large; ask for application/json".to_owned())
+        }
+        other => ApiError::Internal(format!("could not make the picture: {}", with_causes(&other))),
+    }
 }
 
 /// The context, if it is known, and a row for each rollout; small and without labels if there are many.
 /// Errors: `Size` if there are too many.
 pub(super) fn rollout_sheet(seen: &[Frame], rollouts: &[impl AsRef<[Frame]>]) -> Result<Frame, FrameError> {
-    let inputs = MontageRow::in_time("inputs", seen, 1 - seen.len() as i64);
-    let rows = rollouts
+    let inputs = (!seen.is_empty()).then(|| MontageRow::in_time("inputs", seen, 1 - seen.len() as i64));
+    let plans = rollouts
         .iter()
         .enumerate()
         .map(|(index, frames)| MontageRow::in_time(&format!("plan {index}"), frames.as_ref(), 1));
-    let mut rows: Vec<MontageRow> = Some(inputs)
-        .filter(|_| !seen.is_empty())
-        .into_iter()
-        .chain(rows)
-        .collect();
-    let large = montage("", &rows, &style(rollouts));
+    let mut rows: Vec<MontageRow> = inputs.into_iter().chain(plans).collect();
+    let large = montage("", &rows, &large(rollouts));
     if !matches!(large, Err(FrameError::Size { .. })) {
         return large;
     }
@@ -94,34 +87,26 @@ pub(super) fn rollout_animation(
 ) -> Result<Vec<u8>, FrameError> {
     let columns = (rollouts.len() as f64).sqrt().ceil().max(1.0) as usize;
     let steps = rollouts.iter().map(|frames| frames.as_ref().len()).max().unwrap_or(0);
-    let grid = |cells: Vec<(String, Frame)>| {
-        let rows = cells.chunks(columns).map(|cells| MontageRow {
-            label: String::new(),
-            cells: cells.to_vec(),
-        });
-        let rows: Vec<MontageRow> = rows.collect();
-        montage("", &rows, &style(rollouts)).or_else(|_| montage("", &rows, &SMALL))
+    let grid = |frames: Vec<&Frame>| {
+        let cells = (0..)
+            .zip(frames)
+            .map(|(index, frame): (usize, _)| (index.to_string(), frame.clone()));
+        let cells: Vec<(String, Frame)> = cells.collect();
+        let rows: Vec<MontageRow> = cells.chunks(columns).map(unlabelled).collect();
+        montage("", &rows, &large(rollouts)).or_else(|_| montage("", &rows, &SMALL))
     };
-    let named = |(index, frame): (usize, &Frame)| (index.to_string(), frame.clone());
-    let first = seen
-        .last()
-        .map(|last| rollouts.iter().map(|_| last).enumerate().map(named).collect());
-    let later = (0..steps).map(|step| {
-        rollouts
-            .iter()
-            .filter_map(|future| future.as_ref().get(step))
-            .enumerate()
-            .map(named)
-            .collect()
-    });
-    film(
-        first
-            .into_iter()
-            .chain(later)
-            .map(grid)
-            .collect::<Result<_, FrameError>>()?,
-        period_s,
-    )
+    let first = seen.last().map(|last| vec![last; rollouts.len()]);
+    let at = |step| rollouts.iter().filter_map(move |frames| frames.as_ref().get(step));
+    let later = (0..steps).map(|step| at(step).collect());
+    film(first.into_iter().chain(later).map(grid), period_s)
+}
+
+/// A row without a heading.
+pub(super) fn unlabelled(cells: &[(String, Frame)]) -> MontageRow {
+    MontageRow {
+        label: String::new(),
+        cells: cells.to_vec(),
+    }
 }
 
 const SMALL: Style = Style {
@@ -129,7 +114,8 @@ const SMALL: Style = Style {
     grid_lines: 0,
 };
 
-fn style(rollouts: &[impl AsRef<[Frame]>]) -> Style {
+/// Enlarges the frames of these rollouts.
+fn large(rollouts: &[impl AsRef<[Frame]>]) -> Style {
     let width = rollouts.iter().flat_map(AsRef::as_ref).next().map_or(1, Frame::width);
     Style {
         grid_lines: 0,
@@ -144,25 +130,21 @@ pub(super) fn animation(seen: &[Frame], predicted: &[Frame], period_s: f64) -> R
         MontageRow::in_time("", seen, 1 - seen.len() as i64),
         MontageRow::in_time("", predicted, 1),
     ];
-    let picture = |cell: (String, Frame)| {
-        let style = Style {
-            grid_lines: 0,
-            ..Style::for_frames_of(cell.1.width())
-        };
-        let row = MontageRow {
-            label: String::new(),
-            cells: vec![cell],
-        };
-        montage("", &[row], &style)
-    };
-    let cells = rows.into_iter().flat_map(|row| row.cells);
-    film(cells.map(picture).collect::<Result<_, FrameError>>()?, period_s)
+    let style = large(&[seen, predicted]);
+    let cells = rows.iter().flat_map(|row| row.cells.chunks(1));
+    film(cells.map(|cell| montage("", &[unlabelled(cell)], &style)), period_s)
 }
 
-fn film(mut frames: Vec<Frame>, period_s: f64) -> Result<Vec<u8>, FrameError> {
+fn film(frames: impl Iterator<Item = Result<Frame, FrameError>>, period_s: f64) -> Result<Vec<u8>, FrameError> {
+    let mut frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
     let last = frames.last().cloned();
     frames.extend(last.into_iter().flat_map(|last| vec![last; REST_PERIODS]));
-    codec::encode_gif(&frames, (period_s * 1000.0).clamp(20.0, 10_000.0) as u32)
+    codec::encode_gif(&frames, delay_ms(period_s))
+}
+
+/// How long an animation shows each frame.
+pub(super) fn delay_ms(period_s: f64) -> u32 {
+    (period_s * 1000.0).clamp(20.0, 10_000.0) as u32
 }
 
 #[cfg(test)]

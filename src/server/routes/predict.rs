@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
@@ -11,15 +10,15 @@ use utoipa_axum::routes;
 use super::picture;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
-use crate::server::http::multipart::{JsonOrForm, TooManyError, WithFrames, check_count};
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
+use crate::server::http::problem::{ApiError, unfit};
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
-use foreframe_core::types::{Action, RobotState, ValueError};
+use foreframe_core::types::{Action, RobotState};
 use foreframe_train::evaluation::figures::montage::prediction_sheet;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -37,25 +36,19 @@ struct PredictRequest {
     #[serde(default)]
     format: ImageFormat,
     /// How an image of another size is resized; without it, another size is an error.
-    #[serde(default)]
     resize: Option<Resize>,
     /// The action at each frame, oldest first. Without `plan`, the last one is repeated.
     #[serde(default)]
     actions: Vec<Vec<f32>>,
     /// The robot's state at the last frame.
-    #[serde(default)]
     state: Option<Vec<f32>>,
     /// The robot's state at each frame, instead of `state`.
-    #[serde(default)]
     states: Option<Vec<Vec<f32>>>,
     /// The future actions, as many as `steps`. The first acts from the last frame on.
-    #[serde(default)]
     plan: Option<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
-    #[serde(default)]
     steps: Option<usize>,
     /// The units of actions and state as the client has them: other units than the model's are an error.
-    #[serde(default)]
     units: Option<Units>,
 }
 
@@ -102,40 +95,6 @@ struct PredictResponse {
     timing: Timing,
 }
 
-/// Why a prediction request failed.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum PredictError {
-    #[error(transparent)]
-    TooMany(#[from] TooManyError),
-    #[error("the rollouts would be {found} bytes of images; this server predicts at most {limit} in a request")]
-    TooLarge { found: u64, limit: usize },
-    #[error("plans is empty; give at least one plan")]
-    NoPlans,
-    #[error("the session has {have} of the {need} frames that a prediction takes; send more frames")]
-    Buffering { have: usize, need: usize },
-    #[error("steps is {found}; this server predicts 1 to {limit}")]
-    Steps { found: usize, limit: usize },
-    #[error("units.{field} is [{found}]; model \"{model}\" takes [{expected}]")]
-    Units {
-        field: &'static str,
-        found: String,
-        model: String,
-        expected: String,
-    },
-    #[error("{field}: {source}")]
-    Value { field: String, source: ValueError },
-    #[error("state and states are both given; give one")]
-    BothStates,
-    #[error("states holds {found} states; there are {frames} frames, and each has one")]
-    StateCount { found: usize, frames: usize },
-    #[error(transparent)]
-    Image(#[from] ImageError),
-    #[error(transparent)]
-    Input(#[from] InputError),
-    #[error(transparent)]
-    Serving(#[from] ServingError),
-}
-
 impl WithFrames for PredictRequest {
     fn push_frame(&mut self, file: Vec<u8>) {
         self.frames.push(ImageBytes(file));
@@ -146,33 +105,31 @@ impl WithFrames for PredictRequest {
 /// `frames` and the other fields as JSON in a part `request`. `Accept: image/png` gives a labelled contact sheet of the
 /// context and the prediction, `image/gif` an animation.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/predict", tag = "models",
-    params(("model" = String, Path, description = "The model's name")),
+    post, path = "/v1/models/{model}/predict",
     request_body(content((PredictRequest = "application/json"), (PredictForm = "multipart/form-data"))),
     responses(
         (status = 200, description = "The prediction", content(
             (PredictResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
-        (status = 400, description = "Not JSON", body = Problem),
-        (status = 406, description = "No media type in `Accept` is supported", body = Problem),
-        (status = 404, description = "No such model", body = Problem),
-        (status = 413, description = "A body or a list exceeds its limit", body = Problem),
-        (status = 415, description = "Content-Type is neither JSON nor a form", body = Problem),
-        (status = 422, description = "Does not fit the model", body = Problem),
-        (status = 503, description = "Too many predictions wait", body = Problem),
+        (status = 400, description = "Not JSON"),
+        (status = 406, description = "No media type in `Accept` is supported"),
+        (status = 413, description = "A body or a list exceeds its limit"),
+        (status = 415, description = "Content-Type is neither JSON nor a form"),
+        (status = 422, description = "Does not fit the model"),
+        (status = 503, description = "Too many predictions wait"),
     )
 )]
 async fn predict(
-    State(app): State<App>,
+    app: App,
     Path(model): Path<String>,
     wanted: ResponseFormat,
     JsonOrForm(request): JsonOrForm<PredictRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
-    let _place = app.admission().enter()?;
-    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
+    let _place = app.admission.enter()?;
+    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, Arc::clone(&app.config));
     let decode = move || request.into_task(wanted, &manifest, &config);
-    let (seen, task) = app.predictions().run(decode).await??;
+    let (seen, task) = app.predictions.run(decode).await??;
     let prediction = app.predictor().compute(&model, task, None).await?;
     let encode = move || answer(wanted, format, &seen, prediction);
     picture::threads_for(&app, wanted).run(encode).await?
@@ -185,7 +142,7 @@ impl PredictRequest {
         wanted: ResponseFormat,
         manifest: &Manifest,
         config: &ServerConfig,
-    ) -> Result<(Vec<Frame>, Task), PredictError> {
+    ) -> Result<(Vec<Frame>, Task), ApiError> {
         let (format, resize) = (self.format, self.resize);
         check_steps(self.steps, manifest, config)?;
         self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
@@ -207,16 +164,14 @@ impl PredictRequest {
 #[serde(deny_unknown_fields)]
 pub(super) struct Units {
     /// Of the components of an action.
-    #[serde(default)]
     actions: Option<Vec<String>>,
     /// Of the components of a state.
-    #[serde(default)]
     state: Option<Vec<String>>,
 }
 
 impl Units {
-    /// Errors: `Units` where they differ from the model's.
-    pub(super) fn check(&self, manifest: &Manifest) -> Result<(), PredictError> {
+    /// Errors: `Unprocessable` where they differ from the model's.
+    pub(super) fn check(&self, manifest: &Manifest) -> Result<(), ApiError> {
         let spec = &manifest.spec;
         let given = [
             ("actions", &self.actions, &spec.actions),
@@ -225,27 +180,25 @@ impl Units {
         for (field, found, channels) in given {
             let expected: Vec<&str> = channels.iter().map(|channel| channel.unit.as_str()).collect();
             if let Some(found) = found.as_ref().filter(|found| **found != expected) {
-                return Err(PredictError::Units {
-                    field,
-                    found: found.join(", "),
-                    model: manifest.name.to_string(),
-                    expected: expected.join(", "),
-                });
+                return Err(ApiError::Unprocessable(format!(
+                    "units.{field} is [{}]; model \"{}\" takes [{}]",
+                    found.join(", "),
+                    manifest.name,
+                    expected.join(", ")
+                )));
             }
         }
         Ok(())
     }
 }
 
-/// Errors: `Steps` if a request asks for more than this server predicts. The model's own horizon is always allowed.
-pub(super) fn check_steps(
-    steps: Option<usize>,
-    manifest: &Manifest,
-    config: &ServerConfig,
-) -> Result<(), PredictError> {
+/// Errors: `Unprocessable` if a request asks for more than this server predicts. The model's own horizon is always allowed.
+pub(super) fn check_steps(steps: Option<usize>, manifest: &Manifest, config: &ServerConfig) -> Result<(), ApiError> {
     let limit = config.max_steps.max(manifest.spec.horizon);
     match steps {
-        Some(found) if !(1..=limit).contains(&found) => Err(PredictError::Steps { found, limit }),
+        Some(found) if !(1..=limit).contains(&found) => Err(ApiError::Unprocessable(format!(
+            "steps is {found}; this server predicts 1 to {limit}"
+        ))),
         _ => Ok(()),
     }
 }
@@ -256,14 +209,11 @@ pub(super) fn decode_frames(
     input: ImageInput,
     manifest: &Manifest,
     limit: usize,
-) -> Result<Vec<Frame>, PredictError> {
+) -> Result<Vec<Frame>, ApiError> {
     check_count("frames", frames.len(), limit)?;
     let frame = |(index, image)| images::decode(&format!("frames[{index}]"), image, input, manifest);
-    Ok(frames
-        .into_iter()
-        .enumerate()
-        .map(frame)
-        .collect::<Result<_, ImageError>>()?)
+    let frames: Result<_, ImageError> = frames.into_iter().enumerate().map(frame).collect();
+    Ok(frames?)
 }
 
 /// The state at the last frame, from `state` or `states` of a request.
@@ -271,35 +221,27 @@ pub(super) fn last_state(
     state: Option<Vec<f32>>,
     states: Option<Vec<Vec<f32>>>,
     frames: usize,
-) -> Result<Option<RobotState>, PredictError> {
-    if let Some(states) = states.as_ref().filter(|states| states.len() != frames) {
-        return Err(PredictError::StateCount {
-            found: states.len(),
-            frames,
-        });
-    }
-    let state = match (state, states) {
-        (Some(_), Some(_)) => return Err(PredictError::BothStates),
-        (state, None) => state,
-        (None, Some(states)) => states.into_iter().next_back(),
+) -> Result<Option<RobotState>, ApiError> {
+    let given = match (state, states) {
+        (_, Some(states)) if states.len() != frames => {
+            return Err(ApiError::Unprocessable(format!(
+                "states holds {} states; there are {frames} frames, and each has one",
+                states.len()
+            )));
+        }
+        (Some(_), Some(_)) => {
+            return Err(ApiError::Unprocessable(
+                "state and states are both given; give one".to_owned(),
+            ));
+        }
+        (state, states) => state.or_else(|| states?.pop()),
     };
-    state
-        .map(RobotState::try_from)
-        .transpose()
-        .map_err(|source| PredictError::Value {
-            field: "state".to_owned(),
-            source,
-        })
+    given.map(RobotState::try_from).transpose().map_err(unfit("state"))
 }
 
 /// The actions in `field` of a request.
-pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, PredictError> {
-    let action = |(index, values)| {
-        Action::try_from(values).map_err(|source| PredictError::Value {
-            field: format!("{field}[{index}]"),
-            source,
-        })
-    };
+pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, ApiError> {
+    let action = |(index, values)| Action::try_from(values).map_err(unfit(&format!("{field}[{index}]")));
     values.into_iter().enumerate().map(action).collect()
 }
 
@@ -315,22 +257,9 @@ impl From<ServingError> for ApiError {
     }
 }
 
-impl From<PredictError> for ApiError {
-    fn from(error: PredictError) -> Self {
-        match error {
-            PredictError::TooMany(too_many) => too_many.into(),
-            PredictError::TooLarge { .. } => Self::TooLarge(error.to_string()),
-            PredictError::Image(image) => image.into(),
-            PredictError::Serving(serving) => serving.into(),
-            PredictError::Buffering { .. } => Self::Conflict(error.to_string()),
-            PredictError::Steps { .. }
-            | PredictError::Units { .. }
-            | PredictError::Value { .. }
-            | PredictError::BothStates
-            | PredictError::StateCount { .. }
-            | PredictError::NoPlans
-            | PredictError::Input(_) => Self::Unprocessable(error.to_string()),
-        }
+impl From<InputError> for ApiError {
+    fn from(error: InputError) -> Self {
+        Self::Unprocessable(error.to_string())
     }
 }
 
@@ -344,10 +273,10 @@ fn answer(
     let rollout = prediction.rollouts.pop().unwrap_or_default();
     let manifest = prediction.manifest;
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(prediction_sheet(seen, &rollout.frames, &[]))?),
+        ResponseFormat::Png => picture::png(prediction_sheet(seen, &rollout.frames, &[])),
         ResponseFormat::Gif => {
             let period_s = manifest.spec.frame_period_s;
-            Ok(picture::gif(picture::animation(seen, &rollout.frames, period_s))?)
+            picture::gif(picture::animation(seen, &rollout.frames, period_s))
         }
         ResponseFormat::Json => {
             let format = format.answer();

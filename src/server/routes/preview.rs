@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use axum::body::Bytes;
-use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse as _, Response};
 use utoipa_axum::router::OpenApiRouter;
@@ -11,12 +10,12 @@ use utoipa_axum::routes;
 
 use super::picture;
 use crate::server::http::extract::Path;
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::nn::{Conditioning, ModelSpec};
 use foreframe_core::registry::{Manifest, Model};
-use foreframe_core::serving::{PredictionInput, ServingError};
+use foreframe_core::serving::PredictionInput;
 use foreframe_core::types::{Action, RobotState, Seed};
 use foreframe_sim::{Scenario, SimError, World, WorldConfig};
 use foreframe_train::evaluation::figures::montage::prediction_sheet;
@@ -33,21 +32,19 @@ const TRIAL: u64 = 1;
 
 /// A contact sheet of a simulated trial: the context, the predicted frames and the true frames.
 #[utoipa::path(
-    get, path = "/v1/models/{model}/preview.png", tag = "models",
-    params(("model" = String, Path, description = "The model's name")),
+    get, path = "/v1/models/{model}/preview.png",
     responses(
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
-        (status = 404, description = "No such model", body = Problem),
-        (status = 422, description = "The simulator cannot make the frames that this model takes", body = Problem),
-        (status = 503, description = "Too many predictions wait", body = Problem),
+        (status = 422, description = "The simulator cannot make the frames that this model takes"),
+        (status = 503, description = "Too many predictions wait"),
     )
 )]
-async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Response, ApiError> {
+async fn preview(app: App, Path(model): Path<String>) -> Result<Response, ApiError> {
     let active = app.predictor().active(&model)?;
     let key = format!("model/{model}/{}", active.manifest.weights_sha256);
     // Many requests for the same picture compute one prediction.
-    let _turn = app.render_cache().turn().await;
-    let png = match app.render_cache().cached(&key) {
+    let _turn = app.render_cache.turn().await;
+    let png = match app.render_cache.cached(&key) {
         Some(png) => png,
         None => make(&app, active, key).await?,
     };
@@ -56,15 +53,14 @@ async fn preview(State(app): State<App>, Path(model): Path<String>) -> Result<Re
 
 async fn make(app: &App, model: Arc<Model>, key: String) -> Result<Bytes, ApiError> {
     let manifest = Arc::clone(&model.manifest);
-    let simulated = app.render_cache().threads().run(move || simulate(&manifest)).await?;
+    let simulated = app.render_cache.threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
-    let task = input.into_task(&model.manifest.name, &model.manifest.spec);
-    let task = task.map_err(ServingError::from)?;
+    let task = input.into_task(&model.manifest.name, &model.manifest.spec)?;
     let mut rollouts = app.predictor().compute(&model, task, None).await?.rollouts;
     let predicted = rollouts.pop().unwrap_or_default().frames;
-    let draw = move || Ok::<_, ApiError>(picture::png_file(prediction_sheet(&seen, &predicted, &truth))?);
-    app.render_cache().get_or_make(key, draw).await
+    let draw = move || picture::png_file(prediction_sheet(&seen, &predicted, &truth));
+    app.render_cache.get_or_make(key, draw).await
 }
 
 /// The model's input from the trial, and the true frames after it.

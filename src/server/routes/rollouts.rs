@@ -2,19 +2,18 @@
 
 use std::sync::Arc;
 
-use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use super::predict::{self, PredictError};
+use super::predict;
 use super::sessions::AuthorizedSession;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Json, Path, ResponseFormat};
 use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
@@ -40,18 +39,14 @@ struct RolloutRequest {
     #[serde(default)]
     format: ImageFormat,
     /// How an image of another size is resized; without it, another size is an error.
-    #[serde(default)]
     resize: Option<Resize>,
     /// The robot's state at the last frame.
-    #[serde(default)]
     state: Option<Vec<f32>>,
     /// The robot's state at each frame, instead of `state`.
-    #[serde(default)]
     states: Option<Vec<Vec<f32>>>,
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
-    #[serde(default)]
     steps: Option<usize>,
 }
 
@@ -63,12 +58,10 @@ struct SessionRolloutRequest {
     #[serde(default)]
     format: ImageFormat,
     /// The robot's state. Default: its state at the session's last frame.
-    #[serde(default)]
     state: Option<Vec<f32>>,
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
-    #[serde(default)]
     steps: Option<usize>,
 }
 
@@ -112,30 +105,28 @@ impl WithFrames for RolloutRequest {
 /// Predicts a rollout for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
 /// `image/gif` an animation with all of them side by side.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/rollouts", tag = "models", request_body = RolloutRequest,
-    params(("model" = String, Path, description = "The model's name")),
+    post, path = "/v1/models/{model}/rollouts", request_body = RolloutRequest,
     responses(
         (status = 200, description = "The rollouts", content(
             (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
-        (status = 400, description = "Not JSON", body = Problem),
-        (status = 404, description = "No such model", body = Problem),
-        (status = 406, description = "Too many for a picture, or no media type in `Accept` is supported", body = Problem),
-        (status = 413, description = "A body, a list or an answer exceeds its limit", body = Problem),
-        (status = 422, description = "Does not fit the model", body = Problem),
-        (status = 503, description = "Too many predictions wait", body = Problem),
+        (status = 400, description = "Not JSON"),
+        (status = 406, description = "Too many for a picture, or no media type in `Accept` is supported"),
+        (status = 413, description = "A body, a list or an answer exceeds its limit"),
+        (status = 422, description = "Does not fit the model"),
+        (status = 503, description = "Too many predictions wait"),
     )
 )]
 async fn model_rollouts(
-    State(app): State<App>,
+    app: App,
     Path(model): Path<String>,
     wanted: ResponseFormat,
     JsonOrForm(request): JsonOrForm<RolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
-    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, app.shared_config());
+    let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, Arc::clone(&app.config));
     let decode = move || request.into_task(wanted, &manifest, &config);
-    let (seen, task) = app.predictions().run(decode).await??;
+    let (seen, task) = app.predictions.run(decode).await??;
     let prediction = app.predictor().compute(&model, task, None).await?;
     let encode = move || answer(wanted, format, &seen, prediction);
     picture::threads_for(&app, wanted).run(encode).await?
@@ -143,35 +134,31 @@ async fn model_rollouts(
 
 /// Predicts a rollout for each of many plans from the session's last frame. The session does not change.
 #[utoipa::path(
-    post, path = "/v1/sessions/{id}/rollouts", tag = "sessions", request_body = SessionRolloutRequest,
-    params(
-        ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
-    ),
+    post, path = "/v1/sessions/{id}/rollouts",
+    params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
     responses(
         (status = 200, description = "The rollouts", content(
             (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
-        (status = 403, description = "Not the session's token", body = Problem),
-        (status = 404, description = "No such session", body = Problem),
-        (status = 409, description = "The session has not enough frames yet", body = Problem),
-        (status = 410, description = "It has expired", body = Problem),
-        (status = 413, description = "A body, a list or an answer exceeds its limit", body = Problem),
-        (status = 422, description = "Does not fit the model", body = Problem),
-        (status = 503, description = "Too many predictions wait", body = Problem),
+        (status = 409, description = "The session has not enough frames yet"),
+        (status = 413, description = "A body, a list or an answer exceeds its limit"),
+        (status = 422, description = "Does not fit the model"),
+        (status = 503, description = "Too many predictions wait"),
     )
 )]
 async fn session_rollouts(
-    State(app): State<App>,
+    app: App,
     AuthorizedSession(session): AuthorizedSession,
     wanted: ResponseFormat,
     Json(request): Json<SessionRolloutRequest>,
 ) -> Result<Response, ApiError> {
-    let model = Arc::clone(session.model());
+    let model = Arc::clone(&session.model);
     let (state, format) = (session.state().0, request.format);
     let (have, need) = (state.frame_count(), model.manifest.spec.context);
     if have < need {
-        return Err(PredictError::Buffering { have, need }.into());
+        return Err(ApiError::Conflict(format!(
+            "the session has {have} of the {need} frames that a prediction takes; send more frames"
+        )));
     }
     let given = predict::last_state(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
@@ -182,7 +169,7 @@ async fn session_rollouts(
         &model.manifest,
         app.config(),
     )?);
-    let prediction = app.predictor().compute(&model, task, Some(session.key())).await?;
+    let prediction = app.predictor().compute(&model, task, Some(session.key)).await?;
     let encode = move || answer(wanted, format, &[], prediction);
     picture::threads_for(&app, wanted).run(encode).await?
 }
@@ -194,7 +181,7 @@ impl RolloutRequest {
         wanted: ResponseFormat,
         manifest: &Manifest,
         config: &ServerConfig,
-    ) -> Result<(Vec<Frame>, Task), PredictError> {
+    ) -> Result<(Vec<Frame>, Task), ApiError> {
         let (format, resize) = (self.format, self.resize);
         let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let state = predict::last_state(self.state, self.states, frames.len())?;
@@ -212,19 +199,21 @@ fn conditioning(
     state: Option<RobotState>,
     manifest: &Manifest,
     config: &ServerConfig,
-) -> Result<Vec<ConditioningInput>, PredictError> {
+) -> Result<Vec<ConditioningInput>, ApiError> {
     let spec = &manifest.spec;
     check_count("plans", plans.len(), config.max_plans)?;
     if plans.is_empty() {
-        return Err(PredictError::NoPlans);
+        return Err(ApiError::Unprocessable(
+            "plans is empty; give at least one plan".to_owned(),
+        ));
     }
     predict::check_steps(steps, manifest, config)?;
     let found = plans.len() as u64 * steps.unwrap_or(spec.horizon) as u64 * spec.pixels() as u64;
-    if found > config.max_rollout_bytes as u64 {
-        return Err(PredictError::TooLarge {
-            found,
-            limit: config.max_rollout_bytes,
-        });
+    let limit = config.max_rollout_bytes;
+    if found > limit as u64 {
+        return Err(ApiError::TooLarge(format!(
+            "the rollouts would be {found} bytes of images; this server predicts at most {limit} in a request"
+        )));
     }
     let plans = plans
         .into_iter()
@@ -249,14 +238,10 @@ fn answer(
         ..
     } = prediction;
     match wanted {
-        ResponseFormat::Png => Ok(picture::png(picture::rollout_sheet(seen, &rollout_frames(&rollouts)))?),
+        ResponseFormat::Png => picture::png(picture::rollout_sheet(seen, &rollout_frames(&rollouts))),
         ResponseFormat::Gif => {
             let period_s = manifest.spec.frame_period_s;
-            Ok(picture::gif(picture::rollout_animation(
-                seen,
-                &rollout_frames(&rollouts),
-                period_s,
-            ))?)
+            picture::gif(picture::rollout_animation(seen, &rollout_frames(&rollouts), period_s))
         }
         ResponseFormat::Json => {
             let format = format.answer();

@@ -5,8 +5,6 @@ mod bodies;
 use std::sync::Arc;
 use std::time::Instant;
 
-use axum::Extension;
-use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
 use serde::Deserialize;
@@ -16,8 +14,8 @@ use utoipa_axum::routes;
 use self::bodies::{CreateSession, CreatedSession, ExportedState, SessionDescription, SessionList};
 use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::keys::Caller;
-use crate::server::http::page::{Page, checked_limit};
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::page::Page;
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use crate::server::stream::protocol::StreamLimits;
 use crate::server::stream::session::Session;
@@ -31,28 +29,24 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 
 /// Opens a session, or continues one from its exported state.
 #[utoipa::path(
-    post, path = "/v1/sessions", tag = "sessions", request_body = CreateSession,
+    post, path = "/v1/sessions",
     responses(
         (status = 201, description = "Open; only this answer contains the token", body = CreatedSession),
-        (status = 400, description = "Not JSON", body = Problem),
-        (status = 404, description = "No such model", body = Problem),
-        (status = 409, description = "The state belongs to a version of the model that is not active here", body = Problem),
-        (status = 422, description = "A state that does not fit; the answer names the field", body = Problem),
-        (status = 503, description = "Too many sessions", body = Problem),
+        (status = 400, description = "Not JSON"),
+        (status = 404, description = "No such model"),
+        (status = 409, description = "The state belongs to a version of the model that is not active here"),
+        (status = 422, description = "A state that does not fit; the answer names the field"),
+        (status = 503, description = "Too many sessions"),
     )
 )]
-async fn create(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
-    Json(request): Json<CreateSession>,
-) -> Result<impl IntoResponse, ApiError> {
+async fn create(app: App, caller: Caller, Json(request): Json<CreateSession>) -> Result<impl IntoResponse, ApiError> {
     let (model, state, settings) = request.resolve(&app)?;
     let now = Instant::now();
     let created = Session::new(model, state, settings, caller, now);
     let (session, token) = created.map_err(|error| ApiError::Internal(error.to_string()))?;
-    let session = app.sessions().insert(session, now)?;
+    let session = app.sessions.insert(session, now)?;
     let created = CreatedSession {
-        session: SessionDescription::of(&session, app.sessions().grace(), now),
+        session: SessionDescription::of(&session, app.sessions.grace, now),
         token,
         limits: StreamLimits::new(app.config(), true),
     };
@@ -62,20 +56,14 @@ async fn create(
 
 /// Lists the open sessions that this key opened; with the scope `admin`, those of all keys.
 #[utoipa::path(
-    get, path = "/v1/sessions", tag = "sessions", params(Page),
-    responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range", body = Problem))
+    get, path = "/v1/sessions",
+    responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range"))
 )]
-async fn list(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
-    Query(page): Query<Page>,
-) -> Result<axum::Json<SessionList>, ApiError> {
+async fn list(app: App, caller: Caller, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
     let now = Instant::now();
-    let found = app
-        .sessions()
-        .page(&page.after, checked_limit(page.limit)? + 1, caller, now);
-    let (found, next) = page.of(found, |session| session.id())?;
-    let grace = app.sessions().grace();
+    let found = app.sessions.page(&page.after, page.limit()? + 1, caller, now);
+    let (found, next) = page.of(found, |session| session.id.as_str())?;
+    let grace = app.sessions.grace;
     let describe = |session: &Arc<Session>| SessionDescription::of(session, grace, now);
     Ok(axum::Json(SessionList {
         sessions: found.iter().map(describe).collect(),
@@ -84,65 +72,33 @@ async fn list(
 }
 
 /// Describes a session that this key opened; with the scope `admin`, any session.
-#[utoipa::path(
-    get, path = "/v1/sessions/{id}", tag = "sessions",
-    params(("id" = String, Path, description = "The session's id")),
-    responses(
-        (status = 200, body = SessionDescription),
-        (status = 404, description = "No such session", body = Problem),
-        (status = 410, description = "It has expired", body = Problem),
-    )
-)]
-async fn get(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
-    Path(id): Path<String>,
-) -> Result<axum::Json<SessionDescription>, ApiError> {
+#[utoipa::path(get, path = "/v1/sessions/{id}", responses((status = 200, body = SessionDescription)))]
+async fn get(app: App, caller: Caller, Path(id): Path<String>) -> Result<axum::Json<SessionDescription>, ApiError> {
     let now = Instant::now();
-    let session = app.sessions().find(&id, caller, now)?;
-    Ok(axum::Json(SessionDescription::of(
-        &session,
-        app.sessions().grace(),
-        now,
-    )))
+    let session = app.sessions.find(&id, caller, now)?;
+    Ok(axum::Json(SessionDescription::of(&session, app.sessions.grace, now)))
 }
 
 /// Deletes a session and ends its stream.
 #[utoipa::path(
-    delete, path = "/v1/sessions/{id}", tag = "sessions",
-    params(
-        ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
-    ),
-    responses(
-        (status = 204, description = "Deleted"),
-        (status = 403, description = "Not the session's token", body = Problem),
-        (status = 404, description = "No such session", body = Problem),
-        (status = 410, description = "It has expired", body = Problem),
-    )
+    delete, path = "/v1/sessions/{id}",
+    params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
+    responses((status = 204, description = "Deleted"))
 )]
-async fn delete(State(app): State<App>, session: AuthorizedSession) -> StatusCode {
-    app.sessions().remove(&session.0);
+async fn delete(app: App, session: AuthorizedSession) -> StatusCode {
+    app.sessions.remove(&session.0);
     StatusCode::NO_CONTENT
 }
 
 /// Exports the session state, for `POST /v1/sessions` on this or another server.
 #[utoipa::path(
-    get, path = "/v1/sessions/{id}/state", tag = "sessions",
-    params(
-        ("id" = String, Path, description = "The session's id"),
-        ("x-session-token" = Option<String>, Header, description = "The session's token; or as query parameter `token`"),
-    ),
-    responses(
-        (status = 200, body = ExportedState),
-        (status = 403, description = "Not the session's token", body = Problem),
-        (status = 404, description = "No such session", body = Problem),
-        (status = 410, description = "It has expired", body = Problem),
-    )
+    get, path = "/v1/sessions/{id}/state",
+    params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
+    responses((status = 200, body = ExportedState))
 )]
 async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
     let (state, settings) = session.0.state();
-    let manifest = &session.0.model().manifest;
+    let manifest = &session.0.model.manifest;
     axum::Json(ExportedState {
         model: manifest.name.to_string(),
         version: manifest.version,
@@ -158,7 +114,6 @@ async fn state(session: AuthorizedSession) -> axum::Json<ExportedState> {
 /// The token, if it is not in the header.
 #[derive(Debug, Deserialize)]
 struct TokenQuery {
-    #[serde(default)]
     token: Option<String>,
 }
 
@@ -172,7 +127,7 @@ impl axum::extract::FromRequestParts<App> for AuthorizedSession {
         let Path(id) = Path::<String>::from_request_parts(parts, app).await?;
         let Query(query) = Query::<TokenQuery>::from_request_parts(parts, app).await?;
         let token = token_of(&parts.headers).or(query.token).unwrap_or_default();
-        Ok(Self(app.sessions().open(&id, &token, Instant::now())?))
+        Ok(Self(app.sessions.open(&id, &token, Instant::now())?))
     }
 }
 

@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Extension;
-use axum::extract::State;
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::response::Response;
@@ -16,7 +15,7 @@ use super::sessions::AuthorizedSession;
 use crate::server::http::extract::Path;
 use crate::server::http::keys::Caller;
 use crate::server::http::message_bytes::{MessageBytes, UNCOUNTED_BYTES};
-use crate::server::http::problem::{ApiError, Problem};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use crate::server::stream::connection::{StreamConnection, StreamServices};
 use crate::server::stream::protocol::{Codec, SessionSettings};
@@ -41,24 +40,18 @@ type Messages = Option<Extension<MessageBytes>>;
 /// frames. Sub-protocols: `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` describes the messages. If the
 /// session has an open stream, the new stream replaces it.
 #[utoipa::path(
-    get, path = "/v1/sessions/{id}/stream", tag = "sessions",
-    params(
-        ("id" = String, Path, description = "The session's id"),
-        ("token" = Option<String>, Query, description = "The session's token; or as header `x-session-token`"),
-    ),
+    get, path = "/v1/sessions/{id}/stream",
+    params(("id" = String, Path), ("token" = Option<String>, Query)),
     responses(
         (status = 101, description = "The WebSocket is open"),
-        (status = 400, description = "The server speaks none of the requested sub-protocols", body = Problem),
-        (status = 403, description = "Not the session's token", body = Problem),
-        (status = 404, description = "No such session", body = Problem),
-        (status = 410, description = "It has expired", body = Problem),
-        (status = 426, description = "Not a WebSocket handshake", body = Problem),
-        (status = 503, description = "Too many streams", body = Problem),
+        (status = 400, description = "The server speaks none of the requested sub-protocols"),
+        (status = 426, description = "Not a WebSocket handshake"),
+        (status = 503, description = "Too many streams"),
     )
 )]
 async fn session_stream(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    app: App,
+    caller: Caller,
     messages: Messages,
     session: AuthorizedSession,
     upgrade: Upgrade,
@@ -69,19 +62,17 @@ async fn session_stream(
 
 /// Opens a stream whose session ends with it. Otherwise it is the same as the stream of a session.
 #[utoipa::path(
-    get, path = "/v1/models/{model}/stream", tag = "models",
-    params(("model" = String, Path, description = "The model's name")),
+    get, path = "/v1/models/{model}/stream",
     responses(
         (status = 101, description = "The WebSocket is open"),
-        (status = 400, description = "The server speaks none of the requested sub-protocols", body = Problem),
-        (status = 404, description = "No such model", body = Problem),
-        (status = 426, description = "Not a WebSocket handshake", body = Problem),
-        (status = 503, description = "Too many streams", body = Problem),
+        (status = 400, description = "The server speaks none of the requested sub-protocols"),
+        (status = 426, description = "Not a WebSocket handshake"),
+        (status = 503, description = "Too many streams"),
     )
 )]
 async fn model_stream(
-    State(app): State<App>,
-    Extension(caller): Extension<Caller>,
+    app: App,
+    caller: Caller,
     messages: Messages,
     Path(model): Path<String>,
     upgrade: Upgrade,
@@ -100,8 +91,15 @@ async fn model_stream(
 }
 
 fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
-    let messages = messages.map(|Extension(messages)| messages).unwrap_or_default();
-    app.stream_services(caller, messages)
+    StreamServices {
+        config: Arc::clone(&app.config),
+        predictor: app.predictor().clone(),
+        blocking: app.predictions.clone(),
+        streams: app.streams.clone(),
+        keys: app.keys.clone(),
+        caller,
+        messages: messages.map(|Extension(messages)| messages).unwrap_or_default(),
+    }
 }
 
 fn open(
@@ -122,13 +120,13 @@ fn open(
             Codec::NAMES.join(" and ")
         )));
     }
-    let place = app.streams().enter()?;
+    let place = app.streams.enter()?;
     let limit = app.config().max_body_bytes;
     let upgrade = upgrade
         .max_message_size(limit)
         .max_frame_size(limit)
         .read_buffer_size(READ_BYTES);
-    services.messages.begin(app.body_budget());
+    services.messages.begin(&app.body_budget);
     Ok(upgrade.on_upgrade(move |socket| {
         let connection = StreamConnection::new(services, &session, is_persistent, chosen.unwrap_or_default());
         async move {

@@ -96,7 +96,7 @@ impl StreamConnection {
     ) -> Self {
         let outbox = Outbox::new(services.config.max_stream_buffer_bytes);
         let ownership = session.connect();
-        let model = &session.model().manifest.name;
+        let model = &session.model.manifest.name;
         Self {
             frames: counter!(metric_names::STREAM_FRAMES, "model" => model.to_string()),
             overtaken: counter!(metric_names::STREAM_OVERTAKEN, "model" => model.to_string()),
@@ -109,8 +109,8 @@ impl StreamConnection {
     }
 
     pub(in crate::server) async fn run(self, socket: WebSocket) {
-        let session = self.ownership.session();
-        info!(session.id = %session.id(), model.id = %session.model().manifest.name, "stream opened");
+        let session = &self.ownership.session;
+        info!(session.id = %session.id, model.id = %session.model.manifest.name, "stream opened");
         let (mut sink, mut stream) = socket.split();
         self.outbox.push(self.ready()).await;
         let worked = async {
@@ -130,17 +130,17 @@ impl StreamConnection {
             discard_input(&mut stream).await;
         }
         info!(
-            frames = self.ownership.session().next_seq(),
+            frames = self.ownership.session.next_seq(),
             client_gone = ended.is_err(),
             "stream closed"
         );
     }
 
     fn ready(&self) -> ServerMessage {
-        let session = self.ownership.session();
-        let manifest = &session.model().manifest;
+        let session = &self.ownership.session;
+        let manifest = &session.model.manifest;
         ServerMessage::Ready {
-            session: self.is_persistent.then(|| session.id().to_owned()),
+            session: self.is_persistent.then(|| session.id.clone()),
             model: manifest.name.to_string(),
             version: manifest.version,
             spec: Box::new(manifest.spec.clone()),
@@ -174,7 +174,7 @@ impl StreamConnection {
         inbox: &mpsc::Sender<PipelinedItem>,
     ) -> Result<ClosingReason, ClientGone> {
         // Frames are read before the messages ahead of them are answered, so the reader keeps its own copy.
-        let mut resize = self.ownership.session().settings().resize;
+        let mut resize = self.ownership.session.settings().resize;
         loop {
             // The message before this one was decoded: only its frame is left, in the model's size.
             self.services.messages.message_read();
@@ -254,7 +254,7 @@ impl StreamConnection {
 
     /// The frame, if it fits the model. Raw pixels need no other thread; an image file does.
     async fn checked(&self, message: FrameMessage, resize: Option<Resize>) -> Result<FrameStep, StepError> {
-        let manifest = Arc::clone(&self.ownership.session().model().manifest);
+        let manifest = Arc::clone(&self.ownership.session.model.manifest);
         let max_steps = self.services.config.max_steps;
         if message.format == ImageFormat::Raw {
             return FrameStep::new(message, resize, &manifest, max_steps);
@@ -287,7 +287,7 @@ impl StreamConnection {
                         Err(error) => self.error(error.code(), without_middle(&error)),
                     }
                 }
-                PipelinedItem::Configure(message) => self.ownership.session().configure(message),
+                PipelinedItem::Configure(message) => self.ownership.session.configure(message),
                 PipelinedItem::Refused(code, detail) => self.error(code, detail),
             };
             if let ServerMessage::Overtaken { .. } = answer {
@@ -301,7 +301,7 @@ impl StreamConnection {
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {
-        let next_seq = self.ownership.session().next_seq();
+        let next_seq = self.ownership.session.next_seq();
         ServerMessage::Error { code, detail, next_seq }
     }
 
@@ -310,27 +310,20 @@ impl StreamConnection {
     async fn write(&self, sink: &mut SplitSink<WebSocket, Message>) -> Result<(), ClientGone> {
         let limit = Duration::from_millis(self.services.config.stream_send_ms);
         loop {
-            let message = self.outbox.next().await;
-            match timeout(limit, sink.send(self.codec.encode(&message))).await {
-                Ok(sent) => sent.map_err(|_| ClientGone)?,
-                Err(_) => return self.close_slow(sink, limit).await,
+            let mut message = self.outbox.next().await;
+            if let Ok(sent) = timeout(limit, sink.send(self.codec.encode(&message))).await {
+                sent.map_err(|_| ClientGone)?;
+            } else {
+                debug!("the client does not read");
+                let reason = ClosingReason::Slow;
+                message = ServerMessage::Closing { reason };
+                send(sink, self.codec.encode(&message), limit).await?;
             }
             if let ServerMessage::Closing { reason } = message {
-                return close(sink, code_of(reason), limit).await;
+                let (code, reason) = (code_of(reason), "".into());
+                return send(sink, Message::Close(Some(CloseFrame { code, reason })), limit).await;
             }
         }
-    }
-
-    /// Ends the stream of a client that does not read.
-    async fn close_slow(&self, sink: &mut SplitSink<WebSocket, Message>, limit: Duration) -> Result<(), ClientGone> {
-        debug!("the client does not read");
-        let reason = ClosingReason::Slow;
-        let last = self.codec.encode(&ServerMessage::Closing { reason });
-        timeout(limit, sink.send(last))
-            .await
-            .map_err(|_| ClientGone)?
-            .map_err(|_| ClientGone)?;
-        close(sink, code_of(reason), limit).await
     }
 }
 
@@ -358,12 +351,9 @@ async fn discard_input(stream: &mut SplitStream<WebSocket>) {
     let _ = timeout(LINGER, all).await;
 }
 
-async fn close(sink: &mut SplitSink<WebSocket, Message>, code: u16, limit: Duration) -> Result<(), ClientGone> {
-    let frame = CloseFrame {
-        code,
-        reason: "".into(),
-    };
-    let sent = timeout(limit, sink.send(Message::Close(Some(frame)))).await;
+/// Errors: the message cannot be sent within the limit.
+async fn send(sink: &mut SplitSink<WebSocket, Message>, message: Message, limit: Duration) -> Result<(), ClientGone> {
+    let sent = timeout(limit, sink.send(message)).await;
     sent.map_err(|_| ClientGone)?.map_err(|_| ClientGone)
 }
 

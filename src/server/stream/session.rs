@@ -25,12 +25,12 @@ pub(in crate::server) enum Owner {
 }
 
 pub(in crate::server) struct Session {
-    pub(super) id: String,
+    pub(in crate::server) id: String,
     pub(super) token_hash: TokenHash,
     pub(super) maker: Caller,
     /// The session's number in the predictor.
-    key: u64,
-    model: Arc<Model>,
+    pub(in crate::server) key: u64,
+    pub(in crate::server) model: Arc<Model>,
     inner: Mutex<SessionInner>,
     owner: watch::Sender<Owner>,
 }
@@ -69,18 +69,6 @@ impl Session {
             owner: watch::Sender::new(Owner::Connection(0)),
         };
         Ok((session, token.text()))
-    }
-
-    pub(in crate::server) fn id(&self) -> &str {
-        &self.id
-    }
-
-    pub(in crate::server) fn key(&self) -> u64 {
-        self.key
-    }
-
-    pub(in crate::server) fn model(&self) -> &Arc<Model> {
-        &self.model
     }
 
     pub(in crate::server) fn state(&self) -> (SessionState, SessionSettings) {
@@ -156,7 +144,7 @@ impl Session {
 
 /// A connection's right to step a session, until another connection takes over or this is dropped.
 pub(in crate::server) struct Ownership {
-    session: Arc<Session>,
+    pub(super) session: Arc<Session>,
     number: u64,
     changed: watch::Receiver<Owner>,
 }
@@ -172,10 +160,6 @@ impl Drop for Ownership {
 }
 
 impl Ownership {
-    pub(in crate::server) fn session(&self) -> &Arc<Session> {
-        &self.session
-    }
-
     /// Waits until the session has another owner or is deleted.
     pub(in crate::server) async fn lost(&self) -> Owner {
         let mut changed = self.changed.clone();
@@ -208,8 +192,10 @@ impl Ownership {
         let answer = if let Some(task) = task {
             let mut prediction = predictor.compute(model, task, Some(key)).await?;
             let core = &mut self.inner()?.core;
-            if missing.is_some() {
-                core.advance(step.seq, step.conditioning, &mut prediction, spec);
+            if missing.is_some()
+                && let Some(features) = prediction.features.pop()
+            {
+                core.state.advance(step.seq, features, step.conditioning, spec);
             }
             core.keep(step.timestamp_us, missing.unwrap_or(0), prediction)
         } else {

@@ -13,37 +13,11 @@ use crate::server::http::problem::ApiError;
 use crate::server::token::TokenHash;
 use foreframe_core::metric_names;
 
-/// Why a session is not available.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-pub(in crate::server) enum SessionTableError {
-    #[error("there is no session \"{0}\"")]
-    Unknown(String),
-    #[error("session \"{id}\" was not used for {grace_ms} ms and has expired; open a new one with POST /v1/sessions")]
-    Expired { id: String, grace_ms: u128 },
-    #[error(
-        "the session's token is missing or wrong; send it in the header x-session-token or as query parameter token"
-    )]
-    Token,
-    #[error("{0} sessions are open already; try again later")]
-    Full(usize),
-}
-
-impl From<SessionTableError> for ApiError {
-    fn from(error: SessionTableError) -> Self {
-        match error {
-            SessionTableError::Unknown(_) => Self::NotFound(error.to_string()),
-            SessionTableError::Expired { .. } => Self::Gone(error.to_string()),
-            SessionTableError::Token => Self::Forbidden(error.to_string()),
-            SessionTableError::Full(_) => Self::unavailable(error.to_string()),
-        }
-    }
-}
-
 /// All open sessions, by id.
 pub(in crate::server) struct SessionTable {
     inner: Mutex<SessionTableInner>,
     limit: usize,
-    grace: Duration,
+    pub(in crate::server) grace: Duration,
 }
 
 #[derive(Default)]
@@ -62,63 +36,53 @@ impl SessionTable {
         }
     }
 
-    pub(in crate::server) fn grace(&self) -> Duration {
-        self.grace
-    }
-
-    /// Errors: `Full`.
-    pub(in crate::server) fn insert(&self, session: Session, now: Instant) -> Result<Arc<Session>, SessionTableError> {
-        let mut inner = self.inner();
-        self.evict(&mut inner, now);
+    /// Errors: `Unavailable` if there are too many.
+    pub(in crate::server) fn insert(&self, session: Session, now: Instant) -> Result<Arc<Session>, ApiError> {
+        let mut inner = self.current(now);
         if inner.sessions.len() >= self.limit {
-            return Err(SessionTableError::Full(self.limit));
+            let limit = self.limit;
+            return Err(ApiError::unavailable(format!(
+                "{limit} sessions are open already; try again later"
+            )));
         }
         let session = Arc::new(session);
         inner.sessions.insert(session.id.clone(), Arc::clone(&session));
         Ok(session)
     }
 
-    /// The session, if the caller may see it. Errors: `Unknown`, `Expired`.
-    pub(in crate::server) fn find(
-        &self,
-        id: &str,
-        caller: Caller,
-        now: Instant,
-    ) -> Result<Arc<Session>, SessionTableError> {
+    /// The session, if the caller may see it. Errors: `NotFound`, `Gone`.
+    pub(in crate::server) fn find(&self, id: &str, caller: Caller, now: Instant) -> Result<Arc<Session>, ApiError> {
         let session = self.get(id, now)?;
         if caller.may_see(session.maker) {
             Ok(session)
         } else {
-            Err(SessionTableError::Unknown(id.to_owned()))
+            Err(unknown(id))
         }
     }
 
-    /// The session. Errors: `Unknown`, `Expired`.
-    fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, SessionTableError> {
-        let mut inner = self.inner();
-        self.evict(&mut inner, now);
+    /// The session. Errors: `NotFound`, `Gone`.
+    fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, ApiError> {
+        let inner = self.current(now);
         let session = inner.sessions.get(id).cloned();
         session.ok_or_else(|| {
             if inner.expired.iter().any(|expired| expired == id) {
-                return SessionTableError::Expired {
-                    id: id.to_owned(),
-                    grace_ms: self.grace.as_millis(),
-                };
+                return ApiError::Gone(format!(
+                    "session \"{id}\" was not used for {} ms and has expired; open a new one with POST /v1/sessions",
+                    self.grace.as_millis()
+                ));
             }
-            SessionTableError::Unknown(id.to_owned())
+            unknown(id)
         })
     }
 
-    /// The session, if the token is right; counts as use. Errors: `Unknown`, `Expired`, `Token`.
-    pub(in crate::server) fn open(
-        &self,
-        id: &str,
-        token: &str,
-        now: Instant,
-    ) -> Result<Arc<Session>, SessionTableError> {
+    /// The session, if the token is right; counts as use. Errors: `NotFound`, `Gone`, `Forbidden`.
+    pub(in crate::server) fn open(&self, id: &str, token: &str, now: Instant) -> Result<Arc<Session>, ApiError> {
         let session = self.get(id, now)?;
         if session.token_hash != TokenHash::of(token) {
-            return Err(SessionTableError::Token);
+            return Err(ApiError::Forbidden(
+                "the session's token is missing or wrong; send it in the header x-session-token or as query parameter token"
+                    .to_owned(),
+            ));
         }
         session.touch(now);
         Ok(session)
@@ -131,8 +95,7 @@ impl SessionTable {
 
     /// The sessions after an id that the caller may see, in the order of their ids.
     pub(in crate::server) fn page(&self, after: &str, limit: usize, caller: Caller, now: Instant) -> Vec<Arc<Session>> {
-        let mut inner = self.inner();
-        self.evict(&mut inner, now);
+        let inner = self.current(now);
         let later = inner
             .sessions
             .range::<str, _>((std::ops::Bound::Excluded(after), std::ops::Bound::Unbounded));
@@ -142,13 +105,13 @@ impl SessionTable {
 
     /// How many are open.
     pub(in crate::server) fn count(&self, now: Instant) -> usize {
-        let mut inner = self.inner();
-        self.evict(&mut inner, now);
-        inner.sessions.len()
+        self.current(now).sessions.len()
     }
 
-    fn evict(&self, inner: &mut SessionTableInner, now: Instant) {
-        let SessionTableInner { sessions, expired } = inner;
+    /// The table without the sessions that have expired.
+    fn current(&self, now: Instant) -> MutexGuard<'_, SessionTableInner> {
+        let mut inner = self.inner();
+        let SessionTableInner { sessions, expired } = &mut *inner;
         sessions.retain(|id, session| {
             let is_over = session.left(self.grace, now).is_some_and(|left| left.is_zero());
             if is_over {
@@ -161,9 +124,14 @@ impl SessionTable {
         });
         let surplus = expired.len().saturating_sub(self.limit);
         expired.drain(..surplus);
+        inner
     }
 
     fn inner(&self) -> MutexGuard<'_, SessionTableInner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn unknown(id: &str) -> ApiError {
+    ApiError::NotFound(format!("there is no session \"{id}\""))
 }

@@ -37,18 +37,14 @@ impl FrameStep {
     ) -> Result<Self, StepError> {
         let limit = max_steps.max(manifest.spec.horizon);
         if let Some(found) = message.steps.filter(|steps| *steps > limit) {
-            return Err(StepError::Steps { found, limit });
+            return Err(StepError::Invalid(format!(
+                "steps is {found}; this server predicts 1 to {limit}"
+            )));
         }
-        let action = |field| {
-            move |values: Vec<f32>| Action::try_from(values).map_err(|source| StepError::Value { field, source })
-        };
-        let past: Option<Action> = message.action.map(action("action")).transpose()?;
-        let plan: Option<Vec<Action>> = message
-            .plan
-            .map(|plan| plan.into_iter().map(action("plan")).collect())
-            .transpose()?;
-        let state = message.state.map(RobotState::try_from).transpose();
-        let state = state.map_err(|source| StepError::Value { field: "state", source })?;
+        let past: Option<Action> = message.action.map(|action| checked("action", action)).transpose()?;
+        let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked("plan", action)).collect();
+        let plan: Option<Vec<Action>> = message.plan.map(actions).transpose()?;
+        let state: Option<RobotState> = message.state.map(|state| checked("state", state)).transpose()?;
         let given = RawConditioning {
             past: past.as_slice(),
             plan: plan.as_deref(),
@@ -67,19 +63,19 @@ impl FrameStep {
     }
 }
 
+fn checked<T: TryFrom<Vec<f32>, Error = ValueError>>(field: &str, values: Vec<f32>) -> Result<T, StepError> {
+    T::try_from(values).map_err(|error| StepError::Invalid(format!("{field}: {error}")))
+}
+
 /// Why a frame was refused. The session stays as it was.
 #[derive(Debug, thiserror::Error)]
 pub(in crate::server) enum StepError {
     #[error("seq is {found}; seq {expected} is next")]
     Gap { found: u64, expected: u64 },
-    #[error("seq is {0}; the greatest is one less")]
-    Seq(u64),
-    #[error("steps is {found}; this server predicts 1 to {limit}")]
-    Steps { found: usize, limit: usize },
+    #[error("{0}")]
+    Invalid(String),
     #[error(transparent)]
     Image(#[from] ImageError),
-    #[error("{field}: {source}")]
-    Value { field: &'static str, source: ValueError },
     #[error(transparent)]
     Input(#[from] InputError),
     #[error(transparent)]
@@ -98,18 +94,9 @@ impl StepError {
             Self::Serving(error) => match error.kind() {
                 ErrorKind::Busy | ErrorKind::Away => ErrorCode::Overloaded,
                 ErrorKind::Usage => ErrorCode::Invalid,
-                ErrorKind::NotFound
-                | ErrorKind::Conflict
-                | ErrorKind::Unusable
-                | ErrorKind::Cancelled
-                | ErrorKind::Internal => ErrorCode::Internal,
+                _ => ErrorCode::Internal,
             },
-            Self::Seq(_)
-            | Self::Steps { .. }
-            | Self::Image(_)
-            | Self::Value { .. }
-            | Self::Input(_)
-            | Self::NotOwner => ErrorCode::Invalid,
+            Self::Invalid(_) | Self::Image(_) | Self::Input(_) | Self::NotOwner => ErrorCode::Invalid,
         }
     }
 }
@@ -142,11 +129,11 @@ impl SessionCore {
         }
     }
 
-    /// How many frames are missing before this one; `None` if it was answered before. Errors: `Seq`, `Gap`.
+    /// How many frames are missing before this one; `None` if it was answered before. Errors: `Invalid`, `Gap`.
     pub(super) fn missing_before(&self, seq: u64) -> Result<Option<u64>, StepError> {
         let expected = self.state.next_seq();
         if seq == u64::MAX {
-            return Err(StepError::Seq(seq));
+            return Err(StepError::Invalid(format!("seq is {seq}; the greatest is one less")));
         }
         if seq > expected && self.settings.on_gap == OnGap::Error {
             return Err(StepError::Gap { found: seq, expected });
@@ -179,19 +166,6 @@ impl SessionCore {
     pub(super) fn last_answer(&self, timestamp_us: i64) -> StepAnswer {
         let last = self.last_answer.clone();
         last.unwrap_or_else(|| self.answer(timestamp_us, 0, None))
-    }
-
-    /// Advances the session by frame `seq`, of which this is the prediction.
-    pub(super) fn advance(
-        &mut self,
-        seq: u64,
-        conditioning: ConditioningInput,
-        prediction: &mut Prediction,
-        spec: &ModelSpec,
-    ) {
-        if let Some(features) = prediction.features.pop() {
-            self.state.advance(seq, features, conditioning, spec);
-        }
     }
 
     /// Keeps the prediction as the answer to the last frame.

@@ -1,6 +1,6 @@
 //! The audit trail: who changed what and when.
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::database::{Tx, Values, read_all, values};
@@ -11,19 +11,24 @@ use foreframe_core::types::DatasetName;
 const MAX_ROWS: i64 = 100_000;
 
 /// A change of state.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = AuditEntry)]
 pub struct AuditRow {
-    /// Its number, from 1.
+    /// Its number, from 1. The oldest are deleted.
     pub number: i64,
     /// When, in seconds since 1970.
+    #[serde(rename = "unix_s")]
     pub time_s: f64,
-    /// The id of an API key, `anonymous` or `command line`.
+    /// The id of an API key, `anonymous` (authentication is off) or `command line`.
     pub who: String,
     /// The name of that key.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// What was done, for example `job.create`.
+    /// `job.create`, `job.cancel`, `job.resume`, `version.publish`, `version.activate`, `version.delete`, `dataset.delete`,
+    /// `key.create` or `key.revoke`. The entry of `dataset.delete` is written before the files are deleted; if that fails,
+    /// `dataset.delete.failed` follows.
     pub action: String,
-    /// To what, for example `job-7`.
+    /// The job, the version (`NAME@VERSION`), the data set or the key.
     pub target: String,
 }
 

@@ -6,25 +6,28 @@ use super::database::{Tx, read_all, values};
 use super::job_id::JobId;
 use super::{Store, StoreError};
 
-/// A point of a training's loss curves.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// A point of the loss curves.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = CurvePoint)]
 pub struct LossRow {
     /// `pretrain` or `sequence`.
     pub stage: String,
-    /// Steps done in that stage.
+    /// Optimizer steps in that stage.
     pub step: i64,
-    /// On the step's training windows.
+    /// Loss on the training windows of that step.
     pub train: Option<f64>,
-    /// On the validation windows.
+    /// Loss on the validation windows, if it was computed.
     pub validation: Option<f64>,
 }
 
 /// A line of a job's log.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = LogLine)]
 pub struct LogRow {
-    /// The line's number in its job, from 1.
+    /// The number of the line, from 1. The oldest lines are removed.
     pub seq: i64,
-    /// When, in seconds since 1970.
+    /// Time in seconds since 1970.
+    #[serde(rename = "unix_s")]
     pub time_s: f64,
     /// What happened.
     pub line: String,

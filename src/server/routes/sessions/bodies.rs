@@ -19,22 +19,16 @@ use foreframe_core::serving::{SessionSnapshot, SessionState};
 #[serde(deny_unknown_fields)]
 pub(super) struct CreateSession {
     /// The model's name; required without `state`.
-    #[serde(default)]
     pub(super) model: Option<String>,
     /// What happens if frames are missing.
-    #[serde(default)]
     pub(super) on_gap: Option<OnGap>,
     /// What happens to a frame if newer frames wait behind it.
-    #[serde(default)]
     pub(super) on_late: Option<OnLate>,
     /// How predicted frames are encoded. Default: in the format of the frames sent.
-    #[serde(default)]
     pub(super) format: Option<ImageFormat>,
     /// How a frame of another size is resized; without it, another size is an error.
-    #[serde(default)]
     pub(super) resize: Option<Resize>,
     /// A state from `GET /v1/sessions/{id}/state` of this or another server: the session continues from it.
-    #[serde(default)]
     pub(super) state: Option<ExportedState>,
 }
 
@@ -54,7 +48,6 @@ pub(super) struct ExportedState {
     #[serde(default)]
     pub(super) on_late: OnLate,
     /// How predicted frames are encoded; absent: in the format of the frames sent.
-    #[serde(default)]
     pub(super) format: Option<ImageFormat>,
     /// How a frame of another size is resized; absent: it is an error.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -154,10 +147,10 @@ impl CreateSession {
 impl SessionDescription {
     pub(super) fn of(session: &Session, grace: Duration, now: Instant) -> Self {
         let (state, _) = session.state();
-        let manifest = &session.model().manifest;
+        let manifest = &session.model.manifest;
         let left = session.left(grace, now);
         Self {
-            id: session.id().to_owned(),
+            id: session.id.clone(),
             model: manifest.name.to_string(),
             version: manifest.version,
             next_seq: state.next_seq(),
@@ -165,7 +158,7 @@ impl SessionDescription {
             need: manifest.spec.context,
             connected: session.is_connected(),
             expires_in_ms: left.map(|left| left.as_millis() as u64),
-            stream: format!("/v1/sessions/{}/stream", session.id()),
+            stream: format!("/v1/sessions/{}/stream", session.id),
         }
     }
 }

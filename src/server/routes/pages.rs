@@ -1,0 +1,82 @@
+//! Pages for people and contracts for programs. Nothing is fetched from elsewhere: scripts and styles are part of the program.
+//!
+//! `/` shows a simulated robot to drive, its frames beside the predicted ones, the models, and the running jobs; at `/docs`,
+//! requests can be tried out. The contracts are `OpenAPI` for the requests and `AsyncAPI` for the streams.
+
+use std::sync::Arc;
+
+use axum::http::{HeaderValue, header};
+use axum::middleware::map_response;
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use axum::{Extension, Router};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+use utoipa_swagger_ui::{Config, SwaggerUi};
+
+use crate::server::state::App;
+
+const PAGE: &str = include_str!("../dashboard/index.html");
+const SCRIPT: &str = include_str!("../dashboard/dashboard.js");
+const STYLE: &str = include_str!("../dashboard/dashboard.css");
+const STREAMS: &str = include_str!("../../../openapi/asyncapi.yaml");
+
+/// Script, style and pictures come from this server, frames from its answers; nothing from elsewhere.
+const DASHBOARD_POLICY: &str =
+    "default-src 'self'; img-src 'self' data:; script-src 'self'; style-src 'self'; frame-ancestors 'none'";
+/// Everything comes from this server. The pages write styles into their elements.
+const DOCS_POLICY: &str = "default-src 'self'; img-src 'self' data:; script-src 'self'; \
+     style-src 'self' 'unsafe-inline'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'";
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    let asset = |media_type, text| get(async move || ([(header::CONTENT_TYPE, media_type)], text));
+    OpenApiRouter::new()
+        .routes(routes!(page))
+        .routes(routes!(openapi_json))
+        .routes(routes!(asyncapi_yaml))
+        .route("/dashboard.js", asset("text/javascript; charset=utf-8", SCRIPT))
+        .route("/dashboard.css", asset("text/css; charset=utf-8", STYLE))
+}
+
+/// `/docs`.
+pub(in crate::server) fn docs() -> Router<App> {
+    // Otherwise the pages would ask a validator on the internet.
+    let config = Config::from("/openapi.json").validator_url("none");
+    let pages: Router<App> = SwaggerUi::new("/docs").config(config).into();
+    pages.layer(map_response(async |mut page: Response| {
+        let policy = HeaderValue::from_static(DOCS_POLICY);
+        page.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
+        page
+    }))
+}
+
+/// A page for people.
+#[utoipa::path(
+    get, path = "/", tag = "about",
+    responses((status = 200, description = "A page", content_type = "text/html"))
+)]
+async fn page() -> impl IntoResponse {
+    ([(header::CONTENT_SECURITY_POLICY, DASHBOARD_POLICY)], Html(PAGE))
+}
+
+/// The OpenAPI document as text; clones share it.
+#[derive(Clone)]
+pub(in crate::server) struct ContractText(pub(in crate::server) Arc<str>);
+
+/// This contract.
+#[utoipa::path(
+    get, path = "/openapi.json", tag = "about",
+    responses((status = 200, description = "OpenAPI 3.1", content_type = "application/json"))
+)]
+async fn openapi_json(Extension(ContractText(text)): Extension<ContractText>) -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/json")], text.to_string())
+}
+
+/// The contract of the streams: their messages with examples.
+#[utoipa::path(
+    get, path = "/asyncapi.yaml", tag = "about",
+    responses((status = 200, description = "AsyncAPI 3.0", content_type = "application/yaml"))
+)]
+async fn asyncapi_yaml() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/yaml")], STREAMS)
+}
