@@ -150,7 +150,7 @@ pub(in crate::server) fn decode(
     }
     let (width, height) = codec::dimensions(&bytes).map_err(decode_error)?;
     let Some(way) = input.resize else {
-        check_size(field, model, spec, (width, height)).map_err(ImageError::Size)?;
+        check_size(field, manifest, (width, height)).map_err(ImageError::Size)?;
         return codec::decode(&bytes).map_err(decode_error);
     };
     if width.saturating_mul(height) > MAX_FIT_PIXELS {

@@ -7,7 +7,6 @@ use sha2::{Digest, Sha256};
 use super::check::{check_description, check_episode};
 use super::frame_store::{FrameStore, HeldFrames, item};
 use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
-use foreframe_core::files::hex;
 use foreframe_core::frame::Frame;
 
 /// An open data set.
@@ -93,7 +92,7 @@ impl Dataset {
         for value in &self.timestamps_s {
             hasher.update(value.to_le_bytes());
         }
-        hex(&hasher.finalize())
+        format!("{:x}", hasher.finalize())
     }
 
     /// The description of the data set.

@@ -14,7 +14,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::{DATABASE_FILE, Store, StoreError, WRITE_PROBE, unix_s};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
+use foreframe_core::files::{files_below, is_hidden, is_partial, none_if_missing, write_atomically};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
 const INDEX_FILE: &str = "backup.json";
@@ -319,7 +319,7 @@ fn hash_while(source: &mut File, mut take: impl FnMut(&[u8]) -> io::Result<()>) 
     }
     Ok(BackupFile {
         bytes,
-        sha256: hex(&digest.finalize()),
+        sha256: format!("{:x}", digest.finalize()),
     })
 }
 
