@@ -67,7 +67,7 @@ pub mod images {
     #[doc(inline)]
     pub use foreframe_core::frame::codec::{decode, encode_png};
     #[doc(inline)]
-    pub use foreframe_core::frame::jpeg::JpegDamage;
+    pub use foreframe_core::frame::jpeg::{JpegDamage, ScanDamage};
     #[doc(inline)]
     pub use foreframe_core::frame::preprocess::Preprocess;
     #[doc(inline)]

@@ -40,8 +40,8 @@ pub enum JpegDamage {
         scan: usize,
         /// Counted from 1.
         block: usize,
-        /// For example `no data for`.
-        found: &'static str,
+        /// What is wrong.
+        found: ScanDamage,
     },
     /// A component of the image is in no scan.
     #[error("{0} of its color components has no data")]
@@ -49,6 +49,27 @@ pub enum JpegDamage {
     /// Not baseline, extended or progressive with 8 bits and Huffman codes.
     #[error("it is of a kind that is not supported; write it as baseline or progressive JPEG with 8 bits")]
     Unsupported,
+}
+
+/// What is wrong with the data of a scan, as the message says it before the block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ScanDamage {
+    /// The data ends before the block does.
+    #[error("no data for")]
+    End,
+    /// The bits are no code, or a code that has no meaning here.
+    #[error("an invalid code in")]
+    Code,
+    /// A value is larger than any image has.
+    #[error("an invalid coefficient in")]
+    Coefficient,
+    /// The last block of the scan or of a restart interval is not the end of its data.
+    #[error("data left after")]
+    DataLeft,
+    /// A restart marker is missing or has the wrong number.
+    #[error("no restart marker after")]
+    Restart,
 }
 
 /// Errors: the image is damaged. Pixels are not computed. Takes memory only for progressive images: 8 bytes a block.

@@ -1,12 +1,7 @@
 //! Reads markers, segments and the bits of scans.
 
-use super::JpegDamage;
 use super::tables::{HuffmanTable, number};
-
-/// No bits are left before the next marker or the end.
-const END: &str = "no data for";
-/// The bits are no code, or a code that has no meaning here.
-pub(super) const CODE: &str = "an invalid code in";
+use super::{JpegDamage, ScanDamage};
 
 /// Reads an image from its start.
 pub(super) struct JpegReader<'a> {
@@ -48,6 +43,7 @@ impl<'a> JpegReader<'a> {
         rest.get(2..length).ok_or(JpegDamage::Truncated)
     }
 
+    #[inline]
     fn fill(&mut self) {
         while self.count <= 56 {
             let Some(&byte) = self.bytes.get(self.at) else { return };
@@ -60,14 +56,16 @@ impl<'a> JpegReader<'a> {
         }
     }
 
-    fn drop_bits(&mut self, count: u32) -> Result<(), &'static str> {
-        self.count = self.count.checked_sub(count).ok_or(END)?;
+    #[inline]
+    fn drop_bits(&mut self, count: u32) -> Result<(), ScanDamage> {
+        self.count = self.count.checked_sub(count).ok_or(ScanDamage::End)?;
         self.buffer <<= count;
         Ok(())
     }
 
-    /// The next 0 to 16 bits of a scan as a number. Errors: what is wrong with them.
-    pub(super) fn bits(&mut self, count: u32) -> Result<u32, &'static str> {
+    /// The next 0 to 16 bits of a scan as a number. Errors: `End`.
+    #[inline]
+    pub(super) fn bits(&mut self, count: u32) -> Result<u32, ScanDamage> {
         if self.count < count {
             self.fill();
         }
@@ -76,19 +74,26 @@ impl<'a> JpegReader<'a> {
         Ok(value)
     }
 
-    /// The next symbol of a scan. Errors: what is wrong with it.
-    pub(super) fn symbol(&mut self, table: &HuffmanTable) -> Result<u8, &'static str> {
+    /// The next symbol of a scan. Errors: `End`, `Code`.
+    #[inline]
+    pub(super) fn symbol(&mut self, table: &HuffmanTable) -> Result<u8, ScanDamage> {
         if self.count < 16 {
             self.fill();
         }
         let code = table.code((self.buffer >> 48) as u16);
-        let code = code.ok_or(if self.count < 16 { END } else { CODE })?;
-        self.drop_bits(code.length)?;
-        Ok(code.symbol)
+        let missing = if self.count < 16 {
+            ScanDamage::End
+        } else {
+            ScanDamage::Code
+        };
+        let (length, symbol) = code.ok_or(missing)?;
+        self.drop_bits(u32::from(length))?;
+        Ok(symbol)
     }
 
-    /// A signed value of 0 to 16 bits. Errors: what is wrong with it.
-    pub(super) fn signed(&mut self, bits: u32) -> Result<i32, &'static str> {
+    /// A signed value of 0 to 16 bits. Errors: `End`.
+    #[inline]
+    pub(super) fn signed(&mut self, bits: u32) -> Result<i32, ScanDamage> {
         let value = self.bits(bits)? as i32;
         let is_negative = bits > 0 && value < 1 << (bits - 1);
         Ok(if is_negative { value - (1 << bits) + 1 } else { value })

@@ -1,9 +1,9 @@
 //! Reads the blocks of one scan.
 
-use super::JpegDamage;
 use super::layout::{ImageComponent, ImageLayout};
-use super::reader::{CODE, JpegReader};
+use super::reader::JpegReader;
 use super::tables::{HuffmanTable, JpegTables};
+use super::{JpegDamage, ScanDamage};
 
 /// The largest coefficient of an 8-bit image is 1024. Encoders that sharpen may exceed it.
 const MAX_COEFFICIENT: u64 = 1280;
@@ -75,7 +75,7 @@ impl<'a> Scan<'a> {
             .map(|&[id, table]| {
                 let component = components.find(|component| component.id == id)?;
                 component.is_present |= first == 0 && !band.is_refinement;
-                let huffman = |class: usize, index: u8| tables.huffman[class].get(usize::from(index))?.as_ref();
+                let huffman = |class: usize, index: u8| tables.huffman[class].get(usize::from(index))?.as_deref();
                 Some(ScanPart {
                     steps: tables.quantization.get(component.quantization)?.as_ref()?,
                     dc: huffman(0, table >> 4),
@@ -115,7 +115,7 @@ impl<'a> Scan<'a> {
                 self.end_interval(reader).map_err(|found| damage(found, done))?;
                 let marker = 0xd0 + (unit / self.restart_interval - 1) % 8;
                 if reader.marker().map(usize::from) != Ok(marker) {
-                    return Err(damage("no restart marker after", done));
+                    return Err(damage(ScanDamage::Restart, done));
                 }
             }
             for part in &mut self.parts {
@@ -133,19 +133,19 @@ impl<'a> Scan<'a> {
     }
 
     /// A scan or restart interval must end with its last block.
-    fn end_interval(&mut self, reader: &mut JpegReader<'_>) -> Result<(), &'static str> {
+    fn end_interval(&mut self, reader: &mut JpegReader<'_>) -> Result<(), ScanDamage> {
         let has_blocks_left = self.parts.iter().any(|part| part.empty_blocks > 0);
         for part in &mut self.parts {
             part.last_dc = 0;
         }
         let is_ended = reader.end_bits() && !has_blocks_left;
-        is_ended.then_some(()).ok_or("data left after")
+        is_ended.then_some(()).ok_or(ScanDamage::DataLeft)
     }
 }
 
 impl ScanPart<'_> {
     /// Reads what the scan holds of a block. Errors: what is wrong with it.
-    fn read_block(&mut self, reader: &mut JpegReader<'_>, band: Band, block: usize) -> Result<(), &'static str> {
+    fn read_block(&mut self, reader: &mut JpegReader<'_>, band: Band, block: usize) -> Result<(), ScanDamage> {
         if band.first == 0 && band.is_refinement {
             reader.bits(1)?;
         } else if band.first == 0 {
@@ -158,11 +158,11 @@ impl ScanPart<'_> {
     }
 
     /// The first coefficient of a block is the difference to that of the block before.
-    fn read_first_coefficient(&mut self, reader: &mut JpegReader<'_>, low_bit: u32) -> Result<(), &'static str> {
-        let bits = reader.symbol(self.dc.ok_or(CODE)?)?;
+    fn read_first_coefficient(&mut self, reader: &mut JpegReader<'_>, low_bit: u32) -> Result<(), ScanDamage> {
+        let bits = reader.symbol(self.dc.ok_or(ScanDamage::Code)?)?;
         // A difference of 8-bit images has at most 11 bits.
         if bits > 11 {
-            return Err(CODE);
+            return Err(ScanDamage::Code);
         }
         self.last_dc += reader.signed(u32::from(bits))?;
         self.check_range(0, self.last_dc, low_bit)
@@ -173,21 +173,24 @@ impl ScanPart<'_> {
         reader: &mut JpegReader<'_>,
         band: Band,
         block: usize,
-    ) -> Result<(), &'static str> {
+    ) -> Result<(), ScanDamage> {
         let nonzero = self.component.nonzero.get(block).copied();
         let nonzero = nonzero.filter(|_| band.is_refinement).unwrap_or(0);
         let mut index = band.first.max(1);
         while index <= band.last && self.empty_blocks == 0 {
-            let symbol = reader.symbol(self.ac.ok_or(CODE)?)?;
+            let symbol = reader.symbol(self.ac.ok_or(ScanDamage::Code)?)?;
             let (zeros, bits) = (u32::from(symbol >> 4), u32::from(symbol & 15));
             if bits == 0 && zeros < 15 {
                 self.empty_blocks = (1 << zeros) + reader.bits(zeros)?;
                 break;
             }
             let value = reader.signed(bits)?;
-            index = pass_zeros(reader, nonzero, index..=band.last, zeros)?;
+            index = match nonzero {
+                0 => index + zeros as usize,
+                _ => pass_zeros(reader, nonzero, (index, band.last), zeros as usize)?,
+            };
             if index > band.last || (band.is_refinement && bits > 1) {
-                return Err(CODE);
+                return Err(ScanDamage::Code);
             }
             if bits > 0 {
                 self.check_range(index, value, band.low_bit)?;
@@ -199,31 +202,30 @@ impl ScanPart<'_> {
         }
         // Only progressive images have codes for several blocks without more coefficients.
         if self.empty_blocks > 1 && !band.is_progressive {
-            return Err(CODE);
+            return Err(ScanDamage::Code);
         }
         if self.empty_blocks > 0 {
             self.empty_blocks -= 1;
-            pass_zeros(reader, nonzero, index..=band.last, u32::MAX)?;
+            pass_zeros(reader, nonzero, (index, band.last), 64)?;
         }
         Ok(())
     }
 
-    fn check_range(&self, index: usize, value: i32, low_bit: u32) -> Result<(), &'static str> {
+    fn check_range(&self, index: usize, value: i32, low_bit: u32) -> Result<(), ScanDamage> {
         let step = self.steps.get(index).map_or(1, |&step| u64::from(step)) << low_bit;
         let is_in_range = u64::from(value.unsigned_abs()) * step <= MAX_COEFFICIENT + step;
-        is_in_range.then_some(()).ok_or("an invalid coefficient in")
+        is_in_range.then_some(()).ok_or(ScanDamage::Coefficient)
     }
 }
 
-/// Reads a bit for each coefficient that is not 0, and passes so many zeros; gives the index of the next zero.
+/// Reads a bit for each coefficient of `nonzero`, and passes so many others; gives the index of the next other one.
 fn pass_zeros(
     reader: &mut JpegReader<'_>,
     nonzero: u64,
-    indexes: std::ops::RangeInclusive<usize>,
-    mut zeros: u32,
-) -> Result<usize, &'static str> {
-    let end = *indexes.end() + 1;
-    for index in indexes {
+    (mut index, last): (usize, usize),
+    mut zeros: usize,
+) -> Result<usize, ScanDamage> {
+    while index <= last && nonzero >> index != 0 {
         if nonzero >> index & 1 == 1 {
             reader.bits(1)?;
         } else if zeros == 0 {
@@ -231,6 +233,7 @@ fn pass_zeros(
         } else {
             zeros -= 1;
         }
+        index += 1;
     }
-    Ok(end)
+    Ok(index + zeros)
 }

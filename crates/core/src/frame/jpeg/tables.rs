@@ -1,6 +1,6 @@
 //! The tables in effect: Huffman codes and quantization.
 
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
@@ -24,7 +24,7 @@ pub(super) struct JpegTables {
     /// Steps in zigzag order.
     pub(super) quantization: [Option<[u16; 64]>; 4],
     /// For first coefficients, and for all others.
-    pub(super) huffman: [[Option<HuffmanTable>; 4]; 2],
+    pub(super) huffman: [[Option<Arc<HuffmanTable>>; 4]; 2],
     /// Units between two restart markers; 0 for none.
     pub(super) restart_interval: usize,
 }
@@ -55,7 +55,7 @@ impl JpegTables {
             let total = counts.iter().map(|&count| usize::from(count)).sum();
             let (symbols, rest) = rest.split_at_checked(total)?;
             let class = self.huffman.get_mut(usize::from(head >> 4))?;
-            *class.get_mut(usize::from(head & 15))? = Some(HuffmanTable::new(*counts, symbols)?);
+            *class.get_mut(usize::from(head & 15))? = Some(Arc::new(HuffmanTable::new(*counts, symbols)?));
             segment = rest;
         }
         Some(())
@@ -68,22 +68,21 @@ pub(super) fn number(bytes: &[u8], at: usize) -> Option<u16> {
 }
 
 /// A Huffman table: which symbol each code stands for.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct HuffmanTable {
     /// In rising order.
     codes: Vec<HuffmanCode>,
-    /// For each value of the next 8 bits, the position of the first code that may begin with them.
-    starts: [u16; 256],
+    /// For each first 8 bits that hold a whole code: its length and symbol; length 0 for longer codes.
+    short: [(u8, u8); 256],
 }
 
 /// A code of 1 to 16 bits.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct HuffmanCode {
+#[derive(Debug)]
+struct HuffmanCode {
     /// One more than the largest 16 bits that begin with the code.
     end: u32,
-    /// Its bits.
-    pub(super) length: u32,
-    pub(super) symbol: u8,
+    length: u8,
+    symbol: u8,
 }
 
 impl HuffmanTable {
@@ -92,20 +91,31 @@ impl HuffmanTable {
         let lengths = (1..).zip(counts);
         let lengths = lengths.flat_map(|(length, count)| std::iter::repeat_n(length, usize::from(count)));
         let mut end = 0;
-        let code = |(length, &symbol): (u32, &u8)| {
+        let code = |(length, &symbol): (u8, &u8)| {
             end += 0x1_0000 >> length;
             HuffmanCode { end, length, symbol }
         };
-        let codes: Vec<HuffmanCode> = lengths.zip(symbols).map(code).collect();
-        let start = |byte| codes.partition_point(|code| code.end as usize <= byte << 8) as u16;
-        let starts = std::array::from_fn(start);
-        (end <= 0x1_0000).then_some(Self { codes, starts })
+        let codes = lengths.zip(symbols).map(code).collect();
+        let short = [(0, 0); 256];
+        let mut table = Self { codes, short };
+        for (bits, entry) in (0..=u8::MAX).zip(&mut table.short) {
+            let found = search(&table.codes, u16::from(bits) << 8);
+            *entry = found.filter(|(length, _)| *length <= 8).unwrap_or_default();
+        }
+        (end <= 0x1_0000).then_some(table)
     }
 
-    /// The code at the start of 16 bits.
-    pub(super) fn code(&self, bits: u16) -> Option<HuffmanCode> {
-        let start = usize::from(*self.starts.get(usize::from(bits >> 8))?);
-        let possible = self.codes.get(start..)?;
-        possible.iter().find(|code| u32::from(bits) < code.end).copied()
+    /// Length and symbol of the code at the start of 16 bits.
+    #[inline]
+    pub(super) fn code(&self, bits: u16) -> Option<(u8, u8)> {
+        match self.short[usize::from(bits >> 8)] {
+            (0, _) => search(&self.codes, bits),
+            found => Some(found),
+        }
     }
+}
+
+fn search(codes: &[HuffmanCode], bits: u16) -> Option<(u8, u8)> {
+    let position = codes.partition_point(|code| code.end <= u32::from(bits));
+    codes.get(position).map(|code| (code.length, code.symbol))
 }
