@@ -47,11 +47,11 @@ impl<E: Into<NnError>> From<E> for Failure {
 }
 
 /// The index of a window and a conditioning input: what a rollout is predicted from.
-type Row<'a> = (u32, &'a ConditioningInput);
+type RolloutRow<'a> = (u32, &'a ConditioningInput);
 
 fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
-    let (mut predictions, mut windows, mut rows) = (Vec::new(), Vec::new(), Vec::<Row>::new());
+    let (mut predictions, mut windows, mut rows) = (Vec::new(), Vec::new(), Vec::<RolloutRow>::new());
     for task in tasks {
         let features: Vec<Features> = encoded.by_ref().take(task.frames.len()).collect();
         if !task.conditioning_inputs.is_empty() {
@@ -125,14 +125,14 @@ impl<'a> Windows<'a> {
     }
 
     /// The rollout of each row. Rollouts of the same number of steps are computed together.
-    fn predict(&self, rows: &[Row<'_>]) -> Result<Vec<Rollout>, Failure> {
+    fn predict(&self, rows: &[RolloutRow<'_>]) -> Result<Vec<Rollout>, Failure> {
         let spec = self.loaded.spec();
         let mut rollouts = vec![Rollout::default(); rows.len()];
         let steps: BTreeSet<usize> = rows.iter().map(|(_, input)| input.steps(spec)).collect();
         for steps in steps {
             let same = rows.iter().copied().enumerate();
             let same = same.filter(|(_, (_, input))| input.steps(spec) == steps);
-            let (places, rows): (Vec<usize>, Vec<Row<'_>>) = same.unzip();
+            let (places, rows): (Vec<usize>, Vec<RolloutRow<'_>>) = same.unzip();
             for (place, rollout) in places.into_iter().zip(self.rollouts(&rows, steps)?) {
                 rollouts[place] = rollout;
             }
@@ -141,7 +141,7 @@ impl<'a> Windows<'a> {
     }
 
     /// Rollouts of `steps` frames.
-    fn rollouts(&self, rows: &[Row<'_>], steps: usize) -> Result<Vec<Rollout>, Failure> {
+    fn rollouts(&self, rows: &[RolloutRow<'_>], steps: usize) -> Result<Vec<Rollout>, Failure> {
         let spec = self.loaded.spec();
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
         let conditioning = condition(spec, &inputs, steps)?;
@@ -161,7 +161,7 @@ impl<'a> Windows<'a> {
     }
 
     /// A rollout with its expected errors and its novelty. `seen`: the features of all windows.
-    fn rollout(&self, (window, input): Row<'_>, seen: &[f32], codes: &[f32], frames: Vec<Frame>) -> Rollout {
+    fn rollout(&self, (window, input): RolloutRow<'_>, seen: &[f32], codes: &[f32], frames: Vec<Frame>) -> Rollout {
         let spec = self.loaded.spec();
         let (calibration, context) = (&self.loaded.manifest.calibration, self.contexts.get(window as usize));
         let (Some(calibration), Some(context)) = (calibration, context) else {
